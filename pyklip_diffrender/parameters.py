@@ -1,0 +1,102 @@
+"""The free-parameter table: what a model or a fit may leave free, in which unit and range.
+
+The same table drives the forward model's keywords, the fit, the FITS columns and the docs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+
+__all__ = ["FLUX_AND_BACKGROUND", "OPTICAL_PARAMETERS", "Parameter", "parameter"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One named parameter, scalar or vector.
+
+    Attributes
+    ----------
+    name : str
+        The keyword of the forward model.
+    unit : str
+        Unit at the interface, in astropy's spelling ("" for a plain number).
+    size : int
+        Number of components.
+    default : float
+        Value when it is not given.
+    lower, upper : float
+        Bounds of every component.
+    prior : float
+        Standard deviation, about the start, that a fit assumes: generous, what a user does not
+        know before looking.
+    step : float
+        A change small enough for derivatives, large enough to matter.
+    description : str
+        One line.
+    """
+
+    name: str
+    unit: str
+    size: int
+    default: float
+    lower: float
+    upper: float
+    prior: float
+    step: float
+    description: str
+
+
+OPTICAL_PARAMETERS = (
+    Parameter(
+        "star_offset", "arcsec", 2, 0.0, -5.0, 5.0, 0.1, 1e-4,
+        "position (x, y) of the star relative to the occulter, image orientation",
+    ),
+    Parameter(
+        "lyot_shift", "", 2, 0.0, -0.05, 0.05, 0.02, 1e-4,
+        "shift (x, y) of the Lyot stop as a fraction of the pupil diameter",
+    ),
+    Parameter(
+        "lyot_rotation", "deg", 1, 0.0, -5.0, 5.0, 2.0, 1e-2,
+        "rotation of the Lyot stop, counter-clockwise in entrance-pupil orientation",
+    ),
+    Parameter(
+        "si_zernikes", "m", 36, 0.0, -1e-6, 1e-6, 3e-8, 1e-10,
+        "Noll Zernike coefficients added to the instrument's internal wavefront error",
+    ),
+    Parameter(
+        "detector_shift", "arcsec", 2, 0.0, -5.0, 5.0, 0.1, 1e-4,
+        "displacement (x, y) of the optical axis from the centre of the pixel array",
+    ),
+    Parameter(
+        "blur", "arcsec", 1, 0.0, 0.0, 0.1, 0.02, 1e-3,
+        "standard deviation of a Gaussian blur on the detector (jitter, charge diffusion)",
+    ),
+)  # fmt: skip
+"""What the optics of a coronagraph may leave free, besides the OPD."""
+
+FLUX_AND_BACKGROUND = (
+    Parameter(
+        "flux", "", 1, 1.0, 0.0, inf, inf, 1e-4,
+        "light of the star collected by the pupil, in units of the starting value",
+    ),
+    Parameter(
+        "background", "", 1, 0.0, -inf, inf, inf, 1e-4,
+        "uniform background per pixel, in units of the image",
+    ),
+)  # fmt: skip
+"""What an observation leaves free on top of the optics."""
+
+
+def parameter(name: str) -> Parameter:
+    """Look a parameter up by name.
+
+    Raises
+    ------
+    KeyError
+        For a name that is not in the table, with the names that are.
+    """
+    known = {p.name: p for p in (*OPTICAL_PARAMETERS, *FLUX_AND_BACKGROUND)}
+    if name not in known:
+        raise KeyError(f"{name!r} is not a parameter; those are {', '.join(known)}")
+    return known[name]

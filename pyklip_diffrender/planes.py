@@ -1,0 +1,447 @@
+"""The planes of a coronagraph: pupils, the compact occulter, internal aberrations, the detector.
+
+A plane takes a `Wavefront` and gives the next. All but the first are linear in the field. Values
+of free parameters come in by name; a plane uses those that it declares in `parameters`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.geometry import PupilGrid, polygon_coverage, transform_polygons
+from pyklip_diffrender.propagation import MatrixFourier, tilt_phases
+from pyklip_diffrender.units import ARCSEC
+from pyklip_diffrender.zernike import zernike_basis
+
+__all__ = [
+    "CompactOcculter",
+    "Detector",
+    "EntrancePupil",
+    "InternalAberration",
+    "LyotStop",
+    "Plane",
+    "PupilStop",
+    "Values",
+    "Wavefront",
+]
+
+Values = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Wavefront:
+    """A monochromatic field on a window of the pupil.
+
+    Attributes
+    ----------
+    field : Tensor, (..., rows, columns), complex
+        Square root of light per m^2; the whole pupil collects 1.
+    wavelength : float
+        m.
+    grid : PupilGrid
+        Where the samples are.
+    """
+
+    field: Tensor
+    wavelength: float
+    grid: PupilGrid
+
+
+class Plane(Protocol):
+    """What an `OpticalSystem` needs of its planes after the first."""
+
+    name: str
+    parameters: tuple[str, ...]
+
+    def window(self, values: Values) -> PupilGrid | None:
+        """The part of the pupil that this plane passes on; None if it takes what comes."""
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        """Propagate; `onto` is the window that the planes behind need."""
+
+
+class EntrancePupil:
+    """The aperture where the wavefront enters: transmission, OPD and direction of the source.
+
+    Parameters
+    ----------
+    amplitude : Tensor, (npix, npix), float64
+        Amplitude transmission, entrance-pupil orientation.
+    diameter : float
+        Side of the array, m.
+    dtype : torch.dtype
+        Real type of the computation.
+    """
+
+    parameters = ("star_offset",)
+
+    def __init__(
+        self, amplitude: Tensor, diameter: float, dtype: torch.dtype, name: str = "entrance pupil"
+    ) -> None:
+        self.name = name
+        self.dtype = dtype
+        full = PupilGrid.full(amplitude.shape[-1], diameter)
+        self.full = full
+        self.grid = full.around(amplitude)
+        power = (amplitude**2).sum() * full.spacing**2
+        self.amplitude = full.crop(amplitude / torch.sqrt(power), self.grid).to(dtype)
+
+    def field(self, opd: Tensor, wavelength: float, star_offset: Tensor) -> Wavefront:
+        """The field behind the pupil.
+
+        Parameters
+        ----------
+        opd : Tensor, (..., npix, npix)
+            m.
+        wavelength : float
+            m.
+        star_offset : Tensor, (..., 2)
+            arcsec, image orientation.
+        """
+        opd = self.full.crop(opd, self.grid)
+        phase = (2 * math.pi / wavelength) * opd.to(self.dtype)
+        x, y = tilt_phases(star_offset * ARCSEC, self.grid, wavelength)
+        phase = phase + (x[..., None, :] + y[..., :, None]).to(self.dtype)
+        return Wavefront(torch.polar(self.amplitude.expand_as(phase), phase), wavelength, self.grid)
+
+
+class PupilStop:
+    """A fixed amplitude stop, with an optional OPD, in a pupil plane."""
+
+    parameters: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        amplitude: Tensor,
+        diameter: float,
+        dtype: torch.dtype,
+        name: str,
+        opd: Tensor | None = None,
+    ) -> None:
+        self.name = name
+        full = PupilGrid.full(amplitude.shape[-1], diameter)
+        self.grid = full.around(amplitude)
+        self.amplitude = full.crop(amplitude, self.grid).to(dtype)
+        self.opd = None if opd is None else full.crop(opd, self.grid).to(dtype)
+
+    def window(self, values: Values) -> PupilGrid:
+        return self.grid
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        field = wavefront.grid.crop(wavefront.field, self.grid)
+        if self.opd is None:
+            field = field * self.amplitude
+        else:
+            field = field * torch.polar(
+                self.amplitude, (2 * math.pi / wavefront.wavelength) * self.opd
+            )
+        return replace(wavefront, field=field, grid=self.grid)
+
+
+class LyotStop:
+    """A stop made of polygonal openings that can be shifted and turned, exactly.
+
+    The openings are rasterised anew wherever they lie (`polygon_coverage`), so that the image is
+    a smooth function of shift and rotation with the true derivative.
+
+    Parameters
+    ----------
+    openings : list of Tensor, each (vertices, 2)
+        Outlines in m at the primary, entrance-pupil orientation.
+    npix : int
+        Samples across the full pupil array.
+    diameter : float
+        Side of the full array, m; `lyot_shift` is a fraction of it.
+    """
+
+    parameters = ("lyot_shift", "lyot_rotation")
+    margin = 0.06
+    """Room for shifts and rotations around the openings, as a fraction of the diameter."""
+
+    def __init__(
+        self,
+        openings: list[Tensor],
+        npix: int,
+        diameter: float,
+        dtype: torch.dtype,
+        device: torch.device,
+        name: str = "Lyot stop",
+    ) -> None:
+        self.name = name
+        self.openings = openings
+        self.diameter = diameter
+        self.dtype, self.device = dtype, device
+        self._full = PupilGrid.full(npix, diameter)
+        coverage = polygon_coverage(openings, self._full)
+        self._tight = self._full.around(coverage)
+        self._wide = self._tight.widened(self.margin * diameter)
+        self._fixed = self._full.crop(coverage, self._tight).to(device, dtype)
+
+    def _moves(self, values: Values) -> bool:
+        return any(
+            name in values and (values[name].requires_grad or bool((values[name] != 0).any()))
+            for name in self.parameters
+        )
+
+    def window(self, values: Values) -> PupilGrid:
+        return self._wide if self._moves(values) else self._tight
+
+    def amplitude(self, values: Values) -> Tensor:
+        """Transmission on the window, (rows, columns)."""
+        if not self._moves(values):
+            return self._fixed
+        zero = torch.zeros(2, dtype=torch.float64)
+        shift = values.get("lyot_shift", zero).cpu() * self.diameter
+        rotation = torch.deg2rad(values.get("lyot_rotation", zero[:1]).cpu()).reshape(())
+        moved = transform_polygons(self.openings, shift, rotation)
+        return polygon_coverage(moved, self._wide).to(self.device, self.dtype)
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        grid = self.window(values)
+        field = wavefront.grid.crop(wavefront.field, grid) * self.amplitude(values)
+        return replace(wavefront, field=field, grid=grid)
+
+
+class InternalAberration:
+    """Wavefront error of the instrument behind the Lyot stop, in Zernikes on the pupil's disc.
+
+    Parameters
+    ----------
+    coefficients : Tensor, (36,)
+        Noll order, m rms, entrance-pupil orientation.
+    chromatic : callable, optional
+        Wavelength (m) to additional coefficients {Noll index: m}.
+    """
+
+    parameters = ("si_zernikes",)
+
+    def __init__(
+        self,
+        coefficients: Tensor,
+        diameter: float,
+        dtype: torch.dtype,
+        device: torch.device,
+        chromatic: Callable[[float], dict[int, float]] | None = None,
+        name: str = "internal aberration",
+    ) -> None:
+        self.name = name
+        self.coefficients = coefficients.to(device, torch.float64)
+        self.diameter = diameter
+        self.dtype = dtype
+        self.chromatic = chromatic
+        self._bases: dict[PupilGrid, Tensor] = {}
+        self._phasors: dict[tuple[PupilGrid, float], Tensor] = {}
+
+    def window(self, values: Values) -> None:
+        return None
+
+    def _basis(self, grid: PupilGrid) -> Tensor:
+        if grid not in self._bases:
+            basis = zernike_basis(len(self.coefficients), grid.x, grid.y, self.diameter / 2)
+            self._bases[grid] = basis.to(self.coefficients.device)
+        return self._bases[grid]
+
+    def opd(self, wavelength: float, grid: PupilGrid, values: Values) -> Tensor:
+        """OPD on the window, (rows, columns), m, float64."""
+        coefficients = self.coefficients
+        if self.chromatic is not None:
+            extra = torch.zeros_like(coefficients)
+            for noll, value in self.chromatic(wavelength).items():
+                extra[noll - 1] = value
+            coefficients = coefficients + extra
+        if "si_zernikes" in values:
+            coefficients = coefficients + values["si_zernikes"]
+        return torch.tensordot(coefficients, self._basis(grid), dims=1)
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        key = (wavefront.grid, wavefront.wavelength)
+        phasor = self._phasors.get(key)
+        if phasor is None or "si_zernikes" in values:
+            opd = self.opd(wavefront.wavelength, wavefront.grid, values)
+            phase = ((2 * math.pi / wavefront.wavelength) * opd).to(self.dtype)
+            phasor = torch.polar(torch.ones_like(phase), phase)
+            if "si_zernikes" not in values:
+                self._phasors[key] = phasor
+        return replace(wavefront, field=wavefront.field * phasor)
+
+
+class CompactOcculter:
+    """A focal-plane mask whose complement 1 - t is zero outside a disc.
+
+    The field behind it, back in the pupil, is E - F^-1[(1 - t) F[E]]: only the disc is ever
+    sampled (Soummer et al. 2007), in cells of ``1 / sampling`` of lambda/D.
+
+    Parameters
+    ----------
+    complement : callable
+        (x, y) angles in arcsec, arrays, to the amplitude 1 - t. Evaluated in double precision
+        as a constant: 1 - t must be computed without forming t, which would cancel.
+    radius : float
+        arcsec; `complement` vanishes beyond.
+    sampling : float
+        Cells per lambda / `diameter`.
+    """
+
+    parameters: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        complement: Callable[[Tensor, Tensor], Tensor],
+        radius: float,
+        sampling: float,
+        diameter: float,
+        dtype: torch.dtype,
+        device: torch.device,
+        name: str = "occulter",
+    ) -> None:
+        if sampling < 1:
+            raise IncompatibleSetupError(
+                f"occulter_sampling: got {sampling} cells per lambda/D, expected at least 1 "
+                "(below that the cells alias the pupil onto itself; 2 to 4 is usual)"
+            )
+        self.name = name
+        self.complement, self.radius, self.sampling = complement, radius, sampling
+        self.diameter = diameter
+        self.dtype, self.device = dtype, device
+        self._cells: dict[float, tuple[Tensor, Tensor]] = {}
+        self._transforms: dict[tuple[float, PupilGrid], MatrixFourier] = {}
+
+    def window(self, values: Values) -> None:
+        return None
+
+    def cells(self, wavelength: float) -> tuple[Tensor, Tensor]:
+        """Cell positions along one axis (radians) and 1 - t on the cells."""
+        if wavelength not in self._cells:
+            spacing = wavelength / self.diameter / self.sampling
+            half = math.ceil(self.radius * ARCSEC / spacing)
+            axis = torch.arange(-half, half + 1, dtype=torch.float64) * spacing
+            angle = axis / ARCSEC
+            complement = self.complement(angle[None, :], angle[:, None])
+            self._cells[wavelength] = (axis, complement.to(self.device, self.dtype))
+        return self._cells[wavelength]
+
+    def _transform(self, wavelength: float, grid: PupilGrid) -> MatrixFourier:
+        key = (wavelength, grid)
+        if key not in self._transforms:
+            axis = self.cells(wavelength)[0].to(self.device)
+            self._transforms[key] = MatrixFourier(
+                grid, axis, axis, wavelength, self.dtype.to_complex()
+            )
+        return self._transforms[key]
+
+    def focal_field(self, wavefront: Wavefront) -> Tensor:
+        """The field in front of the mask, on the cells of the disc."""
+        return self._transform(wavefront.wavelength, wavefront.grid).forward(wavefront.field)
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        axis, complement = self.cells(wavefront.wavelength)
+        blocked = self.focal_field(wavefront) * complement
+        removed = self._transform(wavefront.wavelength, onto).inverse(
+            blocked, float(axis[1] - axis[0]) ** 2
+        )
+        field = wavefront.grid.crop(wavefront.field, onto) - removed
+        return replace(wavefront, field=field, grid=onto)
+
+
+@dataclass
+class Detector:
+    """The pixel array.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        (ny, nx) detector pixels.
+    pixelscale : tuple of float
+        (x, y) arcsec per pixel.
+    oversample : int
+        Samples per pixel along each axis; a pixel's value is the mean of its samples times the
+        pixel's area, so with 1 it is the intensity at the pixel's centre.
+    shear : float
+        Growth of y with x on the sky, arcsec per arcsec (0 for square axes).
+    """
+
+    shape: tuple[int, int]
+    pixelscale: tuple[float, float]
+    oversample: int
+    dtype: torch.dtype
+    device: torch.device
+    shear: float = 0.0
+    name: str = "detector"
+    parameters: tuple[str, ...] = ("detector_shift", "blur")
+    _transforms: dict[tuple[float, PupilGrid], MatrixFourier] = field(default_factory=dict)
+
+    def axes(self, values: Values) -> tuple[Tensor, Tensor]:
+        """Sample positions x, y on the image relative to the optical axis, radians."""
+        axes = []
+        shift = values.get("detector_shift")
+        for k, (count, scale) in enumerate(
+            zip(self.shape[::-1], self.pixelscale, strict=True)
+        ):
+            samples = count * self.oversample
+            index = torch.arange(samples, dtype=torch.float64, device=self.device)
+            axis = (index - (samples - 1) / 2) * (scale / self.oversample)
+            if shift is not None:
+                axis = axis - shift[..., k].to(self.device)
+            axes.append(axis * ARCSEC)
+        return axes[0], axes[1]
+
+    def field(self, wavefront: Wavefront, values: Values) -> Tensor:
+        """Field on the samples, (..., oversample ny, oversample nx), |field|^2 per sample."""
+        key = (wavefront.wavelength, wavefront.grid)
+        transform = None if "detector_shift" in values else self._transforms.get(key)
+        if transform is None:
+            transform = MatrixFourier(
+                wavefront.grid,
+                *self.axes(values),
+                wavefront.wavelength,
+                self.dtype.to_complex(),
+                self.shear,
+            )
+            if "detector_shift" not in values:
+                self._transforms[key] = transform
+        area = self.pixelscale[0] * self.pixelscale[1] * (ARCSEC / self.oversample) ** 2
+        return math.sqrt(area) * transform.forward(wavefront.field)
+
+    def image(self, intensity: Tensor, values: Values) -> Tensor:
+        """Pixel values (..., ny, nx) from the intensity on the samples: blur, then binning."""
+        if "blur" in values and bool((values["blur"] != 0).any() or values["blur"].requires_grad):
+            for axis, scale in ((-1, self.pixelscale[0]), (-2, self.pixelscale[1])):
+                sigma = values["blur"].reshape(()) * (self.oversample / scale)
+                intensity = _blur(intensity, sigma, axis)
+        if self.oversample == 1:
+            return intensity
+        ny, nx = self.shape
+        k = self.oversample
+        return intensity.reshape(*intensity.shape[:-2], ny, k, nx, k).sum(dim=(-3, -1))
+
+
+def _blur(image: Tensor, sigma: Tensor, axis: int) -> Tensor:
+    """Band-limited Gaussian convolution along one axis, mirrored at the edges.
+
+    Below half a sample a sampled Gaussian is a poor filter; its transform, cut at the Nyquist
+    frequency, is exact for a well-sampled image.
+    """
+    reach = 16
+    frequency = (torch.arange(64, dtype=torch.float64, device=image.device) + 0.5) / 128
+    gain = torch.exp(-2 * (math.pi * sigma.to(image.device) * frequency) ** 2)
+    lag = torch.arange(reach + 1, dtype=torch.float64, device=image.device)
+    kernel = (gain * torch.cos(2 * math.pi * frequency * lag[:, None])).mean(dim=1)
+    kernel = kernel / (kernel[0] + 2 * kernel[1:].sum())
+    count = image.shape[axis]
+    position = torch.arange(-reach, count + reach, device=image.device)
+    folded = position % (2 * count)
+    mirrored = torch.where(folded < count, folded, 2 * count - 1 - folded)
+    distance = (torch.arange(count, device=image.device)[:, None] - position).abs()
+    weight = torch.where(distance <= reach, kernel[distance.clamp(max=reach)], 0.0)
+    matrix = torch.zeros(count, count, dtype=torch.float64, device=image.device)
+    matrix = matrix.index_add(1, mirrored, weight).to(image.dtype)
+    if axis == -1:
+        return image @ matrix.T
+    return matrix @ image

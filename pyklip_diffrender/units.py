@@ -1,0 +1,92 @@
+"""The one gate between the outside world and the float64 SI arrays inside.
+
+`torch.as_tensor(1 * u.um)` is 1.0 and `torch.from_numpy` refuses big-endian arrays, so
+nothing from outside reaches torch but through these functions. Inputs are never modified.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from numpy.typing import NDArray
+
+from pyklip_diffrender.errors import NonFiniteError, ShapeError, UnitError
+
+__all__ = ["ARCSEC", "native_float64", "require_finite", "require_shape", "to_arcsec", "to_metres"]
+
+ARCSEC = float((1 * u.arcsec).to_value(u.rad))
+"""One arcsecond in radians."""
+
+
+def native_float64(value: Any) -> NDArray[np.float64]:
+    """Copy of an array as contiguous, native-endian, writable float64 (masked values are NaN)."""
+    if isinstance(value, np.ma.MaskedArray):
+        value = value.astype(np.float64).filled(np.nan)
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    return np.array(value, dtype=np.float64, order="C")
+
+
+def to_metres(value: Any, name: str) -> NDArray[np.float64]:
+    """Convert a length to metres; a bare number or array is taken to be in metres already.
+
+    Parameters
+    ----------
+    value : Quantity, array or float
+        A length.
+    name : str
+        What it is, for the message.
+
+    Raises
+    ------
+    UnitError
+        If the unit is not a length.
+    """
+    return _to(value, u.m, name)
+
+
+def to_arcsec(value: Any, name: str) -> NDArray[np.float64]:
+    """Convert an angle to arcseconds; a bare number or array is taken to be in arcseconds.
+
+    Raises
+    ------
+    UnitError
+        If the unit is not an angle.
+    """
+    return _to(value, u.arcsec, name)
+
+
+def _to(value: Any, unit: u.UnitBase, name: str) -> NDArray[np.float64]:
+    if isinstance(value, u.Quantity):
+        try:
+            value = value.to_value(unit)
+        except u.UnitConversionError as error:
+            raise UnitError(
+                f"{name}: got the unit '{value.unit}', expected one that converts to '{unit}'"
+            ) from error
+    return native_float64(value)
+
+
+def require_shape(array: NDArray[Any], shape: tuple[int | None, ...], name: str, fix: str) -> None:
+    """Raise `ShapeError` unless `array` has `shape`, where None stands for any length."""
+    good = len(array.shape) == len(shape) and all(
+        want is None or got == want for got, want in zip(array.shape, shape, strict=True)
+    )
+    if not good:
+        wanted = tuple("any" if n is None else n for n in shape)
+        raise ShapeError(f"{name}: got shape {tuple(array.shape)}, expected {wanted}. {fix}")
+
+
+def require_finite(array: NDArray[Any], name: str, where: NDArray[np.bool_] | None = None) -> None:
+    """Raise `NonFiniteError` with the count and the first index of what is not finite."""
+    bad = ~np.isfinite(array)
+    if where is not None:
+        bad &= where
+    if bad.any():
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise NonFiniteError(
+            f"{name}: {int(bad.sum())} values are NaN or infinite, the first at index {first}. "
+            "Replace them, or mask them where a mask is taken"
+        )
