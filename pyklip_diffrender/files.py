@@ -32,22 +32,23 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
     path = Path(path)
     if not path.is_file():
         raise CorruptFileError(f"{path}: no such file")
-    with warnings.catch_warnings():
-        # A truncated file is only a warning to astropy; here it is an error.
-        warnings.filterwarnings("error", category=AstropyUserWarning)
-        try:
-            hdus = fits.open(path, memmap=False, lazy_load_hdus=False)
-            for hdu in hdus:
-                _ = hdu.data
-        except (OSError, EOFError, ValueError, TypeError, KeyError, AstropyUserWarning) as error:
-            raise CorruptFileError(
-                f"{path} ({path.stat().st_size} bytes): not a complete FITS file ({error}). "
-                "Fetch it again"
-            ) from error
-    try:
+    # Opened here, so that it is closed whatever astropy makes of it.
+    with path.open("rb") as raw:
+        with warnings.catch_warnings():
+            # A truncated file is only a warning to astropy; here it is an error.
+            warnings.filterwarnings("error", category=AstropyUserWarning)
+            try:
+                hdus = fits.open(raw, memmap=False, lazy_load_hdus=False)
+                for hdu in hdus:
+                    _ = hdu.data
+            except (
+                OSError, EOFError, ValueError, TypeError, KeyError, AstropyUserWarning
+            ) as error:  # fmt: skip
+                raise CorruptFileError(
+                    f"{path} ({path.stat().st_size} bytes): not a complete FITS file ({error}). "
+                    "Fetch it again"
+                ) from error
         yield hdus
-    finally:
-        hdus.close()
 
 
 @contextmanager

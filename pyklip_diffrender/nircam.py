@@ -69,7 +69,7 @@ def mask335r_complement(x: Tensor, y: Tensor) -> Tensor:
     """
     s = MASK335R_SIGMA * torch.hypot(*torch.broadcast_tensors(x, y))
     safe = torch.where(s > 0, s, 1.0)
-    jinc = torch.where(s > 0, 2 * torch.from_numpy(j1(safe.numpy())) / safe, 1.0)
+    jinc = torch.where(s > 0, 2 * torch.as_tensor(j1(safe.numpy())) / safe, 1.0)
     return torch.where(s < _SECOND_ZERO_OF_J1, jinc**2, 0.0)
 
 
@@ -135,7 +135,7 @@ def _pupil(npix: int, segment_gap: float | None) -> Tensor:
 
 
 def nircam_coronagraph(
-    filter: str = "F444W",  # noqa: A002 - webbpsf's and poppy's name
+    filter: str = "F444W",
     *,
     fov_pixels: int | tuple[int, int] | None = None,
     fov_arcsec: float | None = None,

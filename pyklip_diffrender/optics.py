@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from pyklip_diffrender.errors import ShapeError, UnitError
+from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.geometry import PupilGrid
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.planes import (
@@ -21,8 +22,9 @@ from pyklip_diffrender.planes import (
     Values,
     Wavefront,
 )
+from pyklip_diffrender.psf_file import recipe_psf
 from pyklip_diffrender.spectrum import Bandpass
-from pyklip_diffrender.units import require_finite, require_shape, to_metres
+from pyklip_diffrender.units import require_finite, require_shape, to_metres, to_unit
 
 __all__ = ["OpticalSystem"]
 
@@ -65,7 +67,9 @@ class OpticalSystem:
         self._remake = remake
 
     def __repr__(self) -> str:
-        names = ", ".join(p.name for p in (self.entrance, *self.planes, self.detector))
+        names = ", ".join(
+            [self.entrance.name, *(plane.name for plane in self.planes), self.detector.name]
+        )
         waves = len(self.bandpass.wavelengths)
         return (
             f"<OpticalSystem: {names}; {self.npix} px pupil, {waves} wavelength"
@@ -96,8 +100,8 @@ class OpticalSystem:
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters that this system takes besides the OPD."""
-        planes = (self.entrance, *self.planes, self.detector)
-        return tuple(name for plane in planes for name in plane.parameters)
+        between = [name for plane in self.planes for name in plane.parameters]
+        return (*self.entrance.parameters, *between, *self.detector.parameters)
 
     def with_fidelity(self, **changes: Any) -> Self | OpticalSystem:
         """The same system with other numerical settings, such as ``npix=256``.
@@ -117,9 +121,11 @@ class OpticalSystem:
     def opd(self, opd: Value | None) -> Tensor:
         """Check an OPD and bring it to the system's device: (..., npix, npix) in m.
 
-        None is a flat wavefront. Tensors pass through unchanged in value, so that gradients
-        flow; everything else goes through the unit gate.
+        None is the system's own wavefront, flat unless it came with one. Tensors pass through
+        unchanged in value, so that gradients flow; everything else goes through the unit gate.
         """
+        if opd is None and self.entrance.opd is not None:
+            return self.entrance.opd
         if opd is None:
             return torch.zeros(self.npix, self.npix, dtype=self.dtype, device=self.device)
         if not isinstance(opd, Tensor):
@@ -138,8 +144,10 @@ class OpticalSystem:
             )
         return opd.to(self.device)
 
-    def values(self, given: dict[str, Value]) -> dict[str, Tensor]:
+    def values(self, given: Mapping[str, Value | None]) -> dict[str, Tensor]:
         """Check named parameter values and make them float64 tensors, (components,) each.
+
+        Quantities are converted to the unit of the parameter table.
 
         Raises
         ------
@@ -147,6 +155,8 @@ class OpticalSystem:
             For a name that this system does not take.
         ShapeError
             For a wrong number of components.
+        UnitError
+            For a Quantity of another kind.
         """
         checked = {}
         for name, value in given.items():
@@ -154,11 +164,8 @@ class OpticalSystem:
                 continue
             if name not in self.parameters:
                 raise TypeError(f"{name!r} is not a parameter of this system: {self.parameters}")
-            if hasattr(value, "unit"):
-                raise UnitError(
-                    f"{name}: got a Quantity in '{value.unit}', expected plain numbers in "
-                    f"'{parameter(name).unit}'. Convert with .to_value({parameter(name).unit!r})"
-                )
+            if not isinstance(value, Tensor):
+                value = to_unit(value, parameter(name).unit, name)
             tensor = torch.as_tensor(value, dtype=torch.float64).to(self.device)
             tensor = tensor.reshape(1) if tensor.ndim == 0 else tensor
             if tensor.shape[-1] != parameter(name).size:
@@ -177,7 +184,7 @@ class OpticalSystem:
 
     def windows(self, values: Values) -> list[PupilGrid]:
         """For every plane, the pupil window that it should hand on, given what follows it."""
-        needed = self.entrance.grid
+        needed = self.entrance.full
         handed: list[PupilGrid] = []
         for plane in reversed(self.planes):
             handed.append(needed)
@@ -232,6 +239,77 @@ class OpticalSystem:
             field = self.propagate(self.pupil_field(tensor, wavelength, values), values)
             image = image + weight * (field.real**2 + field.imag**2)
         return self.detector.image(image, values)
+
+    def calc_psf(
+        self,
+        outfile: str | os.PathLike[str] | None = None,
+        source: Any = None,
+        nlambda: int | None = None,
+        monochromatic: float | None = None,
+        fov_arcsec: float | None = None,
+        fov_pixels: int | tuple[int, int] | None = None,
+        oversample: int | None = None,
+        detector_oversample: int | None = None,
+        fft_oversample: int | None = None,
+        overwrite: bool = True,
+        display: bool = False,
+        return_intermediates: bool = False,
+        normalize: str = "first",
+        opd: Value | None = None,
+        **parameters: Value,
+    ) -> Any:
+        """PSF as an HDUList, with the arguments of `calc_psf` of poppy's and webbpsf's instruments.
+
+        Arguments that are not given are those that the system was made with.
+
+        Parameters
+        ----------
+        oversample, detector_oversample, fft_oversample : int, optional
+            Samples per pixel, and per lambda/D on the occulter; the first sets both.
+        outfile : path, optional
+            Write the result there.
+        display : bool
+            Taken for poppy's sake; nothing is drawn.
+        return_intermediates : bool
+            Return (HDUList, `debug` of the first wavelength).
+        normalize : str
+            "first", "last", "exit_pupil" or "none", as in poppy.
+        opd, **parameters
+            As in a call of the system.
+
+        Returns
+        -------
+        HDUList
+            Extensions OVERSAMP and DET_SAMP.
+        """
+        samples = detector_oversample if detector_oversample is not None else oversample
+        sampling = fft_oversample if fft_oversample is not None else oversample
+        changes = {
+            "source": source,
+            "nlambda": nlambda,
+            "monochromatic": monochromatic,
+            "fov_arcsec": fov_arcsec,
+            "fov_pixels": fov_pixels,
+            "oversample": samples,
+            "occulter_sampling": sampling,
+        }
+        changes = {name: value for name, value in changes.items() if value is not None}
+        system: OpticalSystem = self
+        if changes:
+            # One way of giving a size or a band takes the place of the other.
+            for name, rival in (
+                ("fov_pixels", "fov_arcsec"),
+                ("fov_arcsec", "fov_pixels"),
+                ("nlambda", "monochromatic"),
+                ("source", "monochromatic"),
+            ):
+                if name in changes and rival not in changes:
+                    changes[rival] = None
+            system = self.with_fidelity(**changes)
+        hdus = recipe_psf(system, normalize, outfile, overwrite, opd, **parameters)
+        if return_intermediates:
+            return hdus, system.debug(opd, **parameters)
+        return hdus
 
     def debug(
         self, opd: Value | None = None, wavelength: float | None = None, **parameters: Value

@@ -80,7 +80,9 @@ class EntrancePupil:
         Real type of the computation.
     """
 
-    parameters = ("star_offset",)
+    parameters: tuple[str, ...] = ("star_offset",)
+    opd: Tensor | None = None
+    """The OPD of a system that is called without one, (npix, npix) in m; None for a flat one."""
 
     def __init__(
         self, amplitude: Tensor, diameter: float, dtype: torch.dtype, name: str = "entrance pupil"
@@ -161,7 +163,7 @@ class LyotStop:
         Side of the full array, m; `lyot_shift` is a fraction of it.
     """
 
-    parameters = ("lyot_shift", "lyot_rotation")
+    parameters: tuple[str, ...] = ("lyot_shift", "lyot_rotation")
     margin = 0.06
     """Room for shifts and rotations around the openings, as a fraction of the diameter."""
 
@@ -185,10 +187,7 @@ class LyotStop:
         self._fixed = self._full.crop(coverage, self._tight).to(device, dtype)
 
     def _moves(self, values: Values) -> bool:
-        return any(
-            name in values and (values[name].requires_grad or bool((values[name] != 0).any()))
-            for name in self.parameters
-        )
+        return any(name in values for name in self.parameters)
 
     def window(self, values: Values) -> PupilGrid:
         return self._wide if self._moves(values) else self._tight
@@ -220,7 +219,7 @@ class InternalAberration:
         Wavelength (m) to additional coefficients {Noll index: m}.
     """
 
-    parameters = ("si_zernikes",)
+    parameters: tuple[str, ...] = ("si_zernikes",)
 
     def __init__(
         self,
@@ -381,9 +380,7 @@ class Detector:
         """Sample positions x, y on the image relative to the optical axis, radians."""
         axes = []
         shift = values.get("detector_shift")
-        for k, (count, scale) in enumerate(
-            zip(self.shape[::-1], self.pixelscale, strict=True)
-        ):
+        for k, (count, scale) in enumerate(zip(self.shape[::-1], self.pixelscale, strict=True)):
             samples = count * self.oversample
             index = torch.arange(samples, dtype=torch.float64, device=self.device)
             axis = (index - (samples - 1) / 2) * (scale / self.oversample)
@@ -411,7 +408,7 @@ class Detector:
 
     def image(self, intensity: Tensor, values: Values) -> Tensor:
         """Pixel values (..., ny, nx) from the intensity on the samples: blur, then binning."""
-        if "blur" in values and bool((values["blur"] != 0).any() or values["blur"].requires_grad):
+        if "blur" in values:
             for axis, scale in ((-1, self.pixelscale[0]), (-2, self.pixelscale[1])):
                 sigma = values["blur"].reshape(()) * (self.oversample / scale)
                 intensity = _blur(intensity, sigma, axis)

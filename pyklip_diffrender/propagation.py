@@ -93,11 +93,9 @@ class MatrixFourier:
         self._scale = grid.spacing**2 / wavelength
         self._inverse_scale = 1 / wavelength
         rows, columns = grid.shape
-        self._columns_first = (
-            shear != 0
-            or rows * columns * len(x) + rows * len(x) * len(y)
-            <= rows * columns * len(y) + columns * len(x) * len(y)
-        )
+        self._columns_first = shear != 0 or rows * columns * len(x) + rows * len(x) * len(
+            y
+        ) <= rows * columns * len(y) + columns * len(x) * len(y)
 
     def forward(self, field: Tensor) -> Tensor:
         """Pupil field (..., rows, columns), per m, to image field (..., y, x), per radian."""

@@ -82,8 +82,7 @@ def filter_throughput(name: str) -> tuple[NDArray[np.float64], NDArray[np.float6
         return _throughputs()[name.upper()]
     except KeyError:
         raise IncompatibleSetupError(
-            f"filter {name!r} is not one that MASK335R takes; those are "
-            f"{', '.join(filter_names())}"
+            f"filter {name!r} is not one that MASK335R takes; those are {', '.join(filter_names())}"
         ) from None
 
 
@@ -118,7 +117,8 @@ def filter_bandpass(
     name : str
         Filter.
     nlambda : int
-        Number of intervals between the wavelengths where the throughput passes 1 % of its peak.
+        Number of intervals between the wavelengths where the throughput passes 1 % of its peak;
+        one without any light is left out.
     source : float or (wavelengths, flux)
         Temperature of a blackbody in K (default as in stpsf), or a spectrum: wavelengths in m
         and photons per unit wavelength.
@@ -126,7 +126,7 @@ def filter_bandpass(
     Raises
     ------
     IncompatibleSetupError
-        Unknown filter, or a spectrum that does not cover it.
+        Unknown filter, or a spectrum that does not cover it or has no light in it.
     """
     if nlambda < 1:
         raise ValueError(f"nlambda: got {nlambda}, expected at least 1")
@@ -146,5 +146,9 @@ def filter_bandpass(
         photons = blackbody(source, middle)
     photons = (photons * np.interp(middle, wavelength, throughput)).reshape(nlambda, -1)
     weights = photons.sum(axis=1)
-    centres = (photons * middle.reshape(nlambda, -1)).sum(axis=1) / weights
+    seen = weights > 0
+    if not seen.any():
+        raise IncompatibleSetupError(f"the spectrum has no light in the filter {name}")
+    weights, photons = weights[seen], photons[seen]
+    centres = (photons * middle.reshape(nlambda, -1)[seen]).sum(axis=1) / weights
     return Bandpass(tuple(centres.tolist()), tuple(weights.tolist()))

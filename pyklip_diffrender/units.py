@@ -11,10 +11,19 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pyklip_diffrender.errors import NonFiniteError, ShapeError, UnitError
 
-__all__ = ["ARCSEC", "native_float64", "require_finite", "require_shape", "to_arcsec", "to_metres"]
+__all__ = [
+    "ARCSEC",
+    "native_float64",
+    "require_finite",
+    "require_shape",
+    "to_arcsec",
+    "to_metres",
+    "to_unit",
+]
 
 ARCSEC = float((1 * u.arcsec).to_value(u.rad))
 """One arcsecond in radians."""
@@ -23,8 +32,8 @@ ARCSEC = float((1 * u.arcsec).to_value(u.rad))
 def native_float64(value: Any) -> NDArray[np.float64]:
     """Copy of an array as contiguous, native-endian, writable float64 (masked values are NaN)."""
     if isinstance(value, np.ma.MaskedArray):
-        value = value.astype(np.float64).filled(np.nan)
-    if hasattr(value, "detach"):
+        value = np.ma.filled(value.astype(np.float64), np.nan)
+    elif isinstance(value, Tensor):
         value = value.detach().cpu().numpy()
     return np.array(value, dtype=np.float64, order="C")
 
@@ -44,7 +53,7 @@ def to_metres(value: Any, name: str) -> NDArray[np.float64]:
     UnitError
         If the unit is not a length.
     """
-    return _to(value, u.m, name)
+    return to_unit(value, u.m, name)
 
 
 def to_arcsec(value: Any, name: str) -> NDArray[np.float64]:
@@ -55,11 +64,20 @@ def to_arcsec(value: Any, name: str) -> NDArray[np.float64]:
     UnitError
         If the unit is not an angle.
     """
-    return _to(value, u.arcsec, name)
+    return to_unit(value, u.arcsec, name)
 
 
-def _to(value: Any, unit: u.UnitBase, name: str) -> NDArray[np.float64]:
-    if isinstance(value, u.Quantity):
+def to_unit(value: Any, unit: str | u.UnitBase, name: str) -> NDArray[np.float64]:
+    """Convert a Quantity, or a sequence of them, to a unit; bare numbers are in it already.
+
+    Raises
+    ------
+    UnitError
+        If the unit does not convert.
+    """
+    members = value if isinstance(value, list | tuple) else ()
+    if isinstance(value, u.Quantity) or any(isinstance(m, u.Quantity) for m in members):
+        value = u.Quantity(value)
         try:
             value = value.to_value(unit)
         except u.UnitConversionError as error:

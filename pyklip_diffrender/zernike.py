@@ -39,19 +39,27 @@ def zernike_basis(count: int, x: Tensor, y: Tensor, radius: float) -> Tensor:
     -------
     Tensor, (count, rows, columns)
     """
-    rho = torch.hypot(y[:, None], x[None, :]) / radius
-    theta = torch.atan2(y[:, None], x[None, :])
+    # rho^m exp(i m theta) is a power of x + i y: no trigonometry, and smooth at the centre.
+    point = torch.complex(*torch.broadcast_tensors(x[None, :] / radius, y[:, None] / radius))
+    squared = point.real**2 + point.imag**2
+    inside = (squared <= 1).to(squared.dtype)
+    highest = noll_indices(count)[0]
+    waves = [torch.ones_like(point)]
+    even = [torch.ones_like(squared)]
+    for _ in range(highest):
+        waves.append(waves[-1] * point)
+        even.append(even[-1] * squared)
     basis = []
     for j in range(1, count + 1):
         n, m = noll_indices(j)
-        radial = torch.zeros_like(rho)
-        for k in range((n - abs(m)) // 2 + 1):
-            factor = (-1) ** k * comb(n - k, k) * comb(n - 2 * k, (n - abs(m)) // 2 - k)
-            radial = radial + factor * rho ** (n - 2 * k)
+        half = (n - abs(m)) // 2
+        radial = sum(
+            (-1) ** k * comb(n - k, k) * comb(n - 2 * k, half - k) * even[half - k]
+            for k in range(half + 1)
+        )
         if m == 0:
-            polynomial = sqrt(n + 1) * radial
+            basis.append(sqrt(n + 1) * radial * inside)
         else:
-            angular = torch.cos(m * theta) if m > 0 else torch.sin(-m * theta)
-            polynomial = sqrt(2 * (n + 1)) * radial * angular
-        basis.append(torch.where(rho <= 1, polynomial, 0.0))
+            wave = waves[m].real if m > 0 else waves[-m].imag
+            basis.append(sqrt(2 * (n + 1)) * radial * wave * inside)
     return torch.stack(basis)

@@ -1,0 +1,91 @@
+"""Differentiable rendering of a star behind a coronagraph, as an algorithm for pyKLIP.
+
+Every public name is loaded when it is first used, so that ``import pyklip_diffrender`` and
+``pyklip-diffrender --help`` wait neither for PyTorch nor for pyKLIP.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.bridges import from_poppy, from_webbpsf
+    from pyklip_diffrender.nircam import nircam_coronagraph
+    from pyklip_diffrender.observation import Observation
+    from pyklip_diffrender.opd import drift, random_opd, read_opd
+    from pyklip_diffrender.optics import OpticalSystem
+    from pyklip_diffrender.pyklip_backend import (
+        DiffrenderSettings,
+        backend,
+        register,
+        unregister,
+    )
+    from pyklip_diffrender.refinement import Refinement, Status, refine
+    from pyklip_diffrender.scene import Planet, Scene, Star
+    from pyklip_diffrender.simulation import simulate
+
+__all__ = [
+    "DiffrenderSettings",
+    "Observation",
+    "OpticalSystem",
+    "Planet",
+    "Refinement",
+    "Scene",
+    "Star",
+    "Status",
+    "__version__",
+    "backend",
+    "drift",
+    "from_poppy",
+    "from_webbpsf",
+    "nircam_coronagraph",
+    "random_opd",
+    "read_opd",
+    "refine",
+    "register",
+    "simulate",
+    "unregister",
+]
+
+_MODULE_OF = {
+    "DiffrenderSettings": "pyklip_backend",
+    "Observation": "observation",
+    "OpticalSystem": "optics",
+    "Planet": "scene",
+    "Refinement": "refinement",
+    "Scene": "scene",
+    "Star": "scene",
+    "Status": "refinement",
+    "backend": "pyklip_backend",
+    "drift": "opd",
+    "from_poppy": "bridges",
+    "from_webbpsf": "bridges",
+    "nircam_coronagraph": "nircam",
+    "random_opd": "opd",
+    "read_opd": "opd",
+    "refine": "refinement",
+    "register": "pyklip_backend",
+    "simulate": "simulation",
+    "unregister": "pyklip_backend",
+}
+"""The module each public name lives in."""
+
+try:
+    __version__ = version("pyklip-diffrender")
+except PackageNotFoundError:
+    # A source tree that was put on the path without being installed.
+    __version__ = "0+unknown"
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

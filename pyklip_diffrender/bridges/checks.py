@@ -1,0 +1,74 @@
+"""Wavefront maps that cannot be what they are said to be."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyklip_diffrender.errors import DiffrenderWarning, UnitError
+from pyklip_diffrender.units import require_finite
+
+__all__ = ["check_opd"]
+
+Array = NDArray[np.float64]
+
+LARGEST_RMS = 2e-5
+"""m; a telescope whose wavefront is worse than this makes no image in the infrared."""
+
+_TURNS: dict[str, Any] = {
+    "as it is": lambda a: a,
+    "upside down": np.flipud,
+    "left to right": np.fliplr,
+    "turned by 180 deg": lambda a: a[::-1, ::-1],
+}
+
+
+def check_opd(opd: Array, amplitude: Array, name: str) -> None:
+    """Look at a map's size, and at where it is blank.
+
+    Parameters
+    ----------
+    opd : ndarray, (npix, npix)
+        m.
+    amplitude : ndarray, (npix, npix)
+        Transmission of the pupil in the orientation that the map should have.
+    name : str
+        What it is, for the message.
+
+    Raises
+    ------
+    NonFiniteError
+        If a value inside the pupil is not finite.
+    UnitError
+        If it is too large to be in metres.
+
+    Warns
+    -----
+    DiffrenderWarning
+        If its blank samples match the pupil better turned than as it is.
+    """
+    inside = amplitude > 0
+    require_finite(opd, name, inside)
+    rms = float(np.std(opd[inside])) if inside.any() else 0.0
+    if rms > LARGEST_RMS:
+        raise UnitError(
+            f"{name}: {rms:.3g} m rms inside the pupil, more than several wavelengths. Maps must "
+            "be in metres; those of the wavefront-sensing software are in microns. Give it as a "
+            "Quantity, or set BUNIT in the file"
+        )
+    drawn = (opd != 0) & np.isfinite(opd)
+    if drawn.all() or not drawn.any():
+        return
+    mismatch = {turn: float(np.mean(act(drawn) != inside)) for turn, act in _TURNS.items()}
+    best = min(mismatch, key=lambda turn: mismatch[turn])
+    if mismatch[best] < 0.5 * mismatch["as it is"]:
+        warnings.warn(
+            f"{name}: its blank samples match the pupil {best} ({mismatch[best]:.1%} of the "
+            f"samples differ, as it is {mismatch['as it is']:.1%}). Maps must have the "
+            "orientation of the entrance pupil, row 0 at the bottom (-V3)",
+            DiffrenderWarning,
+            stacklevel=3,
+        )

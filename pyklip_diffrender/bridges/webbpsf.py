@@ -1,0 +1,448 @@
+"""`from_webbpsf`: NIRCam's coronagraphs from a user's stpsf (webbpsf) object, and the way back."""
+
+from __future__ import annotations
+
+import copy
+import os
+import warnings
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from astropy import units as u
+from astropy.io import fits
+from numpy.typing import NDArray
+from poppy.poppy_core import PlaneType
+
+from pyklip_diffrender.arrays import AberrationOptic, MovableStop, PupilOptic
+from pyklip_diffrender.bridges.checks import check_opd
+from pyklip_diffrender.bridges.detector import stpsf_effects
+from pyklip_diffrender.bridges.poppy import (
+    Converter,
+    PoppySystem,
+    intermediate_wavefronts,
+    opd_to_hdus,
+)
+from pyklip_diffrender.detector_effects import ChainDetector
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.psf_file import poppy_psf, save
+from pyklip_diffrender.units import to_metres
+
+__all__ = ["WebbSystem", "from_webbpsf", "opd_to_webbpsf"]
+
+Array = NDArray[np.float64]
+
+
+class WebbSystem(PoppySystem):
+    """What `from_webbpsf` makes.
+
+    Attributes
+    ----------
+    instrument : stpsf.NIRCam
+        The model's own copy, as it was when it was converted.
+    si_wfe_flipped : bool or None
+        Whether the map of the instrument's internal wavefront error is flipped vertically, as
+        stpsf does from 2.2.0 on; None without one.
+    """
+
+    instrument: Any
+    si_wfe_flipped: bool | None
+
+    def calc_psf(  # type: ignore[override]  # An instrument's arguments, not an OpticalSystem's.
+        self,
+        outfile: str | os.PathLike[str] | None = None,
+        source: Any = None,
+        nlambda: int | None = None,
+        monochromatic: Any = None,
+        fov_arcsec: float | None = None,
+        fov_pixels: int | tuple[int, int] | None = None,
+        oversample: int | None = None,
+        detector_oversample: int | None = None,
+        fft_oversample: int | None = None,
+        overwrite: bool = True,
+        display: bool = False,
+        save_intermediates: bool = False,
+        return_intermediates: bool = False,
+        normalize: str = "first",
+        add_distortion: bool = True,
+        crop_psf: bool = True,
+        opd: Any = None,
+        **parameters: Any,
+    ) -> Any:
+        """PSF as an HDUList, with the arguments, extensions and keywords of stpsf's `calc_psf`.
+
+        Arguments that are not given are those that the system was made with. The image is this
+        system's; jitter, distortion, detector effects and header are then added by stpsf itself.
+
+        Parameters
+        ----------
+        opd, **parameters
+            As in a call of the system, for the PSF of a refined wavefront.
+        display, save_intermediates
+            Taken for stpsf's sake; nothing is drawn, and saving is not supported.
+
+        Returns
+        -------
+        HDUList, or (HDUList, list of poppy.Wavefront)
+            OVERSAMP, DET_SAMP, OVERDIST and DET_DIST, the last two with `add_distortion`.
+        """
+        if save_intermediates:
+            raise IncompatibleSetupError(
+                "save_intermediates: this system writes no files on its own; take "
+                "return_intermediates=True and call .writeto() on the wavefronts"
+            )
+        changes = {
+            "source": source,
+            "nlambda": nlambda,
+            "monochromatic": monochromatic,
+            "fov_arcsec": fov_arcsec,
+            "fov_pixels": fov_pixels,
+            "oversample": oversample,
+            "detector_oversample": detector_oversample,
+            "fft_oversample": fft_oversample,
+        }
+        changes = {name: value for name, value in changes.items() if value is not None}
+        system: Any = self._with_changes(changes) if changes else self
+        result = poppy_psf(system, normalize, opd, **parameters)
+        instrument = system.instrument
+        options = {
+            **instrument.options,
+            "add_distortion": add_distortion,
+            "crop_psf": crop_psf,
+            "detector_oversample": system.detector.oversample,
+            "fft_oversample": int(system.recipe_oversample[0]),
+        }
+        with _numpy_scale_quirks():
+            instrument._apply_jitter(result, options)
+            instrument._get_fits_header(result, options)
+            instrument._calc_psf_format_output(result, options)
+        if system.si_wfe_flipped is not None:
+            for hdu in result:
+                hdu.header["DRSIFLIP"] = (system.si_wfe_flipped, "SI WFE map flipped vertically")
+        save(result, outfile, overwrite)
+        if return_intermediates:
+            return result, intermediate_wavefronts(system, normalize, only_last=False)
+        return result
+
+    @property
+    def recipe_oversample(self) -> tuple[int, int]:
+        """Oversampling of the image planes and of the detector."""
+        return _oversampling(self.recipe)
+
+    def _with_changes(self, changes: dict[str, Any]) -> Any:
+        """Another system; one way of giving a size or a band takes the place of the other."""
+        rivals = {
+            "fov_pixels": ("fov_arcsec",),
+            "fov_arcsec": ("fov_pixels",),
+            "oversample": ("detector_oversample", "fft_oversample"),
+            "nlambda": ("monochromatic",),
+            "source": ("monochromatic",),
+        }
+        cleared: dict[str, Any] = {
+            rival: None
+            for name in changes
+            for rival in rivals.get(name, ())
+            if rival not in changes
+        }
+        return self.with_fidelity(**{**cleared, **changes})
+
+
+def from_webbpsf(
+    nircam: Any,
+    *,
+    fov_pixels: int | tuple[int, int] | None = None,
+    fov_arcsec: float | None = None,
+    oversample: int | None = None,
+    detector_oversample: int | None = None,
+    fft_oversample: int | None = None,
+    monochromatic: Any = None,
+    nlambda: int | None = None,
+    source: Any = None,
+    add_distortion: bool = False,
+    flip_si_wfe: bool | None = None,
+    propagation: str | Mapping[str, str] = "auto",
+    occulter_sampling: float | None = None,
+    trainable: Collection[str] = (),
+    dtype: torch.dtype = torch.float64,
+    device: str | torch.device = "cpu",
+) -> WebbSystem:
+    """Make a differentiable system of a configured `stpsf.NIRCam` (or `webbpsf.NIRCam`).
+
+    It takes over filter, masks, options (source offset, pupil shift and rotation, shift of the
+    occulter, ND squares, jitter), pixel scale, OPD and internal wavefront errors with their field
+    dependence. ``model()`` is stpsf's DET_SAMP, or DET_DIST with `add_distortion`; ``model(opd)``
+    replaces the whole OPD of the telescope, and ``model.entrance.opd`` is the one it has.
+
+    Parameters
+    ----------
+    nircam : stpsf.NIRCam
+        It is not changed, and later changes to it do not reach the model.
+    fov_pixels, fov_arcsec, oversample, detector_oversample, fft_oversample, monochromatic,
+    nlambda, source
+        As in stpsf's `calc_psf`, with its defaults.
+    add_distortion : bool
+        Include what stpsf adds up to DET_DIST: rotation, distortion, charge diffusion, IPC, PPC.
+    flip_si_wfe : bool, optional
+        Whether to flip the coronagraph's internal wavefront error vertically; default as the
+        installed stpsf does (it does from 2.2.0 on). ``model.si_wfe_flipped`` says what was done.
+    propagation, occulter_sampling, trainable, dtype, device
+        See `from_poppy`; the sampling is `fft_oversample` unless given.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For another instrument, a mask that is not supported, or a wavelength outside the channel.
+    CorruptFileError
+        If stpsf misses a file of its data directory.
+    """
+    recipe = {k: v for k, v in locals().items() if k != "recipe"}
+    if getattr(nircam, "name", None) != "NIRCam" or not hasattr(nircam, "get_optical_system"):
+        raise IncompatibleSetupError(
+            f"from_webbpsf: got {nircam!r}, expected an stpsf.NIRCam or webbpsf.NIRCam. For other "
+            "instruments pass what get_optical_system() returns to from_poppy"
+        )
+    instrument = _private_copy(nircam)
+    recipe["nircam"] = instrument
+    sampling, samples = _oversampling(recipe)
+    wavelengths, weights = _band(instrument, recipe)
+    with _data_errors():
+        osys = instrument.get_optical_system(
+            fft_oversample=sampling,
+            detector_oversample=samples,
+            fov_arcsec=fov_arcsec or instrument._get_default_fov(),
+            fov_pixels=fov_pixels,
+            options=instrument.options,
+        )
+    first = osys.planes[0]
+    check_opd(np.asarray(first.opd), np.asarray(first.amplitude), "pupilopd")
+    flipped = _set_flip(osys, flip_si_wfe)
+    converter = Converter(
+        osys,
+        {
+            **recipe,
+            "osys": osys,
+            "wavelength": wavelengths,
+            "weights": weights,
+        },
+        _kinds(osys),
+    )
+    base = converter.system()
+    system = WebbSystem(
+        base.entrance,
+        base.planes,
+        _with_effects(base, instrument, sampling, add_distortion),
+        base.bandpass,
+        recipe=recipe,
+        remake=from_webbpsf,
+    )
+    system.propagation, system.frames = base.propagation, base.frames
+    system.instrument, system.si_wfe_flipped = instrument, flipped
+    return system
+
+
+def _private_copy(nircam: Any) -> Any:
+    """An instrument that shares data with the user's, but no settings."""
+    instrument = copy.copy(nircam)
+    instrument.options = dict(nircam.options)
+    if hasattr(instrument.pupil, "v2v3"):
+        # As calc_psf does: a telescope model has to know where in the field it is used.
+        instrument.pupil = copy.deepcopy(instrument.pupil)
+        position = instrument._tel_coords().to(u.arcsec)
+        if instrument.pupil.v2v3 is None or not (instrument.pupil.v2v3 == position).all():
+            instrument.pupil.v2v3 = position
+            instrument.pupil.update_opd()
+    return instrument
+
+
+def _oversampling(recipe: Mapping[str, Any]) -> tuple[int, int]:
+    """Of the image planes and of the detector, by stpsf's rules."""
+    both, fine, pixels = (
+        recipe[name] for name in ("oversample", "fft_oversample", "detector_oversample")
+    )
+    if None not in (both, fine, pixels):
+        raise IncompatibleSetupError(
+            "give oversample, or detector_oversample with fft_oversample, not all three"
+        )
+    if both is None and fine is None and pixels is None:
+        both = 4
+    found = (fine if fine is not None else both, pixels if pixels is not None else both)
+    if None in found:
+        raise IncompatibleSetupError(
+            f"fft_oversample={fine}, detector_oversample={pixels}: give both, or oversample"
+        )
+    return int(found[0]), int(found[1])
+
+
+def _band(instrument: Any, recipe: Mapping[str, Any]) -> tuple[list[float], list[float]]:
+    """Wavelengths (m) and weights, as stpsf has them."""
+    monochromatic = recipe["monochromatic"]
+    if monochromatic is not None:
+        monochromatic = float(to_metres(monochromatic, "monochromatic"))
+    with _data_errors(), _synphot_quirks():
+        wavelengths, weights = instrument._get_weights(
+            source=recipe["source"], nlambda=recipe["nlambda"], monochromatic=monochromatic
+        )
+    waves = [float(w) for w in np.atleast_1d(wavelengths)]
+    try:
+        instrument._validate_config(wavelengths=waves)
+    except RuntimeError as error:
+        raise IncompatibleSetupError(
+            f"wavelengths {min(waves):.4g} to {max(waves):.4g} m with {instrument.filter}: {error}. "
+            "Wavelengths are in metres"
+        ) from error
+    if monochromatic is not None:
+        _warn_outside(instrument, monochromatic)
+    return waves, [float(w) for w in np.atleast_1d(weights)]
+
+
+def _warn_outside(instrument: Any, wavelength: float) -> None:
+    """Stpsf lets a wavelength be outside the filter; say so."""
+    path = instrument._filters[instrument.filter].filename
+    if not os.path.exists(path):
+        return  # Only broadband PSFs need the curve.
+    table = fits.getdata(path, 1)
+    used = np.asarray(table["THROUGHPUT"], dtype=float)
+    passed = np.asarray(table["WAVELENGTH"], dtype=float)[used > 1e-3 * used.max()] * 1e-10
+    if not passed.min() <= wavelength <= passed.max():
+        warnings.warn(
+            f"monochromatic: {wavelength:.4g} m is outside {instrument.filter} ({passed.min():.4g} "
+            f"to {passed.max():.4g} m); the filter only names the PSF",
+            DiffrenderWarning,
+            stacklevel=4,
+        )
+
+
+def _aberrations(osys: Any) -> Any:
+    """The plane of the internal wavefront error, or None."""
+    for plane in osys.planes:
+        if any(c.__name__ == "WebbFieldDependentAberration" for c in type(plane).__mro__):
+            return plane
+    return None
+
+
+def _set_flip(osys: Any, wanted: bool | None) -> bool | None:
+    """Flip the map of internal aberrations if it is not as wanted; say how it is."""
+    plane = _aberrations(osys)
+    if plane is None:
+        return None
+    flipped = bool(getattr(plane, "_is_OPD_flipped_for_NRC_coron", False))
+    if wanted is None or wanted == flipped:
+        return flipped
+    # The map alone: focus and tilt, which depend on the wavelength, are added to it later.
+    plane.opd = plane.opd[::-1].copy()
+    return wanted
+
+
+def _kinds(osys: Any) -> dict[str, type[PupilOptic]]:
+    """Pupil planes with parameters: the stop behind the occulter, the internal aberrations."""
+    kinds: dict[str, type[PupilOptic]] = {}
+    behind_mask = False
+    aberrations = _aberrations(osys)
+    for plane in osys.planes:
+        behind_mask |= plane.planetype == PlaneType.image
+        if plane is aberrations:
+            kinds[plane.name] = AberrationOptic
+        elif (
+            behind_mask
+            and plane.planetype == PlaneType.pupil
+            and MovableStop not in (kinds.values())
+        ):
+            kinds[plane.name] = MovableStop
+    return kinds
+
+
+def _with_effects(
+    base: PoppySystem, instrument: Any, sampling: int, distortion: bool
+) -> ChainDetector:
+    detector = base.detector
+    with _data_errors():
+        on_samples, on_pixels = stpsf_effects(
+            instrument,
+            shape=detector.shape,
+            oversample=detector.oversample,
+            fft_oversample=sampling,
+            pixelscale=detector.pixelscale[0],
+            distortion=distortion,
+        )
+    return ChainDetector(
+        shape=detector.shape,
+        pixelscale=detector.pixelscale,
+        oversample=detector.oversample,
+        dtype=detector.dtype,
+        device=detector.device,
+        name=detector.name,
+        on_samples=on_samples,
+        on_pixels=on_pixels,
+    )
+
+
+@contextmanager
+def _data_errors() -> Iterator[None]:
+    """Say which directory it is about when stpsf misses one of its files."""
+    try:
+        yield
+    except (FileNotFoundError, OSError, RuntimeError) as error:
+        if isinstance(error, CorruptFileError):
+            raise
+        raise CorruptFileError(
+            f"stpsf could not read its data ({error}). STPSF_PATH is "
+            f"{os.environ.get('STPSF_PATH')!r}; it must hold the complete stpsf data files, see "
+            "https://stpsf.readthedocs.io/en/latest/installation.html"
+        ) from error
+
+
+@contextmanager
+def _synphot_quirks() -> Iterator[None]:
+    """Room for warnings of synphot that nobody here can act on."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"synphot\.")
+        yield
+
+
+@contextmanager
+def _numpy_scale_quirks() -> Iterator[None]:
+    """Kernel files that stpsf leaves open (stpsf/detectors.py) are not the caller's business."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "unclosed file", ResourceWarning)
+        yield
+
+
+def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:
+    """A refined wavefront as `pupilopd` of a NIRCam object.
+
+    stpsf adds the telescope's field dependence to `pupilopd`; it is taken out here, so that the
+    telescope as a whole has the given OPD at the position of `nircam`.
+
+    Parameters
+    ----------
+    opd : Tensor, Quantity or array, (npix, npix)
+        m, entrance-pupil orientation: for instance ``fit.opd``.
+    nircam : stpsf.NIRCam
+        Not changed. Set its ``pupilopd`` to the result.
+
+    Raises
+    ------
+    UnitError, NonFiniteError, IncompatibleSetupError
+        If the map cannot be right.
+    """
+    values = to_metres(opd, "opd")
+    instrument = _private_copy(nircam)
+    instrument.include_si_wfe = False
+    from pyklip_diffrender.geometry import JWST_DIAMETER
+
+    hdus = opd_to_hdus(values, JWST_DIAMETER)
+    instrument.pupilopd = hdus
+    try:
+        with _data_errors():
+            optic = instrument._get_telescope_pupil_and_aberrations()
+    except ValueError as error:
+        raise IncompatibleSetupError(
+            f"opd: got shape {values.shape}; stpsf does not take it with the pupil "
+            f"{instrument.pupil!r} ({error})"
+        ) from error
+    check_opd(values, np.asarray(optic.amplitude), "opd")
+    added = np.asarray(optic.opd) - values
+    hdus[0].data = values - added
+    return hdus

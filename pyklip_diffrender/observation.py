@@ -1,0 +1,272 @@
+"""Frames to be explained: pixel values, their errors, what is masked, where the star is."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from astropy.io import fits
+from astropy.time import Time
+from numpy.typing import NDArray
+
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    DiffrenderWarning,
+    NoValidPixelsError,
+    ShapeError,
+    UnitError,
+)
+from pyklip_diffrender.files import open_fits
+from pyklip_diffrender.units import native_float64, require_shape
+
+__all__ = ["BAD_PIXEL_BITS", "Observation"]
+
+BAD_PIXEL_BITS = 1 | 2 | 512 | 1024
+"""JWST data-quality bits that take a pixel out of the fit: DO_NOT_USE, SATURATED, NON_SCIENCE,
+DEAD. A jump (4) that the ramp fit has repaired, or a hot pixel (2048) that was dark-subtracted,
+may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A stack of coronagraphic frames.
+
+    Attributes
+    ----------
+    data : ndarray, (frames, ny, nx), float64
+        Pixel values; what is not valid is 0.
+    error : ndarray, (frames, ny, nx)
+        Standard deviations, in the same unit; 1 where not valid.
+    valid : ndarray of bool, (frames, ny, nx)
+    unit : Unit
+        Of data and error; photons for simulations.
+    pixelscale : tuple of float
+        (x, y) arcsec per pixel.
+    center : ndarray, (frames, 2)
+        Approximate x, y of the star, 0-indexed pixels.
+    filter : str or None
+    date : Time or None
+    position_angles : ndarray, (frames,)
+        Degrees.
+    name : str
+    header : Header
+        Primary and science headers of the file, merged.
+    """
+
+    data: NDArray[np.float64]
+    error: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    unit: u.UnitBase
+    pixelscale: tuple[float, float]
+    center: NDArray[np.float64]
+    filter: str | None = None
+    date: Time | None = None
+    position_angles: NDArray[np.float64] | None = None
+    name: str = "observation"
+    header: fits.Header = field(default_factory=fits.Header)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        data: Any,
+        error: Any,
+        *,
+        valid: Any = None,
+        unit: str | u.UnitBase = "photon",
+        pixelscale: float | tuple[float, float],
+        center: Any = None,
+        **details: Any,
+    ) -> Observation:
+        """Make an observation of one frame or a stack, checking and copying.
+
+        Parameters
+        ----------
+        data, error : array, ([frames,] ny, nx)
+            Pixels where either is not finite, or the error is not positive, are masked.
+        valid : array of bool, optional
+        unit : str or Unit
+        pixelscale : float or (x, y)
+            arcsec.
+        center : (2,) or (frames, 2), optional
+            x, y of the star, 0-indexed; default the middle of the array.
+        **details
+            Other attributes.
+
+        Raises
+        ------
+        ShapeError
+            Shapes that do not go together, or no frames.
+        NoValidPixelsError
+            A frame in which nothing is left.
+        """
+        values = native_float64(data)
+        values = values[None] if values.ndim == 2 else values
+        if values.ndim != 3 or values.size == 0:
+            raise ShapeError(f"data: got shape {np.shape(data)}, expected ([frames,] ny, nx)")
+        sigma = native_float64(error)
+        sigma = sigma[None] if sigma.ndim == 2 else sigma
+        require_shape(sigma, values.shape, "error", "Give one error for every pixel")
+        good = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
+        if valid is not None:
+            given = np.asarray(valid, dtype=bool)
+            require_shape(given[None] if given.ndim == 2 else given, values.shape, "valid", "")
+            good &= given
+        empty = np.flatnonzero(~good.any(axis=(1, 2)))
+        if len(empty):
+            raise NoValidPixelsError(
+                f"{details.get('name', 'observation')}: all {values[0].size} pixels of frame "
+                f"{int(empty[0])} are masked, not finite or without an error. Look at its DQ"
+            )
+        frames, ny, nx = values.shape
+        where = native_float64([(nx - 1) / 2, (ny - 1) / 2] if center is None else center)
+        scale = np.broadcast_to(np.asarray(pixelscale, dtype=float), (2,))
+        return cls(
+            np.where(good, values, 0.0),
+            np.where(good, sigma, 1.0),
+            good,
+            u.Unit(unit),
+            (float(scale[0]), float(scale[1])),
+            np.broadcast_to(where, (frames, 2)).copy(),
+            **details,
+        )
+
+    @classmethod
+    def from_fits(cls, path: str | os.PathLike[str]) -> Observation:
+        """Read a JWST stage-2 coronagraphic file (calints).
+
+        Uses SCI, ERR and DQ, BUNIT, FILTER, DATE-BEG, the aperture's pixel area, and the star's
+        position from STARCENX/Y, else CRPIX1/2 (1-indexed).
+
+        Raises
+        ------
+        CorruptFileError
+            No such file, truncated, or without a SCI extension.
+        UnitError
+            SCI has no unit.
+        ShapeError, NoValidPixelsError
+            As `from_arrays`.
+        """
+        path = Path(path)
+        with open_fits(path) as hdus:
+            if "SCI" not in hdus:
+                raise CorruptFileError(
+                    f"{path.name}: no SCI extension, only {[h.name for h in hdus]}; expected a "
+                    "JWST calints file"
+                )
+            science = hdus["SCI"]
+            header = hdus[0].header.copy()
+            header.update(science.header)
+            data = native_float64(science.data)
+            if "ERR" not in hdus:
+                raise CorruptFileError(f"{path.name}: no ERR extension; the fit needs errors")
+            error = native_float64(hdus["ERR"].data)
+            if "DQ" in hdus:
+                quality = np.asarray(hdus["DQ"].data).astype(np.uint32)
+            else:
+                warnings.warn(
+                    f"{path.name}: no DQ extension; only NaN pixels are masked",
+                    DiffrenderWarning,
+                    stacklevel=2,
+                )
+                quality = np.zeros(data.shape, dtype=np.uint32)
+        return cls.from_jwst(data, error, quality, header, name=path.name)
+
+    @classmethod
+    def from_jwst(
+        cls,
+        data: NDArray[Any],
+        error: NDArray[Any],
+        quality: NDArray[Any],
+        header: fits.Header,
+        name: str,
+    ) -> Observation:
+        """Make an observation of JWST arrays and their merged header; see `from_fits`."""
+        if not header.get("BUNIT"):
+            raise UnitError(f"{name}: SCI has no BUNIT; expected one such as 'MJy/sr'")
+        frames = 1 if np.ndim(data) == 2 else len(data)
+        star = [
+            header.get(key, header.get(fallback)) for key, fallback in
+            (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
+        ]  # fmt: skip
+        center = None if None in star else np.array(star, dtype=float) - 1
+        angle = header.get("ROLL_REF", 0.0) - header.get("V3I_YANG", 0.0) * header.get(
+            "VPARITY", -1
+        )
+        date = header.get("DATE-BEG") or header.get("DATE-OBS")
+        area = header.get("PIXAR_A2")
+        if not area:
+            raise UnitError(f"{name}: the header has no PIXAR_A2 (pixel area, arcsec^2)")
+        return cls.from_arrays(
+            data,
+            error,
+            valid=(np.asarray(quality).astype(np.uint32) & BAD_PIXEL_BITS) == 0,
+            unit=header["BUNIT"],
+            pixelscale=float(area) ** 0.5,
+            center=center,
+            filter=header.get("FILTER"),
+            date=Time(date, scale="utc") if date else None,
+            position_angles=np.full(frames, float(angle)),
+            name=name,
+            header=header,
+        )
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        return self.data.shape[1], self.data.shape[2]
+
+    def cutout(self, size: int) -> Observation:
+        """The `size` x `size` pixels about the star (whole pixels, so nothing is resampled).
+
+        Raises
+        ------
+        ShapeError
+            If that sticks out of the frame.
+        """
+        corners = np.round(self.center - (size - 1) / 2).astype(int)
+        ny, nx = self.shape
+        if corners.min() < 0 or (corners + size > (nx, ny)).any():
+            raise ShapeError(
+                f"{self.name}: {size} x {size} pixels about {tuple(self.center[0])} do not fit "
+                f"into {nx} x {ny}. Ask for fewer"
+            )
+
+        def cut(stack: NDArray[Any]) -> NDArray[Any]:
+            return np.stack(
+                [frame[y : y + size, x : x + size] for frame, (x, y) in
+                 zip(stack, corners, strict=True)]
+            )  # fmt: skip
+
+        return replace(
+            self,
+            data=cut(self.data),
+            error=cut(self.error),
+            valid=cut(self.valid),
+            center=self.center - corners,
+        )
+
+    def combined(self) -> Observation:
+        """One frame, the mean of all weighted by their inverse variances pixel by pixel.
+
+        Only for frames that see the star at the same place under the same wavefront.
+        """
+        weight = np.where(self.valid, self.error**-2, 0.0)
+        total = weight.sum(axis=0)
+        seen = total > 0
+        safe = np.where(seen, total, 1.0)
+        return replace(
+            self,
+            data=((weight * self.data).sum(axis=0) / safe)[None],
+            error=np.where(seen, safe**-0.5, 1.0)[None],
+            valid=seen[None],
+            center=self.center.mean(axis=0, keepdims=True),
+            position_angles=None if self.position_angles is None else self.position_angles[:1],
+        )

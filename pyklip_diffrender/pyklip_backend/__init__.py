@@ -1,0 +1,36 @@
+"""The pyKLIP backend: ``algo="diffrender"`` in `klip_dataset`.
+
+Importing this package does not import pyKLIP; `register` and `backend` do.
+"""
+
+from __future__ import annotations
+
+from pyklip_diffrender.pyklip_backend.frames import observation_from_dataset
+from pyklip_diffrender.pyklip_backend.registration import (
+    ALGORITHM,
+    backend,
+    is_registered,
+    register,
+    unregister,
+)
+from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.subtract import (
+    Fit,
+    Subtraction,
+    Subtractor,
+    subtract_by_refinement,
+)
+
+__all__ = [
+    "ALGORITHM",
+    "DiffrenderSettings",
+    "Fit",
+    "Subtraction",
+    "Subtractor",
+    "backend",
+    "is_registered",
+    "observation_from_dataset",
+    "register",
+    "subtract_by_refinement",
+    "unregister",
+]

@@ -1,0 +1,85 @@
+"""KLIP itself on arrays in memory, for comparisons in one run."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["klip_rdi"]
+
+
+def klip_rdi(
+    target: NDArray[np.float64],
+    references: NDArray[np.float64],
+    *,
+    numbasis: int = 9,
+    annuli: int = 5,
+    subsections: int = 4,
+    inner: float = 1.0,
+    wavelength: float = 4.5e-6,
+) -> NDArray[np.float64]:
+    """Subtract the star with pyKLIP's reference differential imaging.
+
+    Parameters
+    ----------
+    target : ndarray, (ny, nx)
+        The frame, star in the middle of the array.
+    references : ndarray, (frames, ny, nx)
+        Frames of a reference star.
+    numbasis : int
+        Karhunen-Loeve modes.
+    annuli, subsections : int
+        Division of the image, as in `pyklip.parallelized.klip_dataset`.
+    inner : float
+        Inner working angle, pixels.
+    wavelength : float
+        m.
+
+    Returns
+    -------
+    ndarray, (ny, nx)
+        The subtracted frame; NaN inside `inner` and outside the largest annulus.
+    """
+    from pyklip import rdi
+    from pyklip.instruments.Instrument import GenericData
+    from pyklip.parallelized import klip_dataset
+
+    ny, nx = target.shape
+    center = np.array([(nx - 1) / 2, (ny - 1) / 2])
+    stack = np.concatenate([target[None], references])
+    names = np.array(["target"] + [f"reference {k}" for k in range(len(references))])
+    dataset = GenericData(
+        target[None].copy(),
+        center[None],
+        parangs=np.zeros(1),
+        wvs=np.array([wavelength]),
+        IWA=inner,
+        filenames=names[:1],
+    )
+    # pyKLIP and its file writer print as they go.
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        contextlib.redirect_stdout(io.StringIO()),
+    ):
+        library = rdi.PSFLibrary(stack, center, names, compute_correlation=True)
+        library.prepare_library(dataset)
+        klip_dataset(
+            dataset,
+            mode="RDI",
+            outputdir=folder,
+            fileprefix="klip",
+            annuli=annuli,
+            subsections=subsections,
+            numbasis=[numbasis],
+            movement=0,
+            psf_library=library,
+            aligned_center=center,
+            numthreads=1,
+            algo="klip",
+            verbose=False,
+        )
+        return np.array(dataset.output[0, 0, 0], dtype=np.float64)

@@ -1,0 +1,193 @@
+"""Subtracted frames put where, and masked as, pyKLIP's `klip_parallelized` leaves them."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from astropy.stats import sigma_clipped_stats
+from numpy.typing import NDArray
+
+__all__ = ["Annuli", "aligned_before", "annuli_of", "fill", "noise_cube", "place", "slices"]
+
+
+@dataclass(frozen=True)
+class Annuli:
+    """The annuli pyKLIP would use, of which only the outer edges and a width matter here.
+
+    Attributes
+    ----------
+    inner, outer : float
+        Pixels; r < inner and r >= outer are NaN in a product.
+    width : float
+        Pixels; of the narrowest annulus, over which pyKLIP measures noise.
+    """
+
+    inner: float
+    outer: float
+    width: float
+
+
+def annuli_of(
+    imgs: NDArray[Any],
+    centers: NDArray[Any],
+    inner: float,
+    outer: float | None,
+    annuli: int,
+    spacing: str,
+) -> Annuli:
+    """Find the edges as pyKLIP does, with its rule for data sets that do not set an OWA.
+
+    Parameters
+    ----------
+    imgs : ndarray
+        (n, ny, nx) frames.
+    centers : ndarray
+        (n, 2) star centres [x, y].
+    inner, outer : float
+        IWA and OWA in pixels; None for the whole image.
+    annuli : int
+        Number of annuli.
+    spacing : str
+        "constant", "log" or "linear".
+
+    Raises
+    ------
+    ValueError
+        By pyKLIP, for annuli narrower than a pixel.
+    """
+    from pyklip.klip import define_annuli_bounds
+
+    edge = outer
+    if edge is None:
+        y, x = np.indices(imgs.shape[1:])
+        squared = (x - centers[0][0]) ** 2 + (y - centers[0][1]) ** 2
+        bad = np.isnan(imgs[0])
+        edge = np.sqrt(np.percentile(squared[bad], 1) if bad.any() else squared.max())
+    bounds = [tuple(b) for b in define_annuli_bounds(annuli, inner, edge, spacing)]
+    if outer is None:
+        bounds[-1] = (bounds[-1][0], imgs.shape[1])
+    return Annuli(bounds[0][0], bounds[-1][1], min(b - a for a, b in bounds))
+
+
+def fill(residual: NDArray[np.float64], good: NDArray[np.bool_]) -> int:
+    """Replace flagged pixels by the median of good neighbours, in place.
+
+    The spline that shifts and turns frames would make one bad pixel ring over a dozen others.
+    NaN pixels stay NaN; where no pixel within two is good, a flagged one becomes NaN.
+
+    Parameters
+    ----------
+    residual : ndarray
+        (ny, nx) frame minus star.
+    good : ndarray
+        (ny, nx) bool, False for flagged pixels.
+
+    Returns
+    -------
+    int
+        How many were replaced.
+    """
+    trusted = np.where(good, residual, np.nan)
+    flagged = np.argwhere(~good & np.isfinite(residual))
+    for y, x in flagged:
+        for reach in (1, 2):
+            near = trusted[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
+            near = near[np.isfinite(near)]
+            if near.size:
+                break
+        residual[y, x] = np.median(near) if near.size else np.nan
+    return len(flagged)
+
+
+def place(
+    residual: NDArray[np.float64],
+    old_center: NDArray[np.float64],
+    new_center: NDArray[np.float64],
+    annuli: Annuli,
+) -> NDArray[np.float64]:
+    """Shift one subtracted frame to the common centre, mask it, take its pedestal away.
+
+    Parameters
+    ----------
+    residual : ndarray
+        (ny, nx) frame minus star.
+    old_center, new_center : ndarray
+        [x, y], 0-indexed.
+    annuli : Annuli
+        What is kept.
+
+    Returns
+    -------
+    ndarray
+        (ny, nx). The pedestal is the sigma-clipped median, which companions do not move: KLIP
+        makes the mean of each section zero, and what reads its products counts on that.
+    """
+    from pyklip.klip import align_and_scale
+
+    if not np.isfinite(residual).any():
+        return np.full(residual.shape, np.nan)
+    placed = np.asarray(align_and_scale(residual, new_center=new_center, old_center=old_center))
+    y, x = np.indices(placed.shape)
+    r = np.hypot(x - new_center[0], y - new_center[1])
+    placed[(r < annuli.inner) | (r >= annuli.outer)] = np.nan
+    kept = np.isfinite(placed)
+    if kept.any():
+        placed -= sigma_clipped_stats(placed[kept])[1]
+    return placed
+
+
+def slices(frames: NDArray[np.float64], count: int, dtype: Any) -> NDArray[Any]:
+    """Repeat (n, ny, nx) `count` times in pyKLIP's number type: (count, n, ny, nx).
+
+    A method without a KL cut-off has one answer, and products have one slice per entry of
+    numbasis, because later steps index them by it.
+    """
+    number = np.dtype(ctypes.c_float if dtype is None else dtype)
+    return np.repeat(frames.astype(number)[np.newaxis], count, axis=0)
+
+
+def noise_cube(
+    frames: NDArray[np.float64],
+    center: NDArray[np.float64],
+    annuli: Annuli,
+    numthreads: int | None,
+) -> NDArray[np.float64]:
+    """Azimuthal scatter of each frame by pyKLIP's own measure, (n, ny, nx), for weighted means."""
+    from pyklip.parallelized import generate_noise_maps
+
+    maps = generate_noise_maps(
+        frames, center, annuli.width, IWA=annuli.inner, OWA=annuli.outer, numthreads=numthreads
+    )
+    return np.asarray(maps)
+
+
+def aligned_before(
+    imgs: NDArray[Any],
+    centers: NDArray[Any],
+    wavelengths: NDArray[Any],
+    center: NDArray[np.float64],
+    dtype: Any,
+) -> NDArray[Any]:
+    """Frames before the subtraction, centred and scaled to each wavelength, as for save_aligned.
+
+    Returns
+    -------
+    ndarray
+        (wavelengths, n, ny, nx).
+    """
+    from pyklip.klip import align_and_scale
+
+    number = np.dtype(ctypes.c_float if dtype is None else dtype)
+    return np.array(
+        [
+            [
+                align_and_scale(img, new_center=center, old_center=old, scale_factor=to / at)
+                for img, old, at in zip(imgs, centers, wavelengths, strict=True)
+            ]
+            for to in np.unique(wavelengths)
+        ],
+        dtype=number,
+    )

@@ -1,0 +1,107 @@
+"""What all refinement methods share: data, noise, the forward model in the data's unit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.errors import NoValidPixelsError, ShapeError
+from pyklip_diffrender.observation import Observation
+from pyklip_diffrender.opd import OPDMap, resample
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.parameters import parameter
+
+__all__ = ["Problem"]
+
+
+@dataclass
+class Problem:
+    """One star image to be explained.
+
+    Frames of an observation that share star and wavefront are averaged first, with their
+    inverse variances as weights.
+
+    Attributes
+    ----------
+    model : OpticalSystem
+    observation : Observation
+        As given.
+    initial : OPDMap
+    start : dict
+        Starting values of optical parameters, and of "flux" and "background" where known.
+    """
+
+    model: OpticalSystem
+    observation: Observation
+    initial: OPDMap
+    start: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.observation.shape != self.model.detector.shape:
+            ny, nx = self.model.detector.shape
+            raise ShapeError(
+                f"the observation has {self.observation.shape[0]} x {self.observation.shape[1]} "
+                f"pixels, the model {ny} x {nx}. Cut with observation.cutout({ny}), or make the "
+                "model with fov_pixels to match"
+            )
+        combined = self.observation.combined()
+        device = self.model.device
+        self.data = torch.from_numpy(combined.data[0]).to(device)
+        self.sigma = torch.from_numpy(combined.error[0]).to(device)
+        self.valid = torch.from_numpy(combined.valid[0]).to(device)
+        if not bool(self.valid.any()):
+            raise NoValidPixelsError(f"{self.observation.name}: all pixels are masked")
+        opd = resample(self.initial.data, self.model.npix)
+        self.opd0 = torch.from_numpy(np.ascontiguousarray(opd)).to(device)
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels that are fitted."""
+        return int(self.valid.sum())
+
+    def optical_start(self, names: tuple[str, ...]) -> dict[str, Tensor]:
+        """Starting values of the named optical parameters and of any given otherwise."""
+        values = {}
+        wanted = dict.fromkeys((*names, *self.start))
+        for name in wanted:
+            if name not in self.model.parameters:
+                continue
+            entry = parameter(name)
+            given = np.broadcast_to(self.start.get(name, entry.default), (entry.size,))
+            values[name] = torch.tensor(given.copy(), dtype=torch.float64, device=self.model.device)
+        return values
+
+    def flux_and_background(
+        self, image: Tensor, sigma: Tensor, names: tuple[str, ...]
+    ) -> tuple[float, float]:
+        """Weighted least-squares flux and background for a rendered star.
+
+        A parameter that is not in `names` keeps its start (flux must then have been given).
+        """
+        weight = torch.where(self.valid, sigma**-2, 0.0)
+        flux = float(self.start.get("flux", 0.0))
+        level = float(self.start.get("background", 0.0))
+        columns = []
+        if "flux" in names:
+            columns.append(image)
+        if "background" in names:
+            columns.append(torch.ones_like(image))
+        target = self.data - (0 if "flux" in names else flux) * image
+        target = target - (0 if "background" in names else level)
+        if columns:
+            design = torch.stack(columns).flatten(1)
+            # Columns of very different size: solve for them in units of their own length.
+            length = torch.sqrt((design**2 * weight.flatten()).sum(dim=1))
+            scaled = design / length[:, None]
+            solution = torch.linalg.solve(
+                (scaled * weight.flatten()) @ scaled.T,
+                (scaled * weight.flatten()) @ target.flatten(),
+            )
+            found = (solution / length).tolist()
+            flux = found[0] if "flux" in names else flux
+            level = found[-1] if "background" in names else level
+        return flux, level

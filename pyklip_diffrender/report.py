@@ -1,0 +1,132 @@
+"""Figures. The only module that imports matplotlib, and only when a figure is drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyklip_diffrender.demo import DemoResult
+from pyklip_diffrender.files import replacing
+from pyklip_diffrender.geometry import PupilGrid, maskrnd_openings, polygon_coverage
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["draw_demo", "draw_image", "save"]
+
+_INK = "#1b1f24"
+
+
+def save(figure: Figure, path: str | Path, dpi: int = 150) -> None:
+    """Write a figure in one step."""
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=dpi, facecolor="white")
+
+
+def draw_image(
+    ax: Axes,
+    image: NDArray[np.float64],
+    pixelscale: float,
+    *,
+    limits: tuple[float, float],
+    cmap: str,
+    title: str,
+    norm: Any = None,
+) -> Any:
+    """Show an image with its axes in arcseconds from the middle, y up.
+
+    Returns
+    -------
+    AxesImage
+    """
+    half_y, half_x = (n * pixelscale / 2 for n in image.shape)
+    shown = ax.imshow(
+        image,
+        origin="lower",
+        extent=(-half_x, half_x, -half_y, half_y),
+        cmap=cmap,
+        interpolation="nearest",
+        **({"norm": norm} if norm is not None else {"vmin": limits[0], "vmax": limits[1]}),
+    )
+    ax.set_title(title, fontsize=10, color=_INK, loc="left")
+    ax.tick_params(labelsize=8, colors=_INK)
+    return shown
+
+
+def draw_demo(result: DemoResult) -> Figure:
+    """The demo in one figure: frame, four subtractions in units of the noise, wavefronts."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(14, 7.4), layout="constrained")
+    axes = figure.subplots(2, 4)
+    scale = result.model.detector.pixelscale[0]
+    frame = result.observation.data[0]
+    shown = draw_image(
+        axes[0, 0], np.maximum(frame, 1), scale, limits=(0, 1), cmap="magma",
+        norm=LogNorm(float(np.percentile(frame, 2)), float(frame.max())),
+        title="Frame: the occulted star hides the planet",
+    )  # fmt: skip
+    figure.colorbar(shown, ax=axes[0, 0], label="photons", shrink=0.85)
+
+    planet = result.scene.planets[0]
+    places = ((0, 1, "initial"), (0, 2, "KLIP"), (0, 3, "optimal"), (1, 0, "refined"))
+    titles = {
+        "initial": f"Star from the {result.table.meta['hours']:.0f} h old wavefront",
+        "KLIP": "KLIP, nine dithered references",
+        "optimal": "True star (the best there is)",
+        "refined": "Star from the refined wavefront",
+    }
+    for row, column, name in places:
+        ax = axes[row, column]
+        facts = result.table[list(result.table["star model"]).index(name)]
+        shown = draw_image(
+            ax, result.images[name] / result.noise, scale, limits=(-6, 6), cmap="RdBu_r",
+            title=f"{titles[name]}\nSNR {facts['annulus SNR']:.1f}, planet light kept "
+            f"{100 * facts['planet throughput']:.0f} %",
+        )  # fmt: skip
+        ax.plot(*planet.offset, "o", mfc="none", mec=_INK, ms=13, mew=1.2, clip_on=True)
+        figure.colorbar(shown, ax=ax, label="residual / noise", shrink=0.85)
+
+    grid = PupilGrid.full(result.model.npix, result.model.diameter)
+    stop = polygon_coverage(maskrnd_openings(), grid).numpy() > 0.5
+    true_change = 1e9 * (result.true_opd - result.measured.data)
+    found_change = 1e9 * (result.fit.opd - result.measured.data)
+    limit = float(np.percentile(np.abs(true_change[stop]), 99.5))
+    for ax, change, title in (
+        (axes[1, 1], true_change, "True change of the wavefront\nseen through the Lyot stop"),
+        (axes[1, 2], found_change, "Change found from one frame\n(prior, no reference star)"),
+    ):
+        seen = np.where(stop, change - change[stop].mean(), np.nan)
+        shown = draw_image(
+            ax, seen, grid.spacing, limits=(-limit, limit), cmap="PuOr_r", title=title
+        )
+        ax.set_xlabel("m", fontsize=8)
+        figure.colorbar(shown, ax=ax, label="nm", shrink=0.85)
+
+    ax = axes[1, 3]
+    history = result.fit.history
+    steps = [entry["iteration"] for entry in history]
+    ax.semilogy(steps, [entry["chi2_per_pixel"] for entry in history], "-", color=_INK, lw=1)
+    for wavefront, colour, label in ((False, "#c0631a", "alignment"), (True, "#5b3f95", "all")):
+        chosen = [e for e in history if e["wavefront"] is wavefront]
+        ax.semilogy(
+            [e["iteration"] for e in chosen], [e["chi2_per_pixel"] for e in chosen], "o",
+            color=colour, label=f"{label} free", ms=5,
+        )  # fmt: skip
+    ax.axhline(1, color="0.6", lw=0.8, zorder=0)
+    ax.set_title(
+        f"Refinement: {result.fit.status.name.lower().replace('_', ' ')}\nin "
+        f"{result.fit.seconds:.0f} s",
+        fontsize=10, color=_INK, loc="left",
+    )  # fmt: skip
+    ax.set_xlabel("iteration", fontsize=9)
+    ax.set_ylabel("chi2 per pixel", fontsize=9)
+    ax.legend(frameon=False, fontsize=8)
+    for ax in (*axes[0], axes[1, 0]):
+        ax.set_xlabel("arcsec", fontsize=8)
+    return figure

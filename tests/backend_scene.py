@@ -1,0 +1,112 @@
+"""Small datasets for the tests of the backend, with a star that can be rendered exactly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from pyklip_diffrender.opd import OPDMap, as_opd_map
+from pyklip_diffrender.pyklip_backend import DiffrenderSettings, Fit, Subtraction
+
+SHAPE = (48, 44)
+CENTER = (21.25, 24.5)
+RIPPLE = 2e-9 * np.hypot(*np.mgrid[-32:32, -32:32])
+OPD = as_opd_map(RIPPLE)
+BACKGROUND = 3.0
+
+
+def psf(x: float, y: float, shape: tuple[int, int] = SHAPE) -> NDArray[np.float64]:
+    """A speckled star at (x, y), peak about 1: not round, so that flips and turns show."""
+    j, i = np.indices(shape)
+    dx, dy = i - x, j - y
+    r2 = dx**2 + dy**2
+    return np.exp(-r2 / 18) * (1 + 0.3 * np.cos(0.9 * dx + 0.4 * dy)) + 0.02 / (1 + r2 / 60)
+
+
+def planet(x: float, y: float, shape: tuple[int, int] = SHAPE) -> NDArray[np.float64]:
+    j, i = np.indices(shape)
+    return np.exp(-((i - x) ** 2 + (j - y) ** 2) / (2 * 1.4**2))
+
+
+def frames(angles: Any, rng: np.random.Generator, noise: float = 0.05) -> NDArray[np.float64]:
+    """Star, background and a companion 12 pixels up on the sky, one frame for each angle."""
+    cube = []
+    for angle in angles:
+        # pyKLIP will turn the frame counter-clockwise by the angle: the companion is behind it.
+        t = np.radians(90 - angle)
+        companion = planet(CENTER[0] + 12 * np.cos(t), CENTER[1] + 12 * np.sin(t))
+        cube.append(1000 * psf(*CENTER) + BACKGROUND + 2 * companion)
+    return np.array(cube) + rng.normal(0, noise, (len(cube), *SHAPE))
+
+
+def generic(imgs: NDArray[Any], angles: Any, wvs: Any = None, **kw: Any) -> Any:
+    """Make a GenericData as in scripts: no FITS header anywhere."""
+    from pyklip.instruments.Instrument import GenericData
+
+    n = len(imgs)
+    return GenericData(
+        np.array(imgs),
+        np.tile(kw.pop("center", CENTER), (n, 1)),
+        parangs=np.asarray(angles, dtype=float),
+        wvs=np.full(n, 4.44) if wvs is None else np.asarray(wvs),
+        IWA=3,
+        filenames=np.array([f"frame{i}" for i in range(n)]),
+        **kw,
+    )
+
+
+def render(observation: Any, opd: OPDMap, settings: DiffrenderSettings) -> Subtraction:
+    """Least-squares fit of the true star and a background: an honest, tiny subtractor."""
+    star = np.empty_like(observation.data)
+    chi2 = 0.0
+    for i, (x, y) in enumerate(observation.center):
+        good = observation.valid[i]
+        terms = np.stack([psf(x, y, star.shape[1:]), np.ones(star.shape[1:])])
+        a, b = terms[:, good] / observation.error[i][good], observation.data[i][good]
+        weights, *_ = np.linalg.lstsq(a.T, b / observation.error[i][good], rcond=None)
+        star[i] = np.tensordot(weights, terms, 1)
+        chi2 += float(np.mean(((star[i] - observation.data[i]) / observation.error[i])[good] ** 2))
+    fit = Fit(tuple(range(len(star))), "converged", chi2 / len(star), observation)
+    return Subtraction(star, "least-squares", 7, (fit,))
+
+
+def calints(
+    path: Path,
+    rng: np.random.Generator,
+    roll: float = 0.0,
+    center: tuple[float, float] = (20.7, 25.2),
+    nints: int = 2,
+) -> NDArray[np.float64]:
+    """Write a file as the JWST pipeline does and return its pixels; two pixels are flagged."""
+    data = np.array([1000 * psf(*center) + BACKGROUND for _ in range(nints)])
+    data += rng.normal(0, 0.05, data.shape)
+    flags = np.zeros(data.shape, np.uint32)
+    flags[:, 30, 30], data[:, 30, 30] = 1, 5e3
+    flags[:, 8, 9] = 512
+    primary = fits.Header(
+        {
+            "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON", "FILTER": "F444W",
+            "PUPIL": "MASKRND", "CORONMSK": "MASKA335R", "XOFFSET": 0.0, "YOFFSET": 0.0,
+            "DATE-BEG": "2022-07-30T01:02:03",
+        }
+    )  # fmt: skip
+    science = fits.Header(
+        {
+            "BUNIT": "MJy/sr", "PIXAR_A2": 0.062424185**2, "CRPIX1": center[0] + 1,
+            "CRPIX2": center[1] + 1, "CRVAL1": 201.0, "CRVAL2": -51.0, "ROLL_REF": roll,
+            "V3I_YANG": 0.0, "VPARITY": -1,
+        }
+    )  # fmt: skip
+    fits.HDUList(
+        [
+            fits.PrimaryHDU(header=primary),
+            fits.ImageHDU(data.astype(np.float32), science, name="SCI"),
+            fits.ImageHDU(np.full(data.shape, 0.05, np.float32), name="ERR"),
+            fits.ImageHDU(flags, name="DQ"),
+        ]
+    ).writeto(path)
+    return data

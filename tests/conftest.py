@@ -1,0 +1,76 @@
+"""Fixtures for all tests, and an environment in which two runs give the same numbers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+# Before numpy or torch are imported: thread pools read these once.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(_name, "1")
+# No test opens a window.
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import settings
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# A deadline measures how busy the machine is; derandomised, a failure is there again tomorrow.
+settings.register_profile("diffrender", deadline=None, derandomize=True)
+settings.load_profile("diffrender")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _torch_threads() -> Iterator[None]:
+    """One thread per xdist worker: more would only make the workers wait for each other."""
+    before = torch.get_num_threads()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A fresh generator with a fixed seed, the same for every test."""
+    return np.random.default_rng(335)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of real frames and wavefront maps, too large to come with the code.
+
+    It is ``data`` in the folder named by PYKLIP_DIFFRENDER_SHARED, or in ``shared`` next to the
+    project. Without either, the tests that need it are skipped; a variable that points nowhere
+    is a mistake, and fails them.
+    """
+    named = os.environ.get("PYKLIP_DIFFRENDER_SHARED")
+    data = (Path(named) if named else ROOT.parent / "shared") / "data"
+    if data.is_dir():
+        return data
+    if named:
+        pytest.fail(f"PYKLIP_DIFFRENDER_SHARED={named}: there is no folder {data}")
+    pytest.skip(
+        "needs real frames and wavefront maps: put a folder 'shared' next to the project or "
+        "name one in PYKLIP_DIFFRENDER_SHARED"
+    )
+
+
+@pytest.fixture(scope="session")
+def stpsf_path(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """An offline data directory with 256 samples across the pupil, set as STPSF_PATH."""
+    from stpsf_data import make_stpsf_data
+
+    before = os.environ.get("STPSF_PATH")
+    folder = make_stpsf_data(tmp_path_factory.mktemp("stpsf") / "data", npix=256)
+    os.environ["STPSF_PATH"] = str(folder)
+    yield folder
+    if before is None:
+        del os.environ["STPSF_PATH"]
+    else:
+        os.environ["STPSF_PATH"] = before

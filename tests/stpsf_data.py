@@ -1,0 +1,202 @@
+"""An offline STPSF data directory made from the embedded geometry, without any symmetry.
+
+With it the real stpsf runs anywhere. Shapes are those of the telescope; aberrations are made up,
+of the right size, and such that any flip, transposition or mixed-up sign changes the image. The
+Lyot stop lacks one opening, the pupil has an extra obstruction.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from astropy.io import fits
+from astropy.table import Table
+from numpy.typing import NDArray
+
+from pyklip_diffrender.geometry import (
+    JWST_DIAMETER,
+    PupilGrid,
+    jwst_pupil,
+    jwst_segments,
+    maskrnd_openings,
+    polygon_coverage,
+)
+from pyklip_diffrender.spectrum import filter_throughput
+
+Array = NDArray[np.float64]
+
+FILTERS = ("F200W", "F335M", "F444W")
+SENSORS = [str(number) for number in range(481, 491)]
+# Interpixel capacitance of the long-wave detector of module A, and a post-pixel coupling.
+IPC = np.array([[3.9e-4, 6e-3, 3.8e-4], [5.9e-3, 0.97456, 6e-3], [3.8e-4, 6.1e-3, 3.9e-4]])
+PPC = np.array([[0, 0, 0], [0, 0.99877, 0.00123], [0, 0, 0]])
+
+
+def lopsided(npix: int, seed: int, rms: float) -> Array:
+    """A smooth map of the given rms over the square, m: low-order waves of random phase."""
+    rng = np.random.default_rng(seed)
+    axis = (np.arange(npix) - (npix - 1) / 2) / npix
+    total = np.zeros((npix, npix))
+    for _ in range(24):
+        fx, fy = rng.normal(scale=2.5, size=2)
+        phase = 2 * np.pi * (fx * axis[None, :] + fy * axis[:, None] + rng.uniform())
+        total += rng.normal() * np.cos(phase)
+    return rms * (total - total.mean()) / total.std()
+
+
+@cache
+def pupil(npix: int) -> Array:
+    """Entrance pupil, 0 or 1, with an extra block in the lower left."""
+    array = (jwst_pupil(npix) > 0.5).numpy().astype(float)
+    array[npix // 4 : npix // 4 + npix // 10, npix // 5 : npix // 5 + npix // 12] = 0
+    return array
+
+
+@cache
+def segments(npix: int) -> Array:
+    """Number of the segment, 1 to 18, at every sample."""
+    labels = np.zeros((npix, npix))
+    for number, outline in enumerate(jwst_segments().values(), start=1):
+        labels[polygon_coverage([outline], PupilGrid.full(npix)).numpy() > 0.5] = number
+    return labels
+
+
+@cache
+def lyot_stop(npix: int) -> Array:
+    """MASKRND without its first opening, entrance-pupil orientation."""
+    return polygon_coverage(maskrnd_openings()[1:], PupilGrid.full(npix)).numpy()
+
+
+def _image(path: Path, data: NDArray[np.generic], npix: int, **keywords: object) -> None:
+    header = fits.Header({**keywords, "PUPLSCAL": JWST_DIAMETER / npix, "PUPLDIAM": JWST_DIAMETER})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fits.PrimaryHDU(data, header).writeto(path)
+
+
+def _zernike_table(path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = []
+    corners = {"A": (0.2, 2.7), "B": (-2.7, -0.2)}
+    for module, (left, right) in corners.items():
+        for channel in ("LW", "SW"):
+            base = rng.normal(scale=15e-9, size=36) / np.sqrt(1 + np.arange(36) / 4)
+            for number, (v2, v3) in enumerate(
+                (a, b) for a in np.linspace(left, right, 3) for b in (-9.5, -8.1, -6.1)
+            ):
+                values = base + rng.normal(scale=2e-9, size=36)
+                rows.append((f"NIRCam{channel}{module}", f"P{number}", v2, v3, *values))
+    names = ["instrument", "field_point_name", "V2", "V3", *(f"Zernike_{k}" for k in range(1, 37))]
+    Table(rows=rows, names=names).write(path)
+
+
+def _field_dependence(path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    keywords = {
+        "INSTR": "NIRCam",
+        "WFBASIS": "Noll Zernikes",
+        "FIEBASIS": "Legendre Polynomials",
+        "NCOEFWF": 78,
+        "NCOEFFIE": 15,
+        "FIEORDER": 4,
+        "FANGUNIT": "arcmin",
+        "OPDUNIT": "nm",
+        "MINXFIE": -3.0,
+        "MAXXFIE": 3.0,
+        "MINYFIE": -3.0,
+        "MAXYFIE": 3.0,
+        "V2SIGN": -1.0,
+        "V2ORIGIN": 0.0,
+        "V3SIGN": 1.0,
+        "V3ORIGIN": -7.8,
+    }
+    hdus = fits.HDUList([fits.PrimaryHDU(header=fits.Header(keywords))])
+    for _ in range(2):
+        values = rng.normal(scale=2, size=(15, 78)) / np.sqrt(1 + np.arange(78))
+        hdus.append(fits.BinTableHDU(Table(values, names=[f"Z{k}" for k in range(1, 79)])))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    hdus.writeto(path)
+
+
+def _kernels(path: Path, kernel: Array) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cubes = [fits.ImageHDU(kernel[None], name=sensor) for sensor in SENSORS]
+    fits.HDUList([fits.PrimaryHDU(), *cubes]).writeto(path)
+
+
+def _filter(path: Path, name: str) -> None:
+    if name == "F200W":  # stpsf wants it to exist; nothing here looks through it.
+        wavelength, throughput = np.linspace(1.7e-6, 2.3e-6, 50), np.ones(50)
+        throughput[[0, -1]] = 0
+    else:
+        wavelength, throughput = filter_throughput(name)
+    table = fits.BinTableHDU(
+        Table([wavelength * 1e10, throughput], names=["WAVELENGTH", "THROUGHPUT"])
+    )
+    table.header["WAVEUNIT"] = "Angstrom"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(path)
+
+
+def wss_file(path: Path, seed: int = 5, date: str = "2022-08-11T02:00:00") -> None:
+    """A wavefront-sensing product as MAST has it: 256 x 256, microns, 0 where there is none."""
+    opd = lopsided(256, seed, 0.07) * pupil(256)
+    primary = fits.PrimaryHDU(
+        header=fits.Header({"APERNAME": "NRCA3_FP1", "DATE-OBS": date[:10], "TIME-OBS": date[11:]})
+    )
+    hdus = [primary, fits.ImageHDU(opd.astype(np.float32), name="RESULT_PHASE")]
+    hdus.append(fits.ImageHDU(np.zeros((4, 4), np.float32), name="EXPECTED_PHASE"))
+    fits.HDUList(hdus).writeto(path)
+
+
+def make_stpsf_data(folder: Path, npix: int = 256) -> Path:
+    """Write the directory.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if it is not there.
+    npix : int
+        Samples across the pupil; stpsf's own files have 1024.
+
+    Returns
+    -------
+    Path
+        `folder`, for STPSF_PATH.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "version.txt").write_text("2.1.0\n", encoding="utf-8")
+    nircam = folder / "NIRCam"
+    nircam.mkdir()
+    (nircam / "filters.tsv").write_text(
+        "filter\tnlambda\n" + "".join(f"{name}\t9\n" for name in FILTERS), encoding="utf-8"
+    )
+    name = f"RevW_npix{npix}.fits.gz"
+    _image(folder / f"jwst_pupil_{name}", pupil(npix).astype(np.uint8), npix)
+    _image(
+        folder / f"JWpupil_segments_{name}", segments(npix).astype(np.uint8), npix, VERSION="RevW"
+    )
+    opd = (lopsided(npix, 1, 66e-9) * pupil(npix)).astype(np.float32)
+    _image(folder / "JWST_OTE_OPD_cycle1_example_2022-07-30.fits", opd, npix, BUNIT="m")
+    _image(nircam / "optics" / "NIRCam_Lyot_Somb.fits.gz", lyot_stop(npix), npix)
+    wedge = lyot_stop(npix) * (np.abs(np.arange(npix) - npix / 2)[:, None] > npix / 12)
+    _image(nircam / "optics" / "NIRCam_Lyot_Sinc.fits.gz", wedge, npix)
+    for number, file in enumerate(("si_zernikes_coron_wfe.fits", "si_zernikes_isim_cv3.fits")):
+        _zernike_table(folder / file, 10 + number)
+    _field_dependence(nircam / "OPD" / "field_dep_table_nircam.fits", 20)
+    for field_point in ("fp1", "fp6"):
+        phase = lopsided(1024, 30, 40e-9).astype(np.float32)
+        path = nircam / "OPD" / f"wss_target_phase_{field_point}.fits"
+        _image(path, phase, 1024, BUNIT="m")
+    _kernels(nircam / "IPC" / "KERNEL_IPC_CUBE.fits", IPC)
+    _kernels(nircam / "IPC" / "KERNEL_PPC_CUBE.fits", PPC)
+    for filter_name in FILTERS:
+        _filter(nircam / "filters" / f"{filter_name}_throughput.fits", filter_name)
+    return folder
+
+
+def zernike_tensor(seed: int) -> torch.Tensor:
+    """36 small Noll coefficients, m."""
+    return torch.from_numpy(np.random.default_rng(seed).normal(scale=5e-9, size=36))

@@ -1,0 +1,305 @@
+"""``algo="diffrender"`` on JWSTData: the recorded pixels, errors, flags and headers are used."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from backend_scene import CENTER, OPD, SHAPE, calints, planet, psf, render
+from pyklip import fakes
+from pyklip.instruments import JWST
+from pyklip.instruments.JWST import JWSTData
+from pyklip.klip import align_and_scale
+from pyklip.parallelized import klip_dataset
+
+from pyklip_diffrender.errors import NoValidPixelsError
+from pyklip_diffrender.pyklip_backend import (
+    DiffrenderSettings,
+    backend,
+    observation_from_dataset,
+    register,
+    unregister,
+)
+
+NATIVE = (20.7, 25.2)
+MIDDLE = ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
+
+pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
+
+
+@pytest.fixture(autouse=True)
+def _offline(monkeypatch: pytest.MonkeyPatch) -> None:
+    """JWSTData asks a web service for its filters and falls back to tables without."""
+
+    def refuse(**kw: Any) -> None:
+        raise OSError("offline")
+
+    monkeypatch.setattr(JWST.SvoFps, "get_filter_list", refuse)
+
+
+@pytest.fixture
+def registered() -> Iterator[None]:
+    register(opd=OPD, subtractor=render)
+    yield
+    unregister()
+
+
+@pytest.fixture
+def files(tmp_path: Path, rng: np.random.Generator) -> list[str]:
+    """Two rolls of the target, two integrations each."""
+    paths = []
+    for i, roll in enumerate((0.0, 10.0, 0.0)):
+        path = tmp_path / f"jw0138600{i}_calints.fits"
+        calints(path, rng, roll, NATIVE)
+        paths.append(str(path))
+    return paths[:2]
+
+
+@pytest.fixture
+def reference(files: list[str]) -> list[str]:
+    """Another star, two integrations."""
+    return [files[0].replace("jw01386000", "jw01386002")]
+
+
+def reduce(dataset: Any, folder: Path, **kw: Any) -> tuple[np.ndarray, fits.Header]:
+    folder.mkdir(exist_ok=True)
+    options = {
+        "mode": "ADI", "annuli": 1, "subsections": 1, "numbasis": [1, 2], "movement": 0,
+        "numthreads": 1, "verbose": False, "algo": "diffrender", **kw,
+    }  # fmt: skip
+    klip_dataset(dataset, outputdir=str(folder), fileprefix="x", **options)
+    path = folder / "x-KLmodes-all.fits"
+    return fits.getdata(path), fits.getheader(path)
+
+
+def test_reading_is_the_same_and_the_reader_is_put_back(
+    files: list[str], reference: list[str]
+) -> None:
+    plain = JWSTData(files, reference)
+    readdata = vars(JWSTData)["readdata"]
+    register(opd=OPD)
+    try:
+        captured = JWSTData(files, reference)
+        assert vars(JWSTData)["readdata"] is not readdata
+        assert JWSTData.readdata.__doc__ == readdata.__doc__
+    finally:
+        unregister()
+    assert vars(JWSTData)["readdata"] is readdata
+    new = set(vars(captured)) - set(vars(plain))
+    assert new == {"_diffrender_source"}
+    for name, value in vars(plain).items():
+        if isinstance(value, np.ndarray) and value.dtype != object:
+            np.testing.assert_array_equal(getattr(captured, name), value)
+
+
+@pytest.mark.usefixtures("registered")
+def test_the_fit_gets_recorded_pixels_errors_flags_and_headers(
+    files: list[str], rng: np.random.Generator
+) -> None:
+    dataset = JWSTData(files)
+    observation = observation_from_dataset(copy.deepcopy(dataset))
+    recorded = np.concatenate([fits.getdata(path, "SCI") for path in files])
+    good = observation.valid
+    np.testing.assert_array_equal(observation.data[good], recorded[good])
+    np.testing.assert_allclose(observation.error[good], 0.05, rtol=1e-6)
+    # DO_NOT_USE, which pyKLIP leaves in, and NON_SCIENCE.
+    assert not good[:, 30, 30].any()
+    assert not good[:, 8, 9].any()
+    assert good.sum() == good.size - 2 * len(good)
+    np.testing.assert_allclose(observation.center, np.tile(NATIVE, (4, 1)))
+    np.testing.assert_allclose(observation.position_angles, [0, 0, 10, 10])
+    np.testing.assert_allclose(observation.pixelscale, 0.062424185)
+    assert observation.filter == "F444W"
+    assert observation.unit == u.MJy / u.sr
+    assert observation.date.isot.startswith("2022-07-30T01:02:03")
+    assert observation.header["CORONMSK"] == "MASKA335R"
+    assert observation.header["BUNIT"] == "MJy/sr"
+
+
+@pytest.mark.usefixtures("registered")
+def test_center_keywords_and_dithers(tmp_path: Path, rng: np.random.Generator) -> None:
+    path = tmp_path / "a_calints.fits"
+    calints(path, rng)
+    fits.setval(path, "STARCENX", value=22.0, ext=1)
+    fits.setval(path, "STARCENY", value=24.0, ext=1)
+    fits.setval(path, "XOFFSET", value=0.062424185)
+    for kw, expected in (
+        ({}, (22.0, 23.0)),
+        ({"center_include_offset": False}, (21.0, 23.0)),
+        ({"center_keywords": ["CRPIX1", "CRPIX2"]}, (21.7, 25.2)),
+    ):
+        observation = observation_from_dataset(JWSTData([str(path)], **kw))
+        np.testing.assert_allclose(observation.center[0], expected)
+
+
+@pytest.mark.usefixtures("registered")
+def test_products_are_aligned_as_pyklip_aligns_and_keep_its_header(
+    files: list[str], reference: list[str], tmp_path: Path
+) -> None:
+    runs = {}
+    for algo in ("klip", "diffrender"):
+        dataset = JWSTData(files, reference)
+        runs[algo] = (
+            *reduce(
+                dataset, tmp_path / algo, algo=algo, save_ints=True, time_collapse="weighted-mean"
+            ),
+            dataset,
+        )
+    klip, klip_header, klip_dataset_ = runs["klip"]
+    ours, header, dataset = runs["diffrender"]
+    assert set(header) >= set(klip_header)
+    for key in set(klip_header) - {"HISTORY"}:
+        assert header[key] == klip_header[key]
+    assert (header["PSFCENTX"], header["STARCENX"]) == (22.0, 23.0)
+    np.testing.assert_array_equal(dataset.output_centers, klip_dataset_.output_centers)
+    assert dataset.allints.shape == (2, 1, 4, *SHAPE)
+    assert header["DRPIXELS"] == "recorded"
+    assert header["DRNOISE"] == "ERR"
+    assert header["DRFILT"] == "F444W"
+    assert ours.shape == klip.shape
+    assert header["DRFILLED"] == 4
+    # The flagged pixel of 5000 does not ring: all is noise.
+    assert np.isfinite(ours[0]).sum() > 1000
+    assert np.nanstd(ours[0]) < 0.05
+    assert np.nanmax(np.abs(ours[0])) < 0.3
+
+
+@pytest.mark.usefixtures("registered")
+def test_companions_injected_after_reading_are_in_what_is_fitted_and_kept(
+    files: list[str], tmp_path: Path
+) -> None:
+    dataset = JWSTData(files)
+    copied = copy.deepcopy(dataset)
+    dataset.diffrender = DiffrenderSettings(seed=5)
+    fakes.inject_planet(
+        copied.input, copied.centers, 3.0, copied.wcs, radius=13.0, pa=0.0, fwhm=4.0
+    )
+    clean, _ = reduce(dataset, tmp_path / "clean", aligned_center=MIDDLE)
+    image, header = reduce(copied, tmp_path / "injected", aligned_center=MIDDLE)
+    assert header["DRPIXELS"] == "recorded"
+    difference = (image - clean)[0]
+    j, i = np.indices(SHAPE)
+    truth = 3.0 * np.exp(
+        -4 * np.log(2) * ((i - MIDDLE[0]) ** 2 + (j - MIDDLE[1] - 13) ** 2) / 4.0**2
+    )
+    stamp = np.s_[31:43, 15:28]
+    np.testing.assert_allclose(difference[stamp], truth[stamp], atol=0.2)
+    assert difference[stamp].sum() == pytest.approx(truth[stamp].sum(), rel=0.05)
+    assert np.abs(clean[0][stamp]).max() < 0.3
+    [made] = copied.diffrender_results
+    assert made.subtraction.worst.result.valid.sum() == 4 * (clean[0].size - 2)
+
+
+@pytest.mark.usefixtures("registered")
+def test_a_pixel_masked_by_hand_is_not_fitted(files: list[str], tmp_path: Path) -> None:
+    dataset = JWSTData(files)
+    dataset.input[0, 14, 12] = np.nan
+    observation = observation_from_dataset(dataset)
+    lost = np.argwhere(~observation.valid[0] & observation.valid[1])
+    assert 1 <= len(lost) <= 9
+    shift = np.array(NATIVE[::-1]) - MIDDLE[::-1]
+    np.testing.assert_allclose(lost.mean(axis=0), np.array([14, 12]) + shift, atol=1.0)
+    reduce(dataset, tmp_path, skip_derot=True, aligned_center=MIDDLE)
+    assert np.isnan(dataset.output[0, 0, 0, 14, 12])
+    assert np.isfinite(dataset.output[0, 1, 0, 14, 12])
+
+
+@pytest.mark.usefixtures("registered")
+def test_a_changed_dataset_is_taken_as_it_is(
+    files: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    dataset = JWSTData(files)
+    dataset.pad_input(5)
+    with caplog.at_level(logging.WARNING):
+        image, header = reduce(dataset, tmp_path)
+    assert "changed since it was read" in caplog.text
+    assert header["DRPIXELS"] == "as given"
+    assert header["DRNOISE"] == "estimated"
+    assert header["DRFILT"] == "F444W"
+    assert image.shape == (2, SHAPE[0] + 10, SHAPE[1] + 10)
+
+    repaired = JWSTData(files)
+    repaired.input = np.nan_to_num(repaired.input)
+    assert reduce(repaired, tmp_path)[1]["DRPIXELS"] == "as given"
+
+
+def test_a_dataset_read_before_registering_still_works(files: list[str], tmp_path: Path) -> None:
+    dataset = JWSTData(files)
+    with backend(opd=OPD, subtractor=render):
+        _, header = reduce(dataset, tmp_path, algo="klip")
+    assert header["DRPIXELS"] == "as given"
+    # The wavelength is one of the table that pyKLIP looked it up in.
+    assert header["DRFILT"] == "F444W"
+
+
+@pytest.mark.usefixtures("registered")
+def test_files_without_errors_or_flags(
+    tmp_path: Path, rng: np.random.Generator, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "a_calints.fits"
+    calints(path, rng)
+    with fits.open(path) as hdus:
+        science, primary = hdus["SCI"].copy(), hdus[0].copy()
+    science.data = science.data[0]
+    fits.HDUList([primary, science]).writeto(path, overwrite=True)
+    observation = observation_from_dataset(JWSTData(str(path)))
+    assert observation.valid.all()
+    assert (observation.error > 0).all()
+    np.testing.assert_array_equal(observation.data[0], science.data)
+
+
+@pytest.mark.usefixtures("registered")
+def test_all_flagged(files: list[str], tmp_path: Path) -> None:
+    for path in files:
+        with fits.open(path, mode="update") as hdus:
+            hdus["DQ"].data[:] = 1
+    with pytest.raises(NoValidPixelsError, match=r"jw01386000_calints.*DQ flags"):
+        reduce(JWSTData(files), tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.usefixtures("registered")
+def test_no_files(tmp_path: Path) -> None:
+    with pytest.raises(UserWarning, match="No science files"):
+        JWSTData([])
+
+
+@pytest.mark.usefixtures("registered")
+def test_a_reader_that_shifts_otherwise_is_not_believed(
+    files: list[str], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def other(img: np.ndarray, new_center: Any, old_center: Any = None, **kw: Any) -> np.ndarray:
+        return align_and_scale(img, new_center, np.asarray(old_center) + 0.5, **kw)
+
+    calls = []
+
+    def alternate(*args: Any, **kw: Any) -> np.ndarray:
+        calls.append(args)
+        return (other if len(calls) <= 4 else align_and_scale)(*args, **kw)
+
+    monkeypatch.setattr("pyklip.klip.align_and_scale", alternate)
+    with caplog.at_level(logging.WARNING):
+        dataset = JWSTData(files)
+    assert "shifted these frames in a way not known here" in caplog.text
+    assert not hasattr(dataset, "_diffrender_source")
+    assert np.isfinite(psf(*CENTER)).all()
+    assert planet(*CENTER).max() > 0.8
+
+
+def test_the_real_frames(shared_data: Path, tmp_path: Path) -> None:
+    path = shared_data / "hip65426_f444w_calints.fits.gz"
+    with backend(opd=OPD):
+        dataset = JWSTData([str(path)])
+        observation = observation_from_dataset(dataset)
+    assert observation.data.shape == (2, 320, 320)
+    np.testing.assert_allclose(observation.center, [[159.5, 158.5]] * 2)
+    np.testing.assert_array_equal(observation.data, fits.getdata(path, "SCI"))
+    assert observation.filter == "F444W"
+    assert observation.date.isot.startswith("2022-07-30")

@@ -1,0 +1,197 @@
+"""``algo="diffrender"`` end to end: a rendered star, an outdated wavefront, a script as usual."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from astropy.io import fits
+from numpy.typing import NDArray
+from pyklip.instruments.Instrument import GenericData
+from pyklip.parallelized import klip_dataset
+
+from pyklip_diffrender.bases import default_basis
+from pyklip_diffrender.errors import NoValidPixelsError, RefinementError
+from pyklip_diffrender.nircam import nircam_coronagraph
+from pyklip_diffrender.observation import Observation
+from pyklip_diffrender.opd import random_drift, random_opd
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, subtract_by_refinement
+from pyklip_diffrender.pyklip_backend.windows import Window, extent
+
+# torch.func.jvp of torch 2.13 compiles its own decompositions with torch.jit.script.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:`torch.jit.script` is deprecated:DeprecationWarning"
+)
+
+SHAPE = (44, 40)
+PAD = 6
+ANGLES = (0.0, 90.0)
+FLUX, CONTRAST, SEPARATION = 1e10, 4e-5, 0.8
+SKY = 100.0
+ALIGNED = {"free": ("flux", "background"), "wavefront": False}
+NUMERICS: dict[str, Any] = {"npix": 128, "occulter_sampling": 2.0, "monochromatic": 4.44e-6}
+OLD = random_opd(1, npix=128)
+NEW = OLD.data + random_drift(2, 40.0, npix=128).data
+
+
+def planet_pixels(angle: float) -> tuple[float, float]:
+    """Where pyKLIP turns up to north from: x, y offset of the companion in a frame, arcsec."""
+    t = np.radians(90 - angle)
+    return SEPARATION * float(np.cos(t)), SEPARATION * float(np.sin(t))
+
+
+@pytest.fixture(scope="module")
+def small() -> OpticalSystem:
+    """What fits: 32 pixels, fewer than the frames have."""
+    return nircam_coronagraph("F444W", fov_pixels=32, **NUMERICS)
+
+
+@pytest.fixture(scope="module")
+def frames() -> NDArray[np.float64]:
+    """Photons of star, companion and sky in two rolls, with noise."""
+    camera = nircam_coronagraph("F444W", fov_pixels=SHAPE, **NUMERICS)
+    rng = np.random.default_rng(4)
+    with torch.no_grad():
+        photons = [
+            FLUX * (camera(NEW) + CONTRAST * camera(NEW, star_offset=planet_pixels(a))).numpy()
+            for a in ANGLES
+        ]
+    return rng.poisson(np.array(photons) + SKY).astype(np.float64)
+
+
+def dataset(frames: NDArray[np.float64], model: Any, **settings: Any) -> GenericData:
+    """Frames padded with NaN as spaceKLIP does, and no header."""
+    padded = np.pad(frames, ((0, 0), (PAD, PAD), (PAD, PAD)), constant_values=np.nan)
+    center = ((SHAPE[1] - 1) / 2 + PAD, (SHAPE[0] - 1) / 2 + PAD)
+    made = GenericData(
+        padded,
+        np.tile(center, (len(frames), 1)),
+        parangs=np.array(ANGLES[: len(frames)]),
+        wvs=np.full(len(frames), 4.44),
+        IWA=2,
+        filenames=np.array([f"roll{i}" for i in range(len(frames))]),
+    )
+    made.OWA = 40.0
+    made.diffrender = DiffrenderSettings(
+        model=model,
+        error=np.sqrt(np.nan_to_num(np.abs(padded), nan=1.0)),
+        refine_options={"basis": default_basis(6.0), "response_npix": 128},
+        **settings,
+    )
+    return made
+
+
+def reduce(made: Any, folder: Path) -> tuple[NDArray[np.float64], fits.Header]:
+    klip_dataset(
+        made, mode="ADI", outputdir=str(folder), fileprefix="x", annuli=1, subsections=1,
+        numbasis=[1], movement=0, numthreads=1, verbose=False, algo="klip",
+        aligned_center=made.centers[0],
+    )  # fmt: skip
+    cube, header = fits.getdata(folder / "x-KLmodes-all.fits", header=True)
+    return cube[0].astype(np.float64), header
+
+
+def test_star_goes_companion_stays(
+    small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path
+) -> None:
+    made = dataset(frames, small)
+    with backend(opd=OLD):
+        refined, outdated = copy.deepcopy(made), copy.deepcopy(made)
+        image, header = reduce(refined, tmp_path)
+        outdated.diffrender = replace(made.diffrender, refine_options=ALIGNED)
+        reduce(outdated, tmp_path)
+    x, y = made.centers[0]
+    peak = np.unravel_index(np.nanargmax(image), image.shape)
+    np.testing.assert_allclose(peak, (y + SEPARATION / 0.062424185, x), atol=1.0)
+    camera = nircam_coronagraph("F444W", fov_pixels=SHAPE, **NUMERICS)
+    truth = FLUX * CONTRAST * float(camera(NEW, star_offset=planet_pixels(0.0)).max())
+    # A subtracted best fit takes part of the companion for star: 40 to 70 % are known to stay.
+    assert 0.4 * truth < np.nanmax(image) < 1.15 * truth
+
+    # The star itself is closer to the truth than the outdated wavefront makes it.
+    star = FLUX * camera(NEW).numpy()
+
+    def wrong(reduced: Any) -> float:
+        found = reduced.diffrender_results[0].subtraction.star[0, PAD:-PAD, PAD:-PAD] - SKY
+        pull = (found - star) / np.sqrt(star + SKY)
+        return float(np.sqrt(np.mean(pull[6:-6, 4:-4] ** 2)))
+
+    assert wrong(refined) < 0.5 * wrong(outdated)
+
+    # The fit saw 32 x 32 pixels, the product covers all that the frames hold.
+    assert np.isfinite(image).sum() > 1.0 * frames[0].size
+    assert header["DRNFIT"] == len(ANGLES)
+    assert header["DRMETH"] == "gauss-newton"
+    assert header["DRSTAT"] in ("converged", "model_mismatch")
+    fits_of_rolls = refined.diffrender_results[0].subtraction.fits
+    assert header["DRCHI2"] == pytest.approx(max(f.result.chi2_per_pixel for f in fits_of_rolls))
+    assert header["DROPD"] == OLD.name
+    assert header["DRSHA256"] == OLD.sha256
+
+
+def test_a_model_without_recipe_is_good_for_its_own_square(
+    small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path, caplog: Any
+) -> None:
+    bare = OpticalSystem(small.entrance, small.planes, small.detector, small.bandpass)
+    made = dataset(frames[:1], bare, fit_pixels=32)
+    with backend(opd=OLD, refine_options=ALIGNED):
+        image, _ = reduce(made, tmp_path)
+    assert "pixels outside its 32 x 32 are NaN" in caplog.text
+    assert 800 < np.isfinite(image).sum() <= 32**2
+
+
+def test_a_fit_that_diverges_stops_the_reduction(
+    small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path
+) -> None:
+    made = dataset(-frames[:1], small)
+    with (
+        backend(opd=OLD, refine_options=ALIGNED),
+        pytest.raises(RefinementError, match="roll0: stopped") as caught,
+    ):
+        reduce(made, tmp_path)
+    assert caught.value.result.star_image.shape == (32, 32)
+    assert list(tmp_path.iterdir()) == []
+    assert made.output is None
+
+
+def test_each_roll_and_dither_has_its_own_fit(
+    small: OpticalSystem, frames: NDArray[np.float64]
+) -> None:
+    cube = frames[[0, 1, 0, 0]]
+    center = np.array([[19.5, 21.5], [19.5, 21.5], [20.5, 21.5], [19.5, 21.5]])
+    observation = Observation.from_arrays(
+        cube, np.sqrt(cube), pixelscale=0.0624, center=center,
+        position_angles=np.array([0.0, 10.0, 0.0, 0.0]), filter="F444W",
+    )  # fmt: skip
+    settings = DiffrenderSettings(model=small, refine_options=ALIGNED)
+    found = subtract_by_refinement(observation, OLD, settings)
+    assert [fit.frames for fit in found.fits] == [(0, 3), (1,), (2,)]
+    assert found.star.shape == cube.shape
+    np.testing.assert_array_equal(found.star[0], found.star[3])
+    assert np.isfinite(found.star).all()
+
+
+def test_windows_that_stick_out_of_the_frame(rng: np.random.Generator) -> None:
+    cube = rng.normal(size=(2, 10, 12))
+    observation = Observation.from_arrays(cube, np.ones_like(cube), pixelscale=0.06, center=(1, 8))
+    window = Window.about(observation.center[0], (5, 7))
+    part = window.of(observation)
+    assert part.shape == (5, 7)
+    np.testing.assert_array_equal(part.center, [[3, 2]] * 2)
+    assert part.valid.sum() == 2 * 4 * 5
+    back = window.paste(part.data[0], (10, 12))
+    kept = np.isfinite(back)
+    assert kept.sum() == 4 * 5
+    np.testing.assert_array_equal(back[kept], cube[0][kept])
+    with pytest.raises(NoValidPixelsError, match="Check the star centre"):
+        Window.about(np.array([-40.0, 5.0]), (5, 7)).of(observation)
+
+    observation.valid[:] = False
+    observation.valid[1, 2:5, 3:9] = True
+    assert extent(observation) == Window(2, 3, (3, 6))

@@ -1,0 +1,345 @@
+"""`from_webbpsf` against the real stpsf, on an offline data directory without symmetry."""
+
+from __future__ import annotations
+
+import copy
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+from astropy.io import fits
+from numpy.typing import NDArray
+from stpsf_data import lopsided, pupil, zernike_tensor
+
+from pyklip_diffrender.bridges import from_webbpsf, opd_to_webbpsf
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    NonFiniteError,
+    UnitError,
+)
+from pyklip_diffrender.geometry import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.zernike import zernike_basis
+
+Array = NDArray[np.float64]
+
+NPIX = 256
+FAST = {
+    "monochromatic": 4.5e-6,
+    "fft_oversample": 2,
+    "detector_oversample": 1,
+    "fov_pixels": 60,
+}
+
+
+@pytest.fixture
+def nircam(stpsf_path: Path) -> Callable[..., Any]:
+    """Make a configured stpsf.NIRCam."""
+    import stpsf
+
+    def make(
+        image_mask: str | None = "MASK335R",
+        pupil_mask: str | None = "MASKRND",
+        band: str = "F444W",
+        **options: Any,
+    ) -> Any:
+        instrument = stpsf.NIRCam()
+        instrument.filter = band
+        instrument.image_mask, instrument.pupil_mask = image_mask, pupil_mask
+        instrument.pupil = str(stpsf_path / f"jwst_pupil_RevW_npix{NPIX}.fits.gz")
+        instrument.options.update(options)
+        return instrument
+
+    return make
+
+
+def error(image: Any, truth: Any) -> float:
+    return float(np.abs(np.asarray(image) - np.asarray(truth)).max() / np.max(truth))
+
+
+@pytest.mark.parametrize("flipped", [True, False])
+def test_the_flip_of_the_internal_wavefront_is_recorded_and_can_be_chosen(
+    nircam: Callable[..., Any], flipped: bool
+) -> None:
+    instrument = nircam()
+    kind = instrument._si_wfe_class
+
+    class AsBefore220(kind):  # type: ignore[misc, valid-type]
+        """The aberrations without the flip that stpsf 2.2.0 brought."""
+
+        def __init__(self, owner: Any) -> None:
+            super().__init__(owner)
+            if not flipped:
+                self.opd = self.opd[::-1]
+
+    model = from_webbpsf(instrument, flip_si_wfe=flipped, **FAST)
+    assert model.si_wfe_flipped is flipped
+    assert model.calc_psf()[0].header["DRSIFLIP"] is flipped
+    assert from_webbpsf(instrument, **FAST).si_wfe_flipped is True
+    assert error(model(), from_webbpsf(instrument, **FAST)()) < 1e-12 or not flipped
+    instrument._si_wfe_class = AsBefore220
+    truth = instrument.calc_psf(**FAST)
+    assert error(model(), truth[1].data) < 1e-10
+    other = from_webbpsf(nircam(), flip_si_wfe=not flipped, **FAST)
+    assert error(other(), truth[1].data) > 1e-3
+
+
+def test_keywords_and_extensions_are_those_of_stpsf(nircam: Callable[..., Any]) -> None:
+    instrument = nircam(source_offset_r=0.1, source_offset_theta=20.0)
+    truth = instrument.calc_psf(**FAST)
+    psf = from_webbpsf(instrument, **FAST).calc_psf()
+    assert [hdu.name for hdu in psf] == [hdu.name for hdu in truth]
+    for mine, theirs in zip(psf, truth, strict=True):
+        keys = set(theirs.header) - {"HISTORY", "DATE", "FFTTYPE", "AUTHOR"}
+        assert keys <= set(mine.header)
+        different = {k for k in keys if mine.header[k] != theirs.header[k]}
+        # The drop of the peak by jitter, from images that agree to rounding.
+        assert different <= {"JITRSTRL"}
+        assert mine.header["DRPROP"] == "MASK335R: compact"
+
+
+def test_a_script_for_stpsf_runs_unchanged(nircam: Callable[..., Any], tmp_path: Path) -> None:
+    instrument = nircam()
+    model = from_webbpsf(instrument)
+    path = str(tmp_path / "psf.fits")
+    call = {"monochromatic": 4.2e-6, "fov_pixels": 40, "oversample": 2}
+    truth = instrument.calc_psf(**call)
+    psf = model.calc_psf(outfile=path, **call)
+    with fits.open(path) as written:
+        for k in range(4):
+            assert error(psf[k].data, truth[k].data) < 1e-10
+            assert np.array_equal(written[k].data, psf[k].data)
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        model.calc_psf(outfile=path, overwrite=False, **call)
+    arcsec = {"monochromatic": 4.2e-6, "fov_arcsec": 1.6, "fft_oversample": 2}
+    one = {"detector_oversample": 1, "add_distortion": False, "normalize": "last"}
+    truth = instrument.calc_psf(**arcsec, **one)
+    psf, waves = model.calc_psf(**arcsec, **one, return_intermediates=False), None
+    assert len(psf) == len(truth) == 2
+    assert error(psf[1].data, truth[1].data) < 1e-10
+    psf, waves = model.calc_psf(**arcsec, detector_oversample=1, return_intermediates=True)
+    assert len(waves) == 6
+    assert waves[-1].shape == psf[0].data.shape
+    with pytest.raises(IncompatibleSetupError, match="not all three"):
+        model.calc_psf(oversample=2, fft_oversample=2, detector_oversample=2)
+
+
+def test_the_users_object_and_the_model_do_not_touch_each_other(
+    nircam: Callable[..., Any],
+) -> None:
+    instrument = nircam(source_offset_x=0.05)
+    settings = copy.deepcopy(instrument.options)
+    model = from_webbpsf(instrument, **FAST)
+    image = model()
+    model.calc_psf(add_distortion=False)
+    assert instrument.options == settings
+    instrument.options["source_offset_x"] = 1.0
+    instrument.image_mask = "MASK430R"
+    assert torch.equal(model(), image)
+    assert torch.equal(model.with_fidelity()(), image)
+
+
+def test_a_refined_wavefront_goes_back(nircam: Callable[..., Any]) -> None:
+    instrument = nircam()
+    model = from_webbpsf(instrument, add_distortion=True, **FAST)
+    opd = lopsided(NPIX, 99, 50e-9) * pupil(NPIX)
+    instrument.pupilopd = opd_to_webbpsf(opd, instrument)
+    truth = instrument.calc_psf(**FAST)
+    assert error(model(opd), truth["DET_DIST"].data) < 1e-10
+    again = from_webbpsf(instrument, **FAST)
+    assert np.abs(again.entrance.opd.numpy() - opd).max() < 1e-20
+    # Upside down, or without taking out the field dependence, it would not be the same image.
+    with pytest.warns(DiffrenderWarning, match="upside down"):
+        instrument.pupilopd = opd_to_webbpsf(opd[::-1].copy(), instrument)
+    assert error(model(opd), instrument.calc_psf(**FAST)["DET_DIST"].data) > 1e-2
+    instrument.pupilopd[0].data = opd
+    assert error(model(opd), instrument.calc_psf(**FAST)["DET_DIST"].data) > 1e-4
+
+
+def test_the_lyot_stop_moves_as_in_stpsf_by_whole_samples(nircam: Callable[..., Any]) -> None:
+    """stpsf shifts in the exit pupil, where y is inverted, by whole samples."""
+    shift = 5 / NPIX
+    truth = nircam(pupil_shift_x=shift * 1.001, pupil_shift_y=-2 * shift * 1.001).calc_psf(**FAST)
+    model = from_webbpsf(nircam(), **FAST)
+    assert error(model(lyot_shift=(shift, 2 * shift)), truth[1].data) < 1e-9
+    assert error(model(lyot_shift=(0.0, 0.0), lyot_rotation=0.0), model()) < 1e-12
+    assert error(model(lyot_shift=(shift, -2 * shift)), truth[1].data) > 1e-2
+    # Rotated by splines there and by cubic convolution here, of an unsmoothed edge.
+    turned = nircam(pupil_rotation=-1.0).calc_psf(**FAST)[1].data
+    right, wrong = (error(model(lyot_rotation=angle), turned) for angle in (1.0, -1.0))
+    assert right < 0.02 < 5 * right < wrong
+
+
+def test_zernikes_add_to_the_internal_wavefront(nircam: Callable[..., Any]) -> None:
+    instrument = nircam()
+    coefficients = zernike_tensor(3)
+    grid = PupilGrid.full(NPIX)
+    basis = zernike_basis(36, grid.x, grid.y, JWST_DIAMETER / 2)
+    extra = torch.tensordot(coefficients, basis, dims=1).numpy()[::-1]
+    kind = instrument._si_wfe_class
+
+    class Changed(kind):  # type: ignore[misc, valid-type]
+        """The aberrations with some more of them."""
+
+        def __init__(self, owner: Any) -> None:
+            super().__init__(owner)
+            self.opd = self.opd + extra
+
+    model = from_webbpsf(instrument, **FAST)
+    instrument._si_wfe_class = Changed
+    truth = instrument.calc_psf(**FAST)[1].data
+    assert error(model(si_zernikes=coefficients), truth) < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "step"),
+    [
+        ("star_offset", [0.013, -0.021], 1e-4),
+        ("lyot_shift", [0.0031, -0.0052], 1e-6),
+        ("lyot_rotation", [0.31], 1e-4),
+        ("si_zernikes", None, 1e-10),
+        ("detector_shift", [0.011, 0.023], 1e-4),
+        ("blur", [0.02], 1e-4),
+        ("opd", None, 1e-10),
+    ],
+)
+def test_gradients(
+    nircam: Callable[..., Any], name: str, value: list[float] | None, step: float
+) -> None:
+    """Through the whole chain to DET_DIST, against finite differences of fourth order."""
+    model = from_webbpsf(nircam(), add_distortion=True, **{**FAST, "fov_pixels": 30})
+    at = (
+        torch.from_numpy(lopsided(NPIX, 4, 60e-9)) if name == "opd" else zernike_tensor(5)
+    ) if value is None else torch.tensor(value, dtype=torch.float64)  # fmt: skip
+    generator = torch.manual_seed(6)
+    weight = torch.randn(30, 30, generator=generator, dtype=torch.float64)
+    direction = torch.randn(at.shape, generator=generator, dtype=torch.float64)
+
+    def function(v: torch.Tensor) -> torch.Tensor:
+        return (model(**{name: v}) * weight).sum()
+
+    variable = at.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(function(variable), variable)
+    f = [function(at + k * step * direction).detach() for k in (-2, -1, 1, 2)]
+    found = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * step)
+    wanted = (gradient * direction).sum()
+    assert abs(found - wanted) <= 1e-6 * abs(wanted)
+
+
+def test_another_instrument_is_refused(stpsf_path: Path) -> None:
+    with pytest.raises(IncompatibleSetupError, match="expected an stpsf.NIRCam"):
+        from_webbpsf("NIRCam")
+
+
+def test_wavelengths_that_do_not_fit(nircam: Callable[..., Any]) -> None:
+    with pytest.raises(IncompatibleSetupError, match="too short for NIRCam long wave"):
+        from_webbpsf(nircam(), monochromatic=2e-6)
+    with pytest.warns(DiffrenderWarning, match=r"3\.5e-06 m is outside F444W"):
+        from_webbpsf(nircam(), **{**FAST, "monochromatic": 3.5 * u.um})
+
+
+@pytest.mark.parametrize(
+    ("change", "expected", "complaint"),
+    [
+        (lambda opd: opd * 1e6, UnitError, "in microns"),
+        (lambda opd: np.where(pupil(NPIX) > 0, np.nan, opd), NonFiniteError, "NaN"),
+    ],
+)
+def test_maps_that_cannot_be_right(
+    nircam: Callable[..., Any],
+    change: Callable[[Array], Array],
+    expected: type[Exception],
+    complaint: str,
+) -> None:
+    instrument = nircam()
+    opd = change(lopsided(NPIX, 7, 60e-9) * pupil(NPIX))
+    header = fits.Header({"BUNIT": "m", "PUPLSCAL": JWST_DIAMETER / NPIX})
+    instrument.pupilopd = fits.HDUList([fits.PrimaryHDU(opd, header)])
+    with pytest.raises(expected, match=complaint):
+        from_webbpsf(instrument, **FAST)
+    with pytest.raises(expected, match=complaint):
+        opd_to_webbpsf(opd, nircam())
+
+
+def test_a_map_upside_down_is_noticed(nircam: Callable[..., Any]) -> None:
+    instrument = nircam()
+    opd = (lopsided(NPIX, 8, 60e-9) * pupil(NPIX))[::-1]
+    header = fits.Header({"BUNIT": "m", "PUPLSCAL": JWST_DIAMETER / NPIX})
+    instrument.pupilopd = fits.HDUList([fits.PrimaryHDU(opd, header)])
+    with pytest.warns(DiffrenderWarning, match="match the pupil upside down"):
+        from_webbpsf(instrument, **FAST)
+
+
+def test_a_wrong_shape_says_so(nircam: Callable[..., Any]) -> None:
+    with pytest.raises(IncompatibleSetupError, match=r"got shape \(100, 100\)"):
+        opd_to_webbpsf(np.zeros((100, 100)), nircam())
+
+
+@pytest.fixture
+def incomplete(stpsf_path: Path, tmp_path: Path) -> Iterator[Path]:
+    """A copy of the data directory to take files from."""
+    folder = tmp_path / "incomplete"
+    shutil.copytree(stpsf_path, folder)
+    os.environ["STPSF_PATH"] = str(folder)
+    yield folder
+    os.environ["STPSF_PATH"] = str(stpsf_path)
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [
+        "si_zernikes_coron_wfe.fits",
+        "NIRCam/optics/NIRCam_Lyot_Somb.fits.gz",
+        "JWST_OTE_OPD_cycle1_example_2022-07-30.fits",
+        "NIRCam/IPC/KERNEL_IPC_CUBE.fits",
+    ],
+)
+def test_a_missing_file_is_named_with_the_directory(
+    nircam: Callable[..., Any], incomplete: Path, missing: str
+) -> None:
+    instrument = nircam()
+    instrument._datapath = str(incomplete / "NIRCam")
+    instrument._STPSF_basepath = str(incomplete)
+    (incomplete / missing).unlink()
+    with pytest.raises(CorruptFileError, match="STPSF_PATH is") as caught:
+        from_webbpsf(instrument, add_distortion=True, **FAST)
+    assert Path(missing).name in str(caught.value)
+
+
+def test_unknown_jitter_is_refused(nircam: Callable[..., Any]) -> None:
+    with pytest.raises(IncompatibleSetupError, match="'linear' is not supported"):
+        from_webbpsf(nircam(jitter="linear"), **FAST)
+
+
+@pytest.mark.slow
+def test_the_older_name_works_as_well(stpsf_path: Path) -> None:
+    """webbpsf 2 is stpsf under another name and takes its path from WEBBPSF_PATH."""
+    code = f"""
+import webbpsf
+from pyklip_diffrender.bridges import from_webbpsf
+nircam = webbpsf.NIRCam()
+nircam.filter, nircam.image_mask, nircam.pupil_mask = "F444W", "MASK335R", "MASKRND"
+nircam.pupil = {str(stpsf_path / f"jwst_pupil_RevW_npix{NPIX}.fits.gz")!r}
+model = from_webbpsf(nircam, monochromatic=4.5e-6, fov_pixels=20, oversample=1)
+print("sum", float(model().sum()))
+"""
+    environment = {k: v for k, v in os.environ.items() if k != "STPSF_PATH"}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code],
+        cwd=Path(__file__).resolve().parents[1],
+        env={**environment, "WEBBPSF_PATH": str(stpsf_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout.split("sum")[1]) > 0

@@ -1,0 +1,155 @@
+"""Wavefront-sensing files, against stpsf's own loader."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.time import Time
+from stpsf_data import wss_file
+
+from pyklip_diffrender.bridges import from_webbpsf, load_wss_opd, load_wss_opd_by_date
+from pyklip_diffrender.bridges.wss import interpolate_wss
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    MissingOPDError,
+    UnitError,
+)
+
+NPIX = 256
+
+
+@pytest.fixture
+def wss(tmp_path: Path) -> Path:
+    path = tmp_path / "R2022081102-NRCA3_FP1-1.fits"
+    wss_file(path)
+    return path
+
+
+def test_it_is_the_map_that_stpsf_loads(stpsf_path: Path, wss: Path) -> None:
+    import stpsf
+
+    instrument = stpsf.NIRCam()
+    instrument.filter = "F444W"
+    instrument.image_mask, instrument.pupil_mask = "MASK335R", "MASKRND"
+    instrument.pupil = str(stpsf_path / f"jwst_pupil_RevW_npix{NPIX}.fits.gz")
+    instrument.load_wss_opd(str(wss), verbose=False)
+    loaded = load_wss_opd(wss, npix=NPIX)
+    truth = instrument.pupilopd[0].data
+    assert np.abs(loaded.opd - truth).max() <= 1e-12
+    for turned in (np.flipud, np.fliplr, np.transpose):
+        assert np.abs(turned(loaded.opd) - truth).max() > 1e-8
+    assert loaded.epoch == Time("2022-08-11T02:00:00")
+    assert loaded.aperture == "NRCA3_FP1"
+    assert any("sha256" in line for line in loaded.history)
+    # Through a file or an HDUList it is the same PSF.
+    call = {"monochromatic": 4.5e-6, "oversample": 1, "fov_pixels": 30}
+    wanted = from_webbpsf(instrument, **call)()
+    instrument.pupilopd = loaded.hdus()
+    assert np.abs((from_webbpsf(instrument, **call)() - wanted).numpy()).max() < 1e-12 * (
+        wanted.max()
+    )
+    assert loaded.hdus()[0].header["DATE-OBS"] == "2022-08-11"
+
+
+def test_finer_maps_are_placed_as_stpsf_places_them(stpsf_path: Path, wss: Path) -> None:
+    from stpsf import mast_wss
+
+    hdus = mast_wss.import_wss_opd(str(wss), npix_out=1024)
+    loaded = load_wss_opd(wss, npix=1024, backout_si_wfe=False)
+    inside = loaded.opd != 0
+    assert inside.mean() > 0.4
+    assert np.abs(loaded.opd - hdus[0].data)[inside].max() <= 1e-12
+    hdus.close()
+
+
+def test_without_stpsf_data_the_sum_can_be_read(wss: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("STPSF_PATH", raising=False)
+    loaded = load_wss_opd(wss, npix=NPIX, backout_si_wfe=False)
+    assert 4e-8 < loaded.opd[loaded.opd != 0].std() < 1e-7
+    with pytest.raises(CorruptFileError, match="backout_si_wfe=False"):
+        load_wss_opd(wss, npix=NPIX)
+
+
+def test_interpolation_in_time_warns(wss: Path, tmp_path: Path) -> None:
+    later = tmp_path / "R2022081402-NRCA3_FP1-1.fits"
+    wss_file(later, seed=6, date="2022-08-14T02:00:00")
+    maps = [load_wss_opd(path, npix=NPIX, backout_si_wfe=False) for path in (wss, later)]
+    with pytest.warns(DiffrenderWarning, match=r"interpolation, 67% of R2022081102"):
+        between = interpolate_wss(*maps, "2022-08-12T02:00:00")
+    assert np.allclose(between.opd, (2 * maps[0].opd + maps[1].opd) / 3, atol=1e-15)
+    assert between.epoch == Time("2022-08-12T02:00:00")
+    with pytest.raises(IncompatibleSetupError, match="not between"):
+        interpolate_wss(*maps, "2022-08-15")
+
+
+def test_by_date_through_stpsf(
+    stpsf_path: Path, wss: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from stpsf import mast_wss
+
+    asked = []
+
+    def found(date: Time, choice: str, output_path: str | None) -> str:
+        asked.append((date.isot, choice, output_path))
+        return str(wss)
+
+    monkeypatch.setattr(mast_wss, "get_opd_at_time", found)
+    loaded = load_wss_opd_by_date("2022-08-11T08:00:00", "before", npix=NPIX)
+    assert asked == [("2022-08-11T08:00:00.000", "before", None)]
+    assert loaded.name == wss.name
+
+    def unreachable(date: Time, choice: str, output_path: str | None) -> str:
+        raise ConnectionError("no route to host")
+
+    monkeypatch.setattr(mast_wss, "get_opd_at_time", unreachable)
+    with pytest.raises(MissingOPDError, match=r"no route to host.*pass its path to load_wss_opd"):
+        load_wss_opd_by_date("2022-08-11T08:00:00")
+    with pytest.raises(IncompatibleSetupError, match="'nearest'"):
+        load_wss_opd_by_date("2022-08-11T08:00:00", "nearest")
+
+
+def test_files_that_are_something_else(wss: Path, tmp_path: Path) -> None:
+    path = tmp_path / "other.fits"
+    fits.PrimaryHDU(np.zeros((4, 4))).writeto(path)
+    with pytest.raises(CorruptFileError, match="no extension RESULT_PHASE"):
+        load_wss_opd(path)
+    with pytest.raises(CorruptFileError, match="no such file"):
+        load_wss_opd(tmp_path / "none.fits")
+    with fits.open(wss) as hdus:
+        values = hdus["RESULT_PHASE"].data
+        hdus["RESULT_PHASE"].data = values * 1000
+        hdus.writeto(tmp_path / "nanometres.fits")
+        hdus["RESULT_PHASE"].data = values[::-1]
+        hdus.writeto(tmp_path / "upside_down.fits")
+        hdus["RESULT_PHASE"].data = values
+        hdus["RESULT_PHASE"].header["BUNIT"] = "radian"
+        hdus.writeto(tmp_path / "radians.fits")
+        del hdus["RESULT_PHASE"].header["BUNIT"]
+        del hdus[0].header["APERNAME"], hdus[0].header["DATE-OBS"]
+        hdus.writeto(tmp_path / "R2023010203-NRCA3_FP1-1.fits")
+    with pytest.raises(UnitError, match="must be in metres"):
+        load_wss_opd(tmp_path / "nanometres.fits", npix=NPIX, backout_si_wfe=False)
+    with pytest.warns(DiffrenderWarning, match="upside down"):
+        load_wss_opd(tmp_path / "upside_down.fits", npix=NPIX, backout_si_wfe=False)
+    with pytest.raises(IncompatibleSetupError, match="'radian'"):
+        load_wss_opd(tmp_path / "radians.fits", npix=NPIX, backout_si_wfe=False)
+    bare = tmp_path / "R2023010203-NRCA3_FP1-1.fits"
+    loaded = load_wss_opd(bare, npix=NPIX, backout_si_wfe=False)
+    assert loaded.epoch == Time("2023-01-02")
+
+
+def test_the_sensing_camera_must_be_known(stpsf_path: Path, wss: Path, tmp_path: Path) -> None:
+    with fits.open(wss) as hdus:
+        del hdus[0].header["APERNAME"]
+        hdus.writeto(tmp_path / "nameless.fits")
+        hdus[0].header["APERNAME"] = "NRCA3_FP9"
+        hdus.writeto(tmp_path / "unknown.fits")
+    with pytest.raises(CorruptFileError, match="no APERNAME"):
+        load_wss_opd(tmp_path / "nameless.fits", npix=NPIX)
+    with pytest.raises(CorruptFileError, match="NRCA3_FP9"):
+        load_wss_opd(tmp_path / "unknown.fits", npix=NPIX)

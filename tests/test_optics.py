@@ -1,0 +1,389 @@
+"""The optical system: conventions, energy, derivatives, bad input."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+
+from pyklip_diffrender.errors import (
+    IncompatibleSetupError,
+    NonFiniteError,
+    ShapeError,
+    UnitError,
+)
+from pyklip_diffrender.geometry import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.nircam import MASK335R_RADIUS, mask335r_complement, nircam_coronagraph
+from pyklip_diffrender.opd import random_opd
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
+from pyklip_diffrender.propagation import MatrixFourier
+from pyklip_diffrender.spectrum import blackbody, filter_bandpass, filter_names
+from pyklip_diffrender.units import ARCSEC
+
+WAVELENGTH = 4.5e-6
+
+
+def small(**changes: object) -> OpticalSystem:
+    settings = {"monochromatic": WAVELENGTH, "npix": 96, "fov_pixels": 24, **changes}
+    return nircam_coronagraph("F444W", **settings)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def opd() -> torch.Tensor:
+    return torch.from_numpy(random_opd(5, npix=96).data)
+
+
+def test_light_is_conserved_without_masks(opd: torch.Tensor) -> None:
+    """On a field of one period of the transform, the image holds all of the pupil's light."""
+    model = small(image_mask=None, pupil_mask=None, si_wfe=False)
+    period = WAVELENGTH / (JWST_DIAMETER / 96) / ARCSEC
+    scale = period / 192
+    full = small(image_mask=None, pupil_mask=None, si_wfe=False, fov_pixels=192, pixelscale=scale)
+    assert float(full(opd).sum()) == pytest.approx(1.0, rel=1e-10)
+    assert float(model(opd).sum()) < 1.0
+
+
+def test_the_coronagraph_never_makes_light(opd: torch.Tensor) -> None:
+    open_sum = float(small(image_mask=None, pupil_mask=None)(opd).sum())
+    stopped = float(small(image_mask=None)(opd).sum())
+    occulted = float(small()(opd).sum())
+    assert occulted < 0.1 * stopped < stopped < open_sum
+
+
+def test_a_source_at_positive_offset_appears_at_positive_offset() -> None:
+    model = small(image_mask=None, fov_pixels=31)
+    scale = model.detector.pixelscale[0]
+    image = model(None, (6 * scale, -4 * scale)).numpy()
+    assert np.unravel_index(image.argmax(), image.shape) == (15 - 4, 15 + 6)
+
+
+def test_detector_shift_moves_the_image_and_nothing_else(opd: torch.Tensor) -> None:
+    model = small()
+    scale = model.detector.pixelscale[0]
+    moved = model(opd, detector_shift=(3 * scale, -2 * scale))
+    torch.testing.assert_close(moved[:-2, 3:], model(opd)[2:, :-3], rtol=1e-10, atol=1e-16)
+
+
+def test_an_opd_tilt_moves_the_star_as_the_convention_says() -> None:
+    """exp(+2 pi i OPD / lambda) with y inverted between the pupils: +x and -y for a rising OPD."""
+    model = small(image_mask=None, si_wfe=False, fov_pixels=31)
+    axis = PupilGrid.full(96).x
+    angle = 5 * model.detector.pixelscale[0] * ARCSEC
+    in_x = model(-angle * axis[None, :].expand(96, 96)).numpy()
+    in_y = model(-angle * axis[:, None].expand(96, 96)).numpy()
+    assert np.unravel_index(in_x.argmax(), in_x.shape) == (15, 15 + 5)
+    assert np.unravel_index(in_y.argmax(), in_y.shape) == (15 - 5, 15)
+
+
+def test_shear_and_rectangular_pixels_sample_the_same_image(opd: torch.Tensor) -> None:
+    """Every pixel of a sheared, anisotropic array equals a small array centred on that pixel."""
+    model = small(pixelscale=(0.060, 0.065), shear=-0.02, fov_pixels=(9, 11))
+    image = model(opd)
+    point = small(fov_pixels=1, pixelscale=(0.060, 0.065))
+    for row, column in ((0, 0), (8, 2), (3, 10)):
+        x = (column - 5) * 0.060
+        y = (row - 4) * 0.065 - 0.02 * x
+        single = point(opd, detector_shift=(-x, -y))
+        assert float(single[0, 0]) == pytest.approx(float(image[row, column]), rel=1e-9)
+
+
+def test_oversampled_pixels_are_the_sum_of_their_samples(opd: torch.Tensor) -> None:
+    fine = small(fov_pixels=72, pixelscale=small().detector.pixelscale[0] / 3)(opd)
+    binned = fine.reshape(24, 3, 24, 3).sum(dim=(1, 3))
+    torch.testing.assert_close(small(oversample=3)(opd), binned, rtol=1e-10, atol=1e-18)
+
+
+def test_broadband_is_the_weighted_sum_of_wavelengths(opd: torch.Tensor) -> None:
+    model = small(monochromatic=None, nlambda=3)
+    reference = model.bandpass.mean_wavelength
+    total = sum(
+        weight * small(monochromatic=wavelength, chromatic_reference=reference)(opd)
+        for wavelength, weight in zip(
+            model.bandpass.wavelengths, model.bandpass.weights, strict=True
+        )
+    )
+    torch.testing.assert_close(model(opd), total, rtol=1e-12, atol=1e-20)
+
+
+def test_batches_equal_single_calls(opd: torch.Tensor) -> None:
+    model = small()
+    opds = torch.stack([opd, 2 * opd])
+    offsets = torch.tensor([[0.01, 0.0], [0.3, -0.2]], dtype=torch.float64)
+    batch = model(opds, offsets)
+    for k in range(2):
+        torch.testing.assert_close(batch[k], model(opds[k], offsets[k]), rtol=1e-10, atol=1e-18)
+
+
+def test_float32_is_close_to_float64(opd: torch.Tensor) -> None:
+    exact, single = small()(opd), small(dtype=torch.float32)(opd)
+    assert single.dtype == torch.float32
+    # Seven digits of the field before the occulter, which removes 99 % of the light.
+    assert float((single - exact).abs().max() / exact.max()) < 2e-5
+
+
+def test_debug_names_every_plane_in_order(opd: torch.Tensor) -> None:
+    model = small()
+    fields = model.debug(opd)
+    assert list(fields) == [
+        "JWST pupil", "MASK335R focus", "MASK335R", "MASKRND", "NIRCam internal WFE", "detector",
+    ]  # fmt: skip
+    intensity = fields["detector"].abs() ** 2
+    torch.testing.assert_close(intensity, model(opd), rtol=1e-10, atol=1e-20)
+
+
+# -- the occulter ----------------------------------------------------------------------------
+
+
+def test_occulter_complement_keeps_its_digits_near_the_centre() -> None:
+    mpmath = pytest.importorskip("mpmath")
+    for r in (0.0, 1e-9, 1e-5, 1e-2, 0.3, 1.5, 2.13):
+        s = mpmath.mpf(r) * mpmath.mpf("3.2927866")
+        exact = 1 if s == 0 else (2 * mpmath.besselj(1, s) / s) ** 2
+        got = float(mask335r_complement(torch.tensor(r, dtype=torch.float64), torch.tensor(0.0)))
+        assert got == pytest.approx(float(exact), rel=1e-12, abs=1e-16)
+
+
+def test_occulter_is_exactly_clear_beyond_its_radius() -> None:
+    beyond = torch.tensor([MASK335R_RADIUS * (1 + 1e-12), 3.0, 10.0], dtype=torch.float64)
+    assert not mask335r_complement(beyond, torch.zeros(3)).any()
+
+
+def test_a_finer_occulter_changes_less_and_less(opd: torch.Tensor) -> None:
+    exact = small(occulter_sampling=16.0)(opd)
+    errors = [
+        float((small(occulter_sampling=s)(opd) - exact).abs().max() / exact.max())
+        for s in (1.0, 2.0, 4.0, 8.0)
+    ]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[2] < 1e-7
+
+
+# -- derivatives -----------------------------------------------------------------------------
+
+
+def test_transform_and_its_inverse_are_adjoint() -> None:
+    generator = torch.Generator().manual_seed(1)
+    grid = PupilGrid(64, JWST_DIAMETER, (5, 60), (10, 50))
+    x = torch.linspace(-1, 1, 17, dtype=torch.float64) * ARCSEC
+    y = torch.linspace(-2, 1, 13, dtype=torch.float64) * ARCSEC
+    transform = MatrixFourier(grid, x, y, WAVELENGTH, shear=0.1)
+
+    def noise(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, dtype=torch.complex128, generator=generator)
+
+    pupil, image = noise(55, 40), noise(13, 17)
+    left = torch.vdot(image.flatten(), transform.forward(pupil).flatten())
+    back = transform.inverse(image, 1.0) * grid.spacing**2
+    right = torch.vdot(back.flatten(), pupil.flatten())
+    assert abs(left - right) / abs(left) < 1e-10
+
+
+@pytest.mark.parametrize("plane", ["MASK335R", "MASKRND", "NIRCam internal WFE", "all"])
+def test_adjoint_identity_of_every_linear_stage(plane: str) -> None:
+    """<A u, v> = <u, A* v>, with A* from automatic differentiation."""
+    generator = torch.Generator().manual_seed(2)
+    model = small()
+    start = model.pupil_field(model.opd(None), WAVELENGTH, {})
+    planes = dict(zip((p.name for p in model.planes), model.planes, strict=True))
+    onto = dict(zip(planes, model.windows({}), strict=True))
+
+    def stage(field: torch.Tensor) -> torch.Tensor:
+        wavefront = type(start)(field, WAVELENGTH, start.grid)
+        if plane == "all":
+            return model.propagate(wavefront, {})
+        return planes[plane].apply(wavefront, {}, onto[plane]).field
+
+    u_ = torch.randn(
+        start.field.shape, dtype=torch.complex128, generator=generator
+    ).requires_grad_()
+    if plane == "NIRCam internal WFE":
+        lyot = planes["MASKRND"].apply(type(start)(u_, WAVELENGTH, start.grid), {}, start.grid)
+
+        def stage(field: torch.Tensor) -> torch.Tensor:
+            wavefront = type(start)(field, WAVELENGTH, lyot.grid)
+            return planes[plane].apply(wavefront, {}, lyot.grid).field
+
+        u_ = lyot.field.detach().requires_grad_()
+    answer = stage(u_)
+    v = torch.randn(answer.shape, dtype=torch.complex128, generator=generator)
+    (adjoint,) = torch.autograd.grad(answer, u_, v)
+    left = torch.vdot(v.flatten(), answer.detach().flatten())
+    right = torch.vdot(adjoint.flatten(), u_.detach().flatten())
+    assert abs(left - right) / abs(left) < 1e-10
+
+
+def start_of(name: str) -> torch.Tensor:
+    """A point away from special places for every parameter."""
+    entry = parameter(name)
+    generator = torch.Generator().manual_seed(len(name))
+    size = 0.02 if name == "blur" else entry.prior * 0.3
+    value = size * (0.5 + torch.rand(entry.size, dtype=torch.float64, generator=generator))
+    return value.requires_grad_()
+
+
+@pytest.mark.parametrize("name", [p.name for p in OPTICAL_PARAMETERS])
+def test_gradcheck_of_every_parameter(name: str, opd: torch.Tensor) -> None:
+    model = small(npix=48, fov_pixels=6)
+    coarse = opd.reshape(48, 2, 48, 2).mean(dim=(1, 3))
+    unit = parameter(name).prior if name != "blur" else 0.02
+
+    def image(value: torch.Tensor) -> torch.Tensor:
+        # In units of the parameter's own size, and of the image's peak: numbers of order 1.
+        return 1e5 * model(coarse, **{name: value * unit})
+
+    value = (start_of(name).detach() / unit).requires_grad_()
+    assert torch.autograd.gradcheck(image, (value,), eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+def test_gradcheck_of_the_opd() -> None:
+    model = small(npix=12, fov_pixels=5)
+    opd = torch.from_numpy(random_opd(7, npix=12).data * 1e9).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda nm: 1e5 * model(nm * 1e-9), (opd,), eps=1e-3, atol=1e-7, rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("name", ["opd", *(p.name for p in OPTICAL_PARAMETERS)])
+def test_full_size_directional_derivative(name: str) -> None:
+    """At 1024 pixels, 80 x 80: reverse mode against a fourth-order finite difference."""
+    model = nircam_coronagraph("F444W", monochromatic=WAVELENGTH)
+    map_ = torch.from_numpy(random_opd(5).data)
+    generator = torch.Generator().manual_seed(11)
+    weight = torch.rand(80, 80, dtype=torch.float64, generator=generator) * 1e5
+
+    if name == "opd":
+        value = map_.clone().requires_grad_()
+        direction = torch.from_numpy(random_opd(6).data)
+        step = 3e-3
+    else:
+        value = start_of(name)
+        direction = torch.full_like(value, parameter(name).prior).detach()
+        # Areas of pixels cut by an edge are only once differentiable: a smaller step there.
+        step = {"blur": 1e-2, "lyot_shift": 2e-5, "lyot_rotation": 2e-5}.get(name, 1e-3)
+
+    def loss(x: torch.Tensor) -> torch.Tensor:
+        image = model(x) if name == "opd" else model(map_, **{name: x})
+        return (weight * image).sum()
+
+    loss(value).backward()
+    slope = float((value.grad * direction).sum())
+    with torch.no_grad():
+        at = [float(loss(value + k * step * direction)) for k in (-2, -1, 1, 2)]
+    numeric = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * step)
+    assert slope == pytest.approx(numeric, rel=1e-7)
+
+
+def test_gradient_at_exact_zeros_of_the_field() -> None:
+    """A dark pixel has a finite gradient: nothing takes a square root or an angle of it."""
+    model = small(npix=32, fov_pixels=8)
+    # Torch warns whenever the mode is on.
+    with pytest.warns(UserWarning, match="Anomaly Detection"):
+        watch = torch.autograd.detect_anomaly(check_nan=True)
+    opd = torch.zeros(32, 32, dtype=torch.float64, requires_grad=True)
+    with watch:
+        (model(opd, (0.0, 0.0)) * 0).sum().backward()
+    assert opd.grad is not None
+    assert not opd.grad.any()
+
+
+# -- wavelengths -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["F444W", "F335M", "F250M"])
+def test_bandpass_weights_sum_to_one_and_lie_in_the_filter(name: str) -> None:
+    band = filter_bandpass(name, 9)
+    assert math.fsum(band.weights) == pytest.approx(1.0, abs=1e-12)
+    assert list(band.wavelengths) == sorted(band.wavelengths)
+    assert band.mean_wavelength == pytest.approx(float(name[1:4]) * 1e-8, rel=0.05)
+
+
+def test_a_cool_star_is_redder_than_a_hot_one() -> None:
+    assert (
+        filter_bandpass("F444W", 5, 2000.0).mean_wavelength
+        > filter_bandpass("F444W", 5, 9000.0).mean_wavelength + 1e-8
+    )
+
+
+def test_blackbody_has_wiens_peak() -> None:
+    grid = np.linspace(1e-7, 4e-6, 100_000)
+    # Photons per wavelength peak at lambda T = 3.6697e-3 m K.
+    assert grid[blackbody(5000.0, grid).argmax()] * 5000 == pytest.approx(3.6697e-3, rel=1e-4)
+
+
+def test_a_given_spectrum_is_used() -> None:
+    line = (np.array([3e-6, 4.39e-6, 4.4e-6, 4.41e-6, 6e-6]), np.array([0, 0, 1.0, 0, 0]))
+    band = filter_bandpass("F444W", 7, line)
+    assert band.mean_wavelength == pytest.approx(4.4e-6, abs=1e-8)
+    assert len(band.wavelengths) < 7
+    with pytest.raises(IncompatibleSetupError, match="no light"):
+        filter_bandpass("F444W", 7, (line[0], 0 * line[1]))
+
+
+# -- bad input -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["F200W", "F444", "nonsense"])
+def test_a_filter_that_the_mask_does_not_take_is_named_with_those_it_takes(name: str) -> None:
+    with pytest.raises(IncompatibleSetupError, match=r"MASK335R.*F444W") as caught:
+        nircam_coronagraph(name)
+    assert repr(name) in str(caught.value)
+    assert "F444W" in filter_names()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"monochromatic": 4.5}, "metres"),
+        ({"monochromatic": 2e-6}, "outside F444W"),
+        ({"image_mask": "MASK210R"}, "MASK335R"),
+        ({"fov_pixels": 10, "fov_arcsec": 1.0}, "not both"),
+        ({"fov_pixels": 0}, "at least 1"),
+        ({"occulter_sampling": 0.5}, "at least 1"),
+        ({"dtype": torch.float16}, "float32"),
+    ],
+)
+def test_impossible_settings_are_refused(changes: dict[str, object], words: str) -> None:
+    with pytest.raises(IncompatibleSetupError, match=words):
+        small(**changes)
+
+
+def test_an_opd_of_another_size_says_what_to_do() -> None:
+    with pytest.raises(ShapeError, match=r"npix=64"):
+        small()(np.zeros((64, 64)))
+
+
+def test_nan_in_the_opd_is_counted_and_located() -> None:
+    bad = np.zeros((96, 96))
+    bad[3, 7] = bad[50, 50] = np.nan
+    with pytest.raises(NonFiniteError, match=r"2 values.*\(3, 7\)"):
+        small()(bad)
+
+
+def test_units_are_honoured_or_refused(opd: torch.Tensor) -> None:
+    model = small()
+    in_nm = model(opd.numpy() * 1e9 * u.nm)
+    torch.testing.assert_close(in_nm, model(opd), rtol=1e-9, atol=1e-20)
+    with pytest.raises(UnitError, match="'s'"):
+        model(np.zeros((96, 96)) * u.s)
+    offset = model(opd, star_offset=(20 * u.mas, -5 * u.mas))
+    torch.testing.assert_close(offset, model(opd, (0.020, -0.005)), rtol=1e-9, atol=1e-20)
+    with pytest.raises(UnitError, match="arcsec"):
+        model(opd, star_offset=[1.0, 2.0] * u.m)
+
+
+def test_unknown_parameters_and_wrong_sizes_are_refused(opd: torch.Tensor) -> None:
+    with pytest.raises(TypeError, match="lyot_shift"):
+        small()(opd, lyot_shfit=(0, 0))
+    with pytest.raises(ShapeError, match="expected 2"):
+        small()(opd, lyot_shift=0.1)
+
+
+def test_inputs_of_any_kind_give_the_same_image_and_stay_unchanged(opd: torch.Tensor) -> None:
+    model = small()
+    array = opd.numpy().astype(">f8")
+    array.setflags(write=False)
+    torch.testing.assert_close(model(array), model(opd), rtol=0, atol=0)
