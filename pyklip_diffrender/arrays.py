@@ -68,7 +68,6 @@ class OrientedPupil(EntrancePupil):
         self.orientation = orientation
         self.pointing = torch.tensor(pointing, dtype=torch.float64, device=device)
         self.chromatic = {w: extra.to(device) for w, extra in (chromatic or {}).items()}
-        self.total = float((amplitude**2).sum())
         angle = math.radians(-turned)
         self._tilt = torch.tensor(
             [[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]],
@@ -209,15 +208,22 @@ class AberrationOptic(PupilOptic):
     """An aberration known from its samples, plus free Zernikes as `planes.InternalAberration`."""
 
     parameters = ("si_zernikes",)
+    _known: tuple[PupilGrid, Tensor] | None = None
+
+    def _basis(self, count: int, wavefront: Wavefront) -> Tensor:
+        grid = wavefront.grid
+        if self._known is None or self._known[0] != grid or len(self._known[1]) != count:
+            basis = zernike_basis(count, grid.x, grid.y, grid.diameter / 2)
+            self._known = (grid, basis.to(wavefront.field.device))
+        return self._known[1]
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Multiply by the phasor, and by that of the Zernikes."""
         wavefront = super().apply(wavefront, values, onto)
         if "si_zernikes" not in values:
             return wavefront
-        grid, coefficients = wavefront.grid, values["si_zernikes"]
-        basis = zernike_basis(len(coefficients), grid.x, grid.y, grid.diameter / 2)
-        opd = torch.tensordot(coefficients, basis.to(coefficients.device), dims=1)
+        coefficients = values["si_zernikes"]
+        opd = torch.tensordot(coefficients, self._basis(len(coefficients), wavefront), dims=1)
         phase = ((2 * math.pi / wavefront.wavelength) * opd).to(self._dtype)
         phasor = torch.polar(torch.ones_like(phase), phase)
         return replace(wavefront, field=wavefront.field * phasor)

@@ -78,9 +78,11 @@ class SegmentMotions:
 
     def _sampled(self, grid: PupilGrid) -> list[tuple[PupilGrid, Tensor]]:
         """For each segment the window that holds it and its three modes there."""
-        if grid not in self._cache:
-            self._cache[grid] = [self._sample(outline, grid) for outline in self._outlines]
-        return self._cache[grid]
+        # Of the whole segment, whatever part of it `grid` holds: the modes stay the same.
+        full = PupilGrid.full(grid.npix, grid.diameter)
+        if full not in self._cache:
+            self._cache[full] = [self._sample(outline, full) for outline in self._outlines]
+        return self._cache[full]
 
     @staticmethod
     def _sample(outline: Tensor, grid: PupilGrid) -> tuple[PupilGrid, Tensor]:

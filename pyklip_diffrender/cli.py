@@ -115,11 +115,16 @@ def _refine(options: argparse.Namespace) -> None:
     from astropy.io import fits
 
     from pyklip_diffrender.files import write_fits
+    from pyklip_diffrender.nircam import nircam_coronagraph
     from pyklip_diffrender.observation import Observation
-    from pyklip_diffrender.refinement import refine_frames
+    from pyklip_diffrender.refinement import refine
+    from pyklip_diffrender.refinement.presets import NIRCAM_FIT, NIRCAM_MODEL
 
     observation = Observation.from_fits(options.frames).cutout(options.fov_pixels)
-    fit = refine_frames(observation, options.opd, progress=True)
+    model = nircam_coronagraph(
+        observation.filter or "", fov_pixels=options.fov_pixels, **NIRCAM_MODEL
+    )
+    fit = refine(model, observation, options.opd, progress=True, **NIRCAM_FIT)
     primary = fits.PrimaryHDU()
     for key, value in fit.summary().items():
         primary.header[f"HIERARCH {key}"] = value

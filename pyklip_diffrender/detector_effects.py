@@ -40,7 +40,7 @@ class GaussianBlur:
         self.sigma = torch.as_tensor(sigma, dtype=torch.float64)
 
     def _matrix(self, count: int, like: Tensor) -> Tensor:
-        reach = int(4 * float(self.sigma) + 0.5)
+        reach = int(4 * float(self.sigma.detach()) + 0.5)
         if reach == 0:
             # Not the kernel's limit: scipy leaves the image alone, and so must the derivative.
             return torch.eye(count, dtype=like.dtype, device=like.device)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
+import io
 import os
 import tempfile
 import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import resources
@@ -18,6 +21,8 @@ from astropy.utils.exceptions import AstropyUserWarning
 from pyklip_diffrender.errors import CorruptFileError
 
 __all__ = ["embedded_table", "open_fits", "replacing", "sha256", "write_fits"]
+
+_GZIP = b"\x1f\x8b"
 
 
 @contextmanager
@@ -32,23 +37,27 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
     path = Path(path)
     if not path.is_file():
         raise CorruptFileError(f"{path}: no such file")
-    # Opened here, so that it is closed whatever astropy makes of it.
-    with path.open("rb") as raw:
+    try:
+        content = path.read_bytes()
+        if content.startswith(_GZIP):
+            # Not left to astropy, which takes an early end of the stream for the last HDU.
+            content = gzip.decompress(content)
         with warnings.catch_warnings():
-            # A truncated file is only a warning to astropy; here it is an error.
-            warnings.filterwarnings("error", category=AstropyUserWarning)
-            try:
-                hdus = fits.open(raw, memmap=False, lazy_load_hdus=False)
-                for hdu in hdus:
-                    _ = hdu.data
-            except (
-                OSError, EOFError, ValueError, TypeError, KeyError, AstropyUserWarning
-            ) as error:  # fmt: skip
-                raise CorruptFileError(
-                    f"{path} ({path.stat().st_size} bytes): not a complete FITS file ({error}). "
-                    "Fetch it again"
-                ) from error
-        yield hdus
+            # Data that end too early are only a warning to astropy; here they are an error.
+            warnings.filterwarnings(
+                "error", message="(?s).*(truncated|corrupt)", category=AstropyUserWarning
+            )
+            hdus = fits.open(io.BytesIO(content), lazy_load_hdus=False)
+            for hdu in hdus:
+                _ = hdu.data
+    except (
+        OSError, EOFError, ValueError, TypeError, KeyError, zlib.error, AstropyUserWarning
+    ) as error:  # fmt: skip
+        raise CorruptFileError(
+            f"{path} ({path.stat().st_size} bytes): not a complete FITS file ({error}). "
+            "Fetch it again"
+        ) from error
+    yield hdus
 
 
 @contextmanager

@@ -116,6 +116,9 @@ class PupilGrid:
             return array
         top, bottom = to.rows[0] - self.rows[0], self.rows[1] - to.rows[1]
         left, right = to.columns[0] - self.columns[0], self.columns[1] - to.columns[1]
+        height, width = self.shape
+        if top >= height or bottom >= height or left >= width or right >= width:
+            return array.new_zeros((*array.shape[:-2], *to.shape))  # They do not meet.
         if min(top, bottom, left, right) < 0:
             return torch.nn.functional.pad(array, (-left, -right, -top, -bottom))
         return array[..., top : top + to.shape[0], left : left + to.shape[1]]

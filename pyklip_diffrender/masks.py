@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import Protocol
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -97,7 +98,7 @@ class BoxPart:
 
 
 class SeparablePart:
-    """A part ``f(x) g(y)`` that may reach to the end of the image: one matrix per axis.
+    """A part ``f(x) g(y)`` that may reach to the end of the image: one convolution per axis.
 
     Parameters
     ----------
@@ -116,18 +117,15 @@ class SeparablePart:
         sampling: float,
     ) -> None:
         self.along_x, self.along_y, self.sampling = along_x, along_y, sampling
-        self._kernels: dict[tuple[str, float, PupilGrid, PupilGrid], Tensor] = {}
+        self._spectra: dict[tuple[str, float, PupilGrid, PupilGrid], Tensor] = {}
 
-    def _kernel(
-        self, axis: str, wavefront: Wavefront, spacing: float, onto: PupilGrid
-    ) -> Tensor | None:
-        """Matrix (window behind, window in front) along one axis; None for the identity."""
-        factor = self.along_x if axis == "x" else self.along_y
-        if factor is None:
-            return None
+    def _spectrum(self, axis: str, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
+        """Transform of the kernel that takes the window in front to the one behind, one axis."""
         key = (axis, wavefront.wavelength, wavefront.grid, onto)
-        if key not in self._kernels:
+        if key not in self._spectra:
             grid = wavefront.grid
+            factor = self.along_x if axis == "x" else self.along_y
+            assert factor is not None
             count = round(grid.npix * self.sampling)
             index = torch.arange(count) - count // 2
             values = factor(index * spacing / ARCSEC).to(torch.float64)
@@ -136,25 +134,33 @@ class SeparablePart:
             coefficients = torch.fft.fft(torch.fft.ifftshift(values)) / count
             if axis == "y":
                 coefficients = coefficients.conj()
-            behind, before = (
-                torch.arange(*(w.columns if axis == "x" else w.rows)) for w in (onto, grid)
-            )
-            matrix = coefficients[(behind[:, None] - before[None, :]) % count]
-            self._kernels[key] = matrix.to(wavefront.field.device, wavefront.field.dtype)
-        return self._kernels[key]
+            before, behind = (w.columns if axis == "x" else w.rows for w in (grid, onto))
+            distance = torch.arange(behind[0] - before[1] + 1, behind[1] - before[0])
+            spectrum = torch.fft.fft(coefficients[distance % count], next_fast_len(len(distance)))
+            self._spectra[key] = spectrum.to(wavefront.field.device, wavefront.field.dtype)
+        return self._spectra[key]
+
+    def _convolved(
+        self, field: Tensor, axis: str, wavefront: Wavefront, spacing: float, onto: PupilGrid
+    ) -> Tensor:
+        spectrum = self._spectrum(axis, wavefront, spacing, onto)
+        dim = -1 if axis == "x" else -2
+        first = field.shape[dim] - 1
+        size = onto.shape[1] if axis == "x" else onto.shape[0]
+        shaped = spectrum if axis == "x" else spectrum[:, None]
+        product = torch.fft.fft(field, len(spectrum), dim=dim) * shaped
+        return torch.fft.ifft(product, dim=dim).narrow(dim, first, size)
 
     def removed(self, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
         """See `MaskPart`."""
         field, grid = wavefront.field, wavefront.grid
-        rows = self._kernel("y", wavefront, spacing, onto)
-        if rows is None:
+        if self.along_y is None:
             field = grid.crop(field, replace(onto, columns=grid.columns))
         else:
-            field = rows @ field
-        columns = self._kernel("x", wavefront, spacing, onto)
-        if columns is None:
+            field = self._convolved(field, "y", wavefront, spacing, onto)
+        if self.along_x is None:
             return replace(grid, rows=onto.rows).crop(field, onto)
-        return field @ columns.T
+        return self._convolved(field, "x", wavefront, spacing, onto)
 
 
 class SampledOcculter:

@@ -22,7 +22,13 @@ from pyklip_diffrender.errors import (
     UnitError,
 )
 from pyklip_diffrender.files import open_fits
-from pyklip_diffrender.units import native_float64, require_shape
+from pyklip_diffrender.units import (
+    native_float64,
+    require_finite,
+    require_shape,
+    to_arcsec,
+    to_unit,
+)
 
 __all__ = ["BAD_PIXEL_BITS", "Observation"]
 
@@ -30,6 +36,14 @@ BAD_PIXEL_BITS = 1 | 2 | 512 | 1024
 """JWST data-quality bits that take a pixel out of the fit: DO_NOT_USE, SATURATED, NON_SCIENCE,
 DEAD. A jump (4) that the ramp fit has repaired, or a hot pixel (2048) that was dark-subtracted,
 may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
+
+
+def _spread(array: NDArray[np.float64], shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
+    """Copy of an array, repeated to a shape."""
+    try:
+        return np.broadcast_to(array, shape).copy()
+    except ValueError as error:
+        raise ShapeError(f"{name}: got shape {array.shape}, expected {shape}") from error
 
 
 @dataclass(frozen=True)
@@ -86,11 +100,12 @@ class Observation:
 
         Parameters
         ----------
-        data, error : array, ([frames,] ny, nx)
+        data, error : array or Quantity, ([frames,] ny, nx)
             Pixels where either is not finite, or the error is not positive, are masked.
+            Quantities are converted to `unit`.
         valid : array of bool, optional
         unit : str or Unit
-        pixelscale : float or (x, y)
+        pixelscale : float, Quantity or (x, y)
             arcsec.
         center : (2,) or (frames, 2), optional
             x, y of the star, 0-indexed; default the middle of the array.
@@ -101,14 +116,25 @@ class Observation:
         ------
         ShapeError
             Shapes that do not go together, or no frames.
+        UnitError
+            A unit that is not known, or does not convert.
+        NonFiniteError
+            A star position that is not a number.
         NoValidPixelsError
             A frame in which nothing is left.
         """
-        values = native_float64(data)
+        try:
+            unit = u.Unit(unit)
+        except (ValueError, TypeError) as reason:
+            raise UnitError(
+                f"{details.get('name', 'observation')}: got the unit {unit!r}, expected one that "
+                "astropy knows, such as 'MJy/sr'"
+            ) from reason
+        values = to_unit(data, unit, "data")
         values = values[None] if values.ndim == 2 else values
         if values.ndim != 3 or values.size == 0:
             raise ShapeError(f"data: got shape {np.shape(data)}, expected ([frames,] ny, nx)")
-        sigma = native_float64(error)
+        sigma = to_unit(error, unit, "error")
         sigma = sigma[None] if sigma.ndim == 2 else sigma
         require_shape(sigma, values.shape, "error", "Give one error for every pixel")
         good = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
@@ -124,14 +150,15 @@ class Observation:
             )
         frames, ny, nx = values.shape
         where = native_float64([(nx - 1) / 2, (ny - 1) / 2] if center is None else center)
-        scale = np.broadcast_to(np.asarray(pixelscale, dtype=float), (2,))
+        require_finite(where, "center")
+        scale = _spread(to_arcsec(pixelscale, "pixelscale"), (2,), "pixelscale")
         return cls(
             np.where(good, values, 0.0),
             np.where(good, sigma, 1.0),
             good,
-            u.Unit(unit),
+            unit,
             (float(scale[0]), float(scale[1])),
-            np.broadcast_to(where, (frames, 2)).copy(),
+            _spread(where, (frames, 2), "center"),
             **details,
         )
 
@@ -145,7 +172,7 @@ class Observation:
         Raises
         ------
         CorruptFileError
-            No such file, truncated, or without a SCI extension.
+            No such file, truncated, or without data in SCI, ERR or DQ.
         UnitError
             SCI has no unit.
         ShapeError, NoValidPixelsError
@@ -161,6 +188,9 @@ class Observation:
             science = hdus["SCI"]
             header = hdus[0].header.copy()
             header.update(science.header)
+            for hdu in hdus:
+                if hdu.name in ("SCI", "ERR", "DQ") and hdu.data is None:
+                    raise CorruptFileError(f"{path.name}: {hdu.name} has no data, so no frames")
             data = native_float64(science.data)
             if "ERR" not in hdus:
                 raise CorruptFileError(f"{path.name}: no ERR extension; the fit needs errors")

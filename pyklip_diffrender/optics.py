@@ -232,13 +232,26 @@ class OpticalSystem:
             Light per detector pixel as a fraction of what the entrance pupil collects.
         """
         given = {"star_offset": star_offset, **parameters}
-        tensor, values = self.opd(opd), self.values(given)
+        return self.image_of(self.fields(opd, **given), self.values(given), weights)
+
+    def image_of(
+        self, fields: Sequence[Tensor], values: Values, weights: Tensor | None = None
+    ) -> Tensor:
+        """Image from the fields at all wavelengths; arguments as in a call.
+
+        Parameters
+        ----------
+        fields : sequence of Tensor
+            What `fields` returns.
+        values : mapping of str to Tensor
+            What `values` returns; the detector's parameters matter here.
+        weights : Tensor, (wavelengths,), optional
+        """
         spectrum = self.bandpass.weights if weights is None else weights
-        image = torch.zeros((), dtype=self.dtype, device=self.device)
-        for wavelength, weight in zip(self.bandpass.wavelengths, spectrum, strict=True):
-            field = self.propagate(self.pupil_field(tensor, wavelength, values), values)
-            image = image + weight * (field.real**2 + field.imag**2)
-        return self.detector.image(image, values)
+        intensity = torch.zeros((), dtype=self.dtype, device=self.device)
+        for field, weight in zip(fields, spectrum, strict=True):
+            intensity = intensity + weight * (field.real**2 + field.imag**2)
+        return self.detector.image(intensity, values)
 
     def calc_psf(
         self,
@@ -308,7 +321,7 @@ class OpticalSystem:
             system = self.with_fidelity(**changes)
         hdus = recipe_psf(system, normalize, outfile, overwrite, opd, **parameters)
         if return_intermediates:
-            return hdus, system.debug(opd, **parameters)
+            return hdus, system.debug(opd, None, **parameters)
         return hdus
 
     def debug(

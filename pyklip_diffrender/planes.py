@@ -92,8 +92,11 @@ class EntrancePupil:
         full = PupilGrid.full(amplitude.shape[-1], diameter)
         self.full = full
         self.grid = full.around(amplitude)
+        self.total = float((amplitude**2).sum())
         power = (amplitude**2).sum() * full.spacing**2
         self.amplitude = full.crop(amplitude / torch.sqrt(power), self.grid).to(dtype)
+        self.lit = amplitude > 0
+        """Where light passes, (npix, npix)."""
 
     def field(self, opd: Tensor, wavelength: float, star_offset: Tensor) -> Wavefront:
         """The field behind the pupil.
@@ -101,17 +104,22 @@ class EntrancePupil:
         Parameters
         ----------
         opd : Tensor, (..., npix, npix)
-            m.
+            m. An imaginary part is absorption: the amplitude is exp(-2 pi Im / wavelength).
         wavelength : float
             m.
         star_offset : Tensor, (..., 2)
             arcsec, image orientation.
         """
         opd = self.full.crop(opd, self.grid)
-        phase = (2 * math.pi / wavelength) * opd.to(self.dtype)
+        wavenumber = 2 * math.pi / wavelength
+        amplitude = self.amplitude
+        if opd.is_complex():
+            amplitude = amplitude * torch.exp(-wavenumber * opd.imag).to(self.dtype)
+            opd = opd.real
+        phase = wavenumber * opd.to(self.dtype)
         x, y = tilt_phases(star_offset * ARCSEC, self.grid, wavelength)
         phase = phase + (x[..., None, :] + y[..., :, None]).to(self.dtype)
-        return Wavefront(torch.polar(self.amplitude.expand_as(phase), phase), wavelength, self.grid)
+        return Wavefront(torch.polar(amplitude.expand_as(phase), phase), wavelength, self.grid)
 
 
 class PupilStop:

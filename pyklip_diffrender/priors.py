@@ -8,7 +8,7 @@ the modes integrated out, is stationary (D. MacKay, "Bayesian interpolation", Ne
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -33,12 +33,34 @@ class WavefrontPrior:
         Beyond the knee the deviation falls as frequency to minus this power.
     fit_scales : bool
         Maximise the evidence over the scales.
+    amplitude_cycles : float
+        Modes up to this frequency may change the amplitude across the pupil as well.
+    amplitude_scale : float
+        Prior deviation of amplitude modes, nm of an imaginary OPD (at 4.4 um 1 nm changes the
+        amplitude by 0.14 %); 0 keeps the amplitude as it is.
+    amplitude_slope : float
+        Beyond the knee the amplitude's deviation falls as frequency to minus this power.
     """
 
     scales: dict[str, float] = field(default_factory=lambda: {"segment": 4.0, "texture": 0.1})
     knee: float = 8.0
     slope: float = 1.0
     fit_scales: bool = True
+    amplitude_cycles: float = 0.0
+    amplitude_scale: float = 0.0
+    amplitude_slope: float = 1.0
+
+    def amplitude_modes(self, basis: Basis) -> int:
+        """Number of modes, the first of the basis, that the pupil's amplitude has as well."""
+        if self.amplitude_scale <= 0:
+            return 0
+        beyond = torch.nonzero(basis.frequencies > self.amplitude_cycles).flatten()
+        return int(beyond[0]) if len(beyond) else len(basis)
+
+    def amplitude_deviation(self, basis: Basis) -> Tensor:
+        """Prior deviation of the amplitude modes, in nm of an imaginary OPD."""
+        frequency = basis.frequencies[: self.amplitude_modes(basis)]
+        return self.amplitude_scale / (1 + (frequency / self.knee) ** self.amplitude_slope)
 
     def shape(self, basis: Basis) -> Tensor:
         """Standard deviation of every mode relative to its group's scale, (modes,)."""
@@ -67,6 +89,13 @@ class EvidenceUpdate:
     effective: float
     log_evidence: float
 
+    def in_units(self, unit: Tensor) -> EvidenceUpdate:
+        """The same for unknowns measured in other units, `unit` of the new ones to the old."""
+        covariance = self.covariance
+        if covariance is not None:
+            covariance = covariance * unit[:, None] * unit
+        return replace(self, step=self.step * unit, covariance=covariance)
+
 
 def solve_with_evidence(
     curvature: Tensor,
@@ -77,6 +106,8 @@ def solve_with_evidence(
     fixed_deviation: Tensor,
     *,
     iterations: int,
+    damping: float = 0.0,
+    current: Tensor | None = None,
     covariance: bool = False,
     floor: float = 1e-4,
 ) -> EvidenceUpdate:
@@ -95,9 +126,13 @@ def solve_with_evidence(
     scales : Tensor, (groups,)
         Starting scales.
     fixed_deviation : Tensor, (n - modes,)
-        Prior deviation of the other parameters; inf where there is none.
+        Prior deviation of what comes before those modes; inf where there is none.
     iterations : int
         Updates of the scales; 0 keeps them.
+    damping : float
+        Levenberg-Marquardt: steps away from `current` cost this much of the prior's penalty.
+    current : Tensor, (n,), optional
+        Where the unknowns are now.
     covariance : bool
         Also compute the covariance.
     floor : float
@@ -106,13 +141,17 @@ def solve_with_evidence(
     others = len(fixed_deviation)
     diagonal = torch.arange(len(curvature))
     identity = torch.eye(len(curvature), dtype=curvature.dtype)
+    inverse, effective = identity, float("nan")
     for k in range(iterations + 1):
         deviation = torch.cat([fixed_deviation, scales[group] * shape])
         precision = deviation**-2
         system = curvature.clone()
-        system[diagonal, diagonal] += precision
+        system[diagonal, diagonal] += (1 + damping) * precision
         factor = torch.linalg.cholesky(system)
-        step = torch.cholesky_solve(gradient[:, None], factor)[:, 0]
+        pulled = gradient if current is None else gradient + damping * precision * current
+        step = torch.cholesky_solve(pulled[:, None], factor)[:, 0]
+        if not iterations and not covariance:
+            break
         # Twenty times faster than torch.cholesky_inverse, which does not use level-3 BLAS.
         inverse = torch.linalg.solve_triangular(factor, identity, upper=False)
         variance = (inverse**2).sum(dim=0)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import datetime
 import os
+import warnings
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from astropy.io import fits
+from astropy.io.fits.verify import VerifyWarning
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -78,7 +80,7 @@ def normalised_samples(system: System, normalize: str, opd: Any = None, **parame
             elif kind == "exit_pupil":
                 light = light / ((wavefront.field.abs() ** 2).sum() * wavefront.grid.spacing**2)
             elif kind == "none":
-                light = light * getattr(system.entrance, "total", 1.0)
+                light = light * system.entrance.total
             total = total + weight * light.double().cpu().numpy()
     return np.asarray(total, dtype=np.float64)
 
@@ -210,4 +212,7 @@ def save(hdus: fits.HDUList, outfile: str | os.PathLike[str] | None, overwrite: 
     if os.path.exists(outfile) and not overwrite:
         raise FileExistsError(f"{outfile} exists; pass overwrite=True, or another outfile")
     hdus[0].header["FILENAME"] = (os.path.basename(outfile), "Name of this file")
-    write_fits(hdus, outfile)
+    with warnings.catch_warnings():
+        # Some comments of stpsf's are longer than a card.
+        warnings.filterwarnings("ignore", "Card is too long", VerifyWarning)
+        write_fits(hdus, outfile)

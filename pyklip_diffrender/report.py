@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from pyklip_diffrender.demo import DemoResult
 from pyklip_diffrender.files import replacing
 from pyklip_diffrender.geometry import PupilGrid, maskrnd_openings, polygon_coverage
+from pyklip_diffrender.refinement import Refinement
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_demo", "draw_image", "save"]
+__all__ = ["draw_demo", "draw_image", "draw_subtraction", "save"]
 
 _INK = "#1b1f24"
 
@@ -62,14 +63,14 @@ def draw_demo(result: DemoResult) -> Figure:
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(14, 7.4), layout="constrained")
+    figure = Figure(figsize=(16, 7.6), layout="constrained")
     axes = figure.subplots(2, 4)
     scale = result.model.detector.pixelscale[0]
     frame = result.observation.data[0]
     shown = draw_image(
         axes[0, 0], np.maximum(frame, 1), scale, limits=(0, 1), cmap="magma",
         norm=LogNorm(float(np.percentile(frame, 2)), float(frame.max())),
-        title="Frame: the occulted star hides the planet",
+        title="The frame: the occulted star\nhides the planet (circle)",
     )  # fmt: skip
     figure.colorbar(shown, ax=axes[0, 0], label="photons", shrink=0.85)
 
@@ -119,6 +120,7 @@ def draw_demo(result: DemoResult) -> Figure:
             color=colour, label=f"{label} free", ms=5,
         )  # fmt: skip
     ax.axhline(1, color="0.6", lw=0.8, zorder=0)
+    ax.set_box_aspect(0.8)
     ax.set_title(
         f"Refinement: {result.fit.status.name.lower().replace('_', ' ')}\nin "
         f"{result.fit.seconds:.0f} s",
@@ -129,4 +131,40 @@ def draw_demo(result: DemoResult) -> Figure:
     ax.legend(frameon=False, fontsize=8)
     for ax in (*axes[0], axes[1, 0]):
         ax.set_xlabel("arcsec", fontsize=8)
+    return figure
+
+
+def draw_subtraction(fit: Refinement) -> Figure:
+    """A fit to real frames: data, star, what is left, and what is left in units of the noise."""
+    from matplotlib.colors import SymLogNorm
+    from matplotlib.figure import Figure
+
+    combined = fit.observation.combined()
+    data, noise = combined.data[0], combined.error[0]
+    residual = np.where(combined.valid[0], data - fit.star_image, np.nan)
+    scale = fit.model.detector.pixelscale[0]
+    unit = str(fit.observation.unit)
+    limit = float(np.nanpercentile(data, 99.8))
+    norm = SymLogNorm(limit / 100, vmin=-limit / 20, vmax=limit)
+    span = float(np.nanpercentile(np.abs(residual), 99.5))
+    ratio = np.where(combined.valid[0], residual / noise, np.nan)
+
+    figure = Figure(figsize=(15.5, 4.4), layout="constrained")
+    axes = figure.subplots(1, 4)
+    panels = (
+        (data, {"norm": norm, "cmap": "magma"}, "Data, mean of the integrations", unit),
+        (fit.star_image, {"norm": norm, "cmap": "magma"}, "Rendered star", unit),
+        (residual, {"limits": (-span, span), "cmap": "RdBu_r"}, "Data - star", unit),
+        (ratio, {"limits": (-8, 8), "cmap": "RdBu_r"}, "(Data - star) / noise", "sigma"),
+    )
+    star = np.zeros(2)
+    for name in ("detector_shift", "star_offset"):
+        star = star + fit.values.get(name, np.zeros(2))
+    for ax, (image, style, title, label) in zip(axes, panels, strict=True):
+        settings: dict[str, Any] = {"limits": (0.0, 1.0), **style}
+        shown = draw_image(ax, image, scale, title=title, **settings)
+        figure.colorbar(shown, ax=ax, label=label, shrink=0.8)
+        ax.set_xlabel("arcsec from the middle of the array", fontsize=8)
+        for _, x, y in fit.companions:
+            ax.plot(star[0] + x, star[1] + y, "o", mfc="none", mec="#2f9e44", ms=16, mew=1.4)
     return figure

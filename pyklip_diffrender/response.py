@@ -10,17 +10,19 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from pyklip_diffrender.bases import Basis
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.geometry import PupilGrid
 from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.planes import Wavefront
 
-__all__ = ["NANOMETRE", "coarse_copy", "parameter_jacobian", "wavefront_jacobian"]
+__all__ = ["NANOMETRE", "WavefrontResponse", "coarse_copy", "downsample", "parameter_jacobian"]
 
 _log = logging.getLogger(__name__)
 
@@ -30,7 +32,7 @@ NANOMETRE = 1e-9
 _BATCH_BYTES = 2.5e7
 
 
-def coarse_copy(model: OpticalSystem, npix: int = 256) -> OpticalSystem:
+def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     """A cheaper copy of a model for derivatives: 2 cells per lambda/D, single precision.
 
     A model without a recipe, or one that is already as coarse, serves itself.
@@ -44,75 +46,120 @@ def downsample(opd: Tensor, npix: int) -> Tensor:
     """Mean of the OPD over the pixels of a coarser grid, (npix, npix)."""
     if opd.shape[-1] == npix:
         return opd
+    if opd.is_complex():
+        return torch.complex(downsample(opd.real, npix), downsample(opd.imag, npix))
     return torch.nn.functional.avg_pool2d(opd[None, None], opd.shape[-1] // npix)[0, 0]
 
 
-def wavefront_jacobian(
-    model: OpticalSystem,
-    basis: Basis,
-    opd: Tensor,
-    values: dict[str, Tensor],
-    *,
-    npix: int = 256,
-    dtype: torch.dtype = torch.float32,
-    progress: bool = False,
-) -> Tensor:
-    """Derivative of the image with respect to the coefficients of a wavefront basis.
+class WavefrontResponse:
+    """Derivative of the complex field on the detector with respect to wavefront modes.
+
+    The field behind a coronagraph is a small difference of large ones: it changes by much when
+    the wavefront changes by little, but its derivative does not. So the derivative of the field
+    is kept, and that of the image is made from it for whatever field the star now has.
 
     Parameters
     ----------
     model : OpticalSystem
-        Gives the field about which to linearise.
     basis : Basis
-    opd : Tensor, (npix, npix)
-        m.
+    opd : Tensor, (n, n)
+        About which to linearise, m.
     values : dict of Tensor
         Values of the model's other parameters.
     npix : int
-        Pupil samples of the coarse copy that gives J.
-    dtype : torch.dtype
-        Real type of the result.
+        Pupil samples of the coarse copy that does the propagations.
+    memory_limit : float
+        Bytes that may be kept.
     progress : bool
         Show a bar.
 
-    Returns
-    -------
-    Tensor, (modes, ny, nx)
-        Light per pixel (fraction of what the pupil collects) per nm.
+    Raises
+    ------
+    IncompatibleSetupError
+        If the response would be larger than `memory_limit`.
     """
-    coarse = coarse_copy(model, npix)
-    with torch.no_grad():
-        reference = model.fields(opd, **values)
-        small = downsample(opd.to(torch.float64), coarse.npix)
+
+    def __init__(
+        self,
+        model: OpticalSystem,
+        basis: Basis,
+        opd: Tensor,
+        values: dict[str, Tensor],
+        *,
+        npix: int = 128,
+        memory_limit: float = 4e9,
+        progress: bool = False,
+    ) -> None:
+        self.model = model
+        coarse = coarse_copy(model, npix)
+        self.coarse = coarse
+        ny, nx = (n * model.detector.oversample for n in model.detector.shape)
+        wavelengths = model.bandpass.wavelengths
+        size = 8.0 * len(basis) * ny * nx * len(wavelengths)
+        if size > memory_limit:
+            raise IncompatibleSetupError(
+                f"the response of {len(basis)} modes on {ny} x {nx} samples at "
+                f"{len(wavelengths)} wavelengths takes {size / 1e9:.1f} GB, more than the limit "
+                f"of {memory_limit / 1e9:.1f} GB. Fit a smaller field, fewer wavelengths or "
+                "fewer modes, or raise the limit"
+            )
+        self.fields = [
+            torch.empty(len(basis), ny, nx, dtype=torch.complex64, device=model.device)
+            for _ in wavelengths
+        ]
         full = PupilGrid.full(coarse.npix, coarse.diameter)
         window = coarse.entrance.grid
-        pupils = [
-            coarse.pupil_field(small, wavelength, values)
-            for wavelength in coarse.bandpass.wavelengths
-        ]
         complex_bytes = 16 if coarse.dtype == torch.float64 else 8
         batch = max(1, int(_BATCH_BYTES / (complex_bytes * math.prod(window.shape)) / 2))
-        jacobian = torch.empty(len(basis), *model.detector.shape, dtype=dtype, device=model.device)
-        for start in tqdm(
-            range(0, len(basis), batch), desc="response", unit="batch", disable=not progress
-        ):
-            stop = min(start + batch, len(basis))
-            modes = full.crop(basis.modes(full, start, stop), window).to(model.device, coarse.dtype)
-            change = torch.zeros((), dtype=coarse.dtype, device=model.device)
-            for field, wavefront, weight in zip(
-                reference, pupils, model.bandpass.weights, strict=True
+        with torch.no_grad():
+            small = downsample(opd, coarse.npix)
+            pupils = [coarse.pupil_field(small, wavelength, values) for wavelength in wavelengths]
+            for start in tqdm(
+                range(0, len(basis), batch), desc="response", unit="batch", disable=not progress
             ):
-                # d(exp(i k OPD)) = i k exp(i k OPD) d(OPD), for 1 nm.
-                wavenumber = 2 * math.pi / wavefront.wavelength * NANOMETRE
-                moved = Wavefront(
-                    modes * (1j * wavenumber * wavefront.field), wavefront.wavelength, window
-                )
-                answer = coarse.propagate(moved, values)
-                base = field.to(answer.dtype)
-                change = change + (2 * weight) * (base.real * answer.real + base.imag * answer.imag)
-            jacobian[start:stop] = coarse.detector.image(change, values).to(dtype)
-    _log.debug("response of %d modes at %d pupil samples", len(basis), coarse.npix)
-    return jacobian
+                stop = min(start + batch, len(basis))
+                sampled = basis.modes(full, start, stop)
+                modes = full.crop(sampled, window).to(model.device, coarse.dtype)
+                for kept, wavefront in zip(self.fields, pupils, strict=True):
+                    # d(exp(i k OPD)) = i k exp(i k OPD) d(OPD), for 1 nm.
+                    wavenumber = 2 * math.pi / wavefront.wavelength * NANOMETRE
+                    moved = replace(wavefront, field=modes * (1j * wavenumber * wavefront.field))
+                    kept[start:stop] = coarse.propagate(moved, values)
+        _log.debug("response of %d modes at %d pupil samples", len(basis), coarse.npix)
+
+    def image(
+        self, fields: Sequence[Tensor], values: dict[str, Tensor], amplitude_modes: int = 0
+    ) -> Tensor:
+        """Derivative of the image, for a star with the given fields.
+
+        A mode of the amplitude, an OPD of -1j nm, changes the field by -1j times what the same
+        mode of the OPD does, so the same response serves.
+
+        Parameters
+        ----------
+        fields : sequence of Tensor
+            What `OpticalSystem.fields` returns: the star's field at each wavelength.
+        values : dict of Tensor
+            Values of the model's other parameters (the blur matters here).
+        amplitude_modes : int
+            How many modes, the first, are amplitude modes as well.
+
+        Returns
+        -------
+        Tensor, (modes + amplitude_modes, ny, nx), float32
+            Light per pixel (fraction of what the pupil collects) per nm.
+        """
+        modes = len(self.fields[0])
+        shape = (modes + amplitude_modes, *self.fields[0].shape[1:])
+        total = torch.zeros(shape, device=self.model.device)
+        for field, change, weight in zip(
+            fields, self.fields, self.model.bandpass.weights, strict=True
+        ):
+            conjugate = (2 * weight) * field.to(change.dtype).conj()
+            product = change * conjugate
+            total[:modes] += product.real
+            total[modes:] += product[:amplitude_modes].imag
+        return self.coarse.detector.image(total, values)
 
 
 def parameter_jacobian(
@@ -142,12 +189,9 @@ def parameter_jacobian(
         model(opd, **values)
     rows = []
     for name in names:
-        for k in range(len(values[name])):
-            direction = torch.zeros_like(values[name])
-            direction[k] = 1.0
 
-            def image(value: Tensor, name: str = name) -> Tensor:
-                return model(opd, **{**values, name: value})
+        def image(value: Tensor, name: str = name) -> Tensor:
+            return model(opd, **{**values, name: value})
 
-            rows.append(torch.func.jvp(image, (values[name],), (direction,))[1])
-    return torch.stack(rows)
+        rows.append(torch.func.jacfwd(image)(values[name]).movedim(-1, 0))
+    return torch.cat(rows)

@@ -165,6 +165,10 @@ OTHERS = {
         pupil(), band_limited(), ("pupil", poppy.ScalarTransmission(transmission=0.8)),
         band_limited("linear"), stop(),
     ),
+    "tilt": (
+        pupil(), ("invert", "x"), ("pupil", poppy.optics.TiltOpticalPathDifference(
+            tilt_angle=0.12 * u.arcsec, rotation=30)), zernikes(), stop()
+    ),
     "lens and OPD": (
         pupil(), ("pupil", poppy.ThinLens(nwaves=0.3, reference_wavelength=4e-6, radius=3.25)),
         ("pupil", poppy.ScalarOpticalPathDifference(opd=1e-7 * u.m)),

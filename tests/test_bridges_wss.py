@@ -40,6 +40,7 @@ def test_it_is_the_map_that_stpsf_loads(stpsf_path: Path, wss: Path) -> None:
     instrument.load_wss_opd(str(wss), verbose=False)
     loaded = load_wss_opd(wss, npix=NPIX)
     truth = instrument.pupilopd[0].data
+    instrument.pupilopd.close()
     assert np.abs(loaded.opd - truth).max() <= 1e-12
     for turned in (np.flipud, np.fliplr, np.transpose):
         assert np.abs(turned(loaded.opd) - truth).max() > 1e-8

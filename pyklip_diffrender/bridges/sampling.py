@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -194,8 +195,6 @@ def _nircam_parts(optic: Any) -> list[Part]:
     Squares, holder and glass edge are cut along the axes without anti-aliasing, and none overlaps
     another: their complements add up.
     """
-    import copy
-
     bare = copy.copy(optic)
     bare.nd_squares = False
     x0, y0 = _shift(optic)

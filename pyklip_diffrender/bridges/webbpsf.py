@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
-import copy
 import os
-import warnings
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from astropy import units as u
 from astropy.io import fits
 from numpy.typing import NDArray
 from poppy.poppy_core import PlaneType
 
 from pyklip_diffrender.arrays import AberrationOptic, MovableStop, PupilOptic
 from pyklip_diffrender.bridges.checks import check_opd
+from pyklip_diffrender.bridges.convert import Converter
 from pyklip_diffrender.bridges.detector import stpsf_effects
-from pyklip_diffrender.bridges.poppy import (
-    Converter,
-    PoppySystem,
-    intermediate_wavefronts,
-    opd_to_hdus,
+from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
+from pyklip_diffrender.bridges.poppy import PoppySystem, opd_to_hdus
+from pyklip_diffrender.bridges.settings import (
+    band,
+    data_errors,
+    kernel_files_left_open,
+    oversampling,
+    private_copy,
 )
 from pyklip_diffrender.detector_effects import ChainDetector
-from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.geometry import JWST_DIAMETER
+from pyklip_diffrender.planes import Detector
 from pyklip_diffrender.psf_file import poppy_psf, save
 from pyklip_diffrender.units import to_metres
 
@@ -114,7 +116,7 @@ class WebbSystem(PoppySystem):
             "detector_oversample": system.detector.oversample,
             "fft_oversample": int(system.recipe_oversample[0]),
         }
-        with _numpy_scale_quirks():
+        with kernel_files_left_open():
             instrument._apply_jitter(result, options)
             instrument._get_fits_header(result, options)
             instrument._calc_psf_format_output(result, options)
@@ -129,7 +131,7 @@ class WebbSystem(PoppySystem):
     @property
     def recipe_oversample(self) -> tuple[int, int]:
         """Oversampling of the image planes and of the detector."""
-        return _oversampling(self.recipe)
+        return oversampling(self.recipe)
 
     def _with_changes(self, changes: dict[str, Any]) -> Any:
         """Another system; one way of giving a size or a band takes the place of the other."""
@@ -203,11 +205,11 @@ def from_webbpsf(
             f"from_webbpsf: got {nircam!r}, expected an stpsf.NIRCam or webbpsf.NIRCam. For other "
             "instruments pass what get_optical_system() returns to from_poppy"
         )
-    instrument = _private_copy(nircam)
+    instrument = private_copy(nircam)
     recipe["nircam"] = instrument
-    sampling, samples = _oversampling(recipe)
-    wavelengths, weights = _band(instrument, recipe)
-    with _data_errors():
+    sampling, samples = oversampling(recipe)
+    wavelengths, weights = band(instrument, recipe)
+    with data_errors():
         osys = instrument.get_optical_system(
             fft_oversample=sampling,
             detector_oversample=samples,
@@ -216,7 +218,9 @@ def from_webbpsf(
             options=instrument.options,
         )
     first = osys.planes[0]
-    check_opd(np.asarray(first.opd), np.asarray(first.amplitude), "pupilopd")
+    # As it was given: the field dependence has values beside the pupil, too.
+    given = getattr(first, "_opd_original", first.opd)
+    check_opd(np.asarray(given), np.asarray(first.amplitude), "pupilopd")
     flipped = _set_flip(osys, flip_si_wfe)
     converter = Converter(
         osys,
@@ -228,90 +232,11 @@ def from_webbpsf(
         },
         _kinds(osys),
     )
-    base = converter.system()
-    system = WebbSystem(
-        base.entrance,
-        base.planes,
-        _with_effects(base, instrument, sampling, add_distortion),
-        base.bandpass,
-        recipe=recipe,
-        remake=from_webbpsf,
-    )
-    system.propagation, system.frames = base.propagation, base.frames
+    converted = converter.convert()
+    detector = _with_effects(converted.detector, instrument, sampling, add_distortion)
+    system = WebbSystem.of(converted, recipe, from_webbpsf, detector)
     system.instrument, system.si_wfe_flipped = instrument, flipped
     return system
-
-
-def _private_copy(nircam: Any) -> Any:
-    """An instrument that shares data with the user's, but no settings."""
-    instrument = copy.copy(nircam)
-    instrument.options = dict(nircam.options)
-    if hasattr(instrument.pupil, "v2v3"):
-        # As calc_psf does: a telescope model has to know where in the field it is used.
-        instrument.pupil = copy.deepcopy(instrument.pupil)
-        position = instrument._tel_coords().to(u.arcsec)
-        if instrument.pupil.v2v3 is None or not (instrument.pupil.v2v3 == position).all():
-            instrument.pupil.v2v3 = position
-            instrument.pupil.update_opd()
-    return instrument
-
-
-def _oversampling(recipe: Mapping[str, Any]) -> tuple[int, int]:
-    """Of the image planes and of the detector, by stpsf's rules."""
-    both, fine, pixels = (
-        recipe[name] for name in ("oversample", "fft_oversample", "detector_oversample")
-    )
-    if None not in (both, fine, pixels):
-        raise IncompatibleSetupError(
-            "give oversample, or detector_oversample with fft_oversample, not all three"
-        )
-    if both is None and fine is None and pixels is None:
-        both = 4
-    found = (fine if fine is not None else both, pixels if pixels is not None else both)
-    if None in found:
-        raise IncompatibleSetupError(
-            f"fft_oversample={fine}, detector_oversample={pixels}: give both, or oversample"
-        )
-    return int(found[0]), int(found[1])
-
-
-def _band(instrument: Any, recipe: Mapping[str, Any]) -> tuple[list[float], list[float]]:
-    """Wavelengths (m) and weights, as stpsf has them."""
-    monochromatic = recipe["monochromatic"]
-    if monochromatic is not None:
-        monochromatic = float(to_metres(monochromatic, "monochromatic"))
-    with _data_errors(), _synphot_quirks():
-        wavelengths, weights = instrument._get_weights(
-            source=recipe["source"], nlambda=recipe["nlambda"], monochromatic=monochromatic
-        )
-    waves = [float(w) for w in np.atleast_1d(wavelengths)]
-    try:
-        instrument._validate_config(wavelengths=waves)
-    except RuntimeError as error:
-        raise IncompatibleSetupError(
-            f"wavelengths {min(waves):.4g} to {max(waves):.4g} m with {instrument.filter}: {error}. "
-            "Wavelengths are in metres"
-        ) from error
-    if monochromatic is not None:
-        _warn_outside(instrument, monochromatic)
-    return waves, [float(w) for w in np.atleast_1d(weights)]
-
-
-def _warn_outside(instrument: Any, wavelength: float) -> None:
-    """Stpsf lets a wavelength be outside the filter; say so."""
-    path = instrument._filters[instrument.filter].filename
-    if not os.path.exists(path):
-        return  # Only broadband PSFs need the curve.
-    table = fits.getdata(path, 1)
-    used = np.asarray(table["THROUGHPUT"], dtype=float)
-    passed = np.asarray(table["WAVELENGTH"], dtype=float)[used > 1e-3 * used.max()] * 1e-10
-    if not passed.min() <= wavelength <= passed.max():
-        warnings.warn(
-            f"monochromatic: {wavelength:.4g} m is outside {instrument.filter} ({passed.min():.4g} "
-            f"to {passed.max():.4g} m); the filter only names the PSF",
-            DiffrenderWarning,
-            stacklevel=4,
-        )
 
 
 def _aberrations(osys: Any) -> Any:
@@ -354,10 +279,9 @@ def _kinds(osys: Any) -> dict[str, type[PupilOptic]]:
 
 
 def _with_effects(
-    base: PoppySystem, instrument: Any, sampling: int, distortion: bool
+    detector: Detector, instrument: Any, sampling: int, distortion: bool
 ) -> ChainDetector:
-    detector = base.detector
-    with _data_errors():
+    with data_errors():
         on_samples, on_pixels = stpsf_effects(
             instrument,
             shape=detector.shape,
@@ -376,37 +300,6 @@ def _with_effects(
         on_samples=on_samples,
         on_pixels=on_pixels,
     )
-
-
-@contextmanager
-def _data_errors() -> Iterator[None]:
-    """Say which directory it is about when stpsf misses one of its files."""
-    try:
-        yield
-    except (FileNotFoundError, OSError, RuntimeError) as error:
-        if isinstance(error, CorruptFileError):
-            raise
-        raise CorruptFileError(
-            f"stpsf could not read its data ({error}). STPSF_PATH is "
-            f"{os.environ.get('STPSF_PATH')!r}; it must hold the complete stpsf data files, see "
-            "https://stpsf.readthedocs.io/en/latest/installation.html"
-        ) from error
-
-
-@contextmanager
-def _synphot_quirks() -> Iterator[None]:
-    """Room for warnings of synphot that nobody here can act on."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", module=r"synphot\.")
-        yield
-
-
-@contextmanager
-def _numpy_scale_quirks() -> Iterator[None]:
-    """Kernel files that stpsf leaves open (stpsf/detectors.py) are not the caller's business."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "unclosed file", ResourceWarning)
-        yield
 
 
 def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:
@@ -428,16 +321,13 @@ def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:
         If the map cannot be right.
     """
     values = to_metres(opd, "opd")
-    instrument = _private_copy(nircam)
-    instrument.include_si_wfe = False
-    from pyklip_diffrender.geometry import JWST_DIAMETER
-
+    instrument = private_copy(nircam)
     hdus = opd_to_hdus(values, JWST_DIAMETER)
     instrument.pupilopd = hdus
     try:
-        with _data_errors():
+        with data_errors():
             optic = instrument._get_telescope_pupil_and_aberrations()
-    except ValueError as error:
+    except (AssertionError, ValueError) as error:
         raise IncompatibleSetupError(
             f"opd: got shape {values.shape}; stpsf does not take it with the pupil "
             f"{instrument.pupil!r} ({error})"

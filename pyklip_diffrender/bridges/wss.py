@@ -175,8 +175,7 @@ def load_wss_opd_by_date(
         raise IncompatibleSetupError(
             f"choice: got {choice!r}, expected 'closest', 'before', 'after' or 'interpolate'"
         )
-    from stpsf import mast_wss
-
+    mast_wss = _stpsf("to ask MAST").mast_wss
     when = Time(date)
     cache = None if folder is None else os.fspath(folder)
     choices = ("before", "after") if choice == "interpolate" else (choice,)
@@ -264,6 +263,19 @@ def _drawn(coarse: Array, npix: int) -> NDArray[np.bool_]:
     return (coarse != 0)[np.ix_(index, index)]
 
 
+def _stpsf(purpose: str) -> Any:
+    """The module stpsf, with its submodule for MAST."""
+    try:
+        import stpsf
+        import stpsf.mast_wss
+    except ImportError as error:
+        raise IncompatibleSetupError(
+            f"stpsf is needed {purpose} and is not installed ({error}): "
+            'pip install "pyklip-diffrender[webbpsf]"'
+        ) from error
+    return stpsf
+
+
 def _data_folder() -> Path | None:
     folder = os.environ.get("STPSF_PATH") or os.environ.get("WEBBPSF_PATH")
     return Path(folder) if folder else None
@@ -287,8 +299,7 @@ def _pupil(npix: int, required: bool) -> Array:
 
 def _sensing_terms(aperture: str, opd: Array, npix: int) -> tuple[Array, Array, str]:
     """What the sensing camera adds: its own aberration, the telescope's field dependence; m."""
-    import stpsf
-
+    stpsf = _stpsf("to take out the sensing terms")
     folder = _data_folder()
     assert folder is not None  # _pupil has read from it.
     try:

@@ -132,9 +132,8 @@ def subtract_by_refinement(
     fits = []
     for frames, group in _alike(observation):
         window = Window.about(group.center[0], model.detector.shape)
-        result = refine(
-            model, window.of(group), opd, method=method, seed=seed, **settings.refine_options
-        )
+        options = {**_defaults(observation, method), **settings.refine_options}
+        result = refine(model, window.of(group), opd, method=method, seed=seed, **options)
         status = result.status.name.lower()
         if not result.status.usable:
             raise RefinementError(f"{group.name}: {result.status.message}", result)
@@ -142,6 +141,20 @@ def subtract_by_refinement(
         star[frames] = _everywhere(result, group, window)
         fits.append(Fit(tuple(map(int, frames)), status, float(result.chi2_per_pixel), result))
     return Subtraction(star, method, seed, tuple(fits))
+
+
+def _defaults(observation: Observation, method: str) -> dict[str, Any]:
+    """Options of `refine` that real frames need and simulated ones do not."""
+    from pyklip_diffrender.refinement.presets import NIRCAM_FIT
+
+    if method != METHOD or not _is_nircam(observation):
+        return {}
+    return dict(NIRCAM_FIT)
+
+
+def _is_nircam(observation: Observation) -> bool:
+    """Whether the frames are NIRCam's own, with its detector's scale and shear."""
+    return bool(observation.header.get("INSTRUME") == "NIRCAM")
 
 
 def _alike(observation: Observation) -> Iterator[tuple[NDArray[np.intp], Observation]]:
@@ -189,7 +202,7 @@ def _everywhere(result: Any, group: Observation, window: Window) -> NDArray[np.f
 def model_for(observation: Observation, settings: DiffrenderSettings) -> OpticalSystem:
     """The model that was given, else NIRCam's coronagraph in the observation's filter.
 
-    For real frames, whose headers say NIRCam, the model has the detector's true scale and shear.
+    For real frames, whose headers say NIRCam, the settings are those of `refinement.presets`.
 
     Raises
     ------
@@ -204,14 +217,14 @@ def model_for(observation: Observation, settings: DiffrenderSettings) -> Optical
             "filter='F444W' (say) or model=nircam_coronagraph(...) to register, to backend or to "
             "DiffrenderSettings"
         )
-    from pyklip_diffrender.nircam import SIAF_PIXELSCALE, SIAF_SHEAR
-
     options: dict[str, Any] = {
         "fov_pixels": settings.fit_pixels or min(FIT_PIXELS, *extent(observation).shape),
         "pixelscale": observation.pixelscale,
     }
-    if observation.header.get("INSTRUME") == "NIRCAM" and settings.pixelscale is None:
-        options |= {"pixelscale": SIAF_PIXELSCALE, "shear": SIAF_SHEAR}
+    if _is_nircam(observation) and settings.pixelscale is None:
+        from pyklip_diffrender.refinement.presets import NIRCAM_MODEL
+
+        options |= NIRCAM_MODEL
     key = tuple(sorted({**options, **settings.model_options}.items()))
     try:
         return _build_once(observation.filter, key)

@@ -11,27 +11,23 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.linalg.blas import dsyrk
 from torch import Tensor
 from tqdm import tqdm
 
 from pyklip_diffrender.bases import Basis, default_basis
-from pyklip_diffrender.geometry import PupilGrid
-from pyklip_diffrender.parameters import FLUX_AND_BACKGROUND, parameter
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.priors import EvidenceUpdate, WavefrontPrior, solve_with_evidence
+from pyklip_diffrender.refinement.companions import bright_companions
+from pyklip_diffrender.refinement.forward import Forward, Point
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement, Status
-from pyklip_diffrender.response import (
-    NANOMETRE,
-    coarse_copy,
-    downsample,
-    parameter_jacobian,
-    wavefront_jacobian,
-)
+from pyklip_diffrender.refinement.unknowns import Unknowns
 
 __all__ = ["GaussNewtonOptions", "gauss_newton"]
 
@@ -42,6 +38,12 @@ _EXPLAINED = 1.5
 
 _NEGLIGIBLE = 1e-3
 """Model error, as a share of the star, below which annealing ends."""
+
+_ANNEALING = 0.6
+"""Factor by which kappa shrinks at least from step to step."""
+
+_TRIES = 7
+"""How often a step is tried again with more damping."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,11 @@ class GaussNewtonOptions:
     basis : Basis, optional
         Default segment motions and Fourier modes to 24 cycles.
     prior : WavefrontPrior
+    companions : int
+        Most companions that may get parameters of their own, if they stand out of what the
+        alignment fit leaves.
+    companion_threshold : float
+        How far they must stand out, in units of the matched filter's scatter.
     response_npix : int
         Pupil samples of the copy of the model that gives derivatives.
     max_iterations : int
@@ -65,351 +72,309 @@ class GaussNewtonOptions:
     kappa_floor : float
         Smallest model error, as a share of the star.
     relinearise : float
-        The response is computed anew when the star has changed by more than this share (rms,
-        weighted) since the last time.
+        Change of the pupil's phase (rms, radians) after which the response of the field to the
+        wavefront is computed anew.
     robust : float
-        Residuals beyond this many sigma count as if they were that far (Huber); inf for never.
+        Residuals of this many sigma count half (Cauchy's weights); inf for plain least squares.
     """
 
     free: tuple[str, ...] = ("star_offset", "lyot_shift", "lyot_rotation", "flux", "background")
     wavefront: bool = True
     basis: Basis | None = None
-    prior: WavefrontPrior = WavefrontPrior()  # noqa: RUF009 - frozen
-    response_npix: int = 256
+    prior: WavefrontPrior = WavefrontPrior()
+    companions: int = 0
+    companion_threshold: float = 4.0
+    response_npix: int = 128
     max_iterations: int = 40
     tolerance: float = 1e-3
     kappa_floor: float = 0.0
-    relinearise: float = 0.1
+    relinearise: float = 0.3
     robust: float = math.inf
 
 
-@dataclass
-class _State:
-    """A point of the fit: parameter values, what they render, how far it is from the data."""
+@dataclass(frozen=True)
+class _Linearised:
+    """Curvature G^T G, gradient G^T r at the unknowns' starts, and where they are now."""
 
-    values: dict[str, Tensor]
-    flux: float
-    background: float
-    coefficients: Tensor
-    image: Tensor | None = None
+    curvature: Tensor
+    gradient: Tensor
+    current: Tensor
 
-    def star(self) -> Tensor:
-        assert self.image is not None
-        return self.flux * self.image
+
+def _self_product(rows: Tensor) -> Tensor:
+    """``rows @ rows.T`` at half the cost: only one triangle is computed, then mirrored."""
+    upper = torch.from_numpy(dsyrk(1.0, rows.numpy().T, trans=1))
+    return upper + upper.triu(1).T
 
 
 class _GaussNewton:
     def __init__(self, problem: Problem, options: GaussNewtonOptions, progress: bool) -> None:
         self.problem, self.options, self.progress = problem, options, progress
-        self.model = problem.model
         self.basis = options.basis or default_basis()
-        extra = {p.name for p in FLUX_AND_BACKGROUND}
-        self.optical = tuple(name for name in options.free if name not in extra)
-        self.linear = tuple(name for name in options.free if name in extra)
-        for name in self.optical:
-            if name not in self.model.parameters:
-                raise ValueError(
-                    f"free: {name!r} is not a parameter of this model, which has "
-                    f"{self.model.parameters}"
+        known = (*problem.model.parameters, "flux", "background")
+        for name in options.free:
+            if name not in known:
+                raise IncompatibleSetupError(
+                    f"free: {name!r} is not a parameter of this model, which has {known}"
                 )
-        self.coarse = coarse_copy(self.model, options.response_npix)
-        self.grid = PupilGrid.full(self.model.npix, self.model.diameter)
+        self.forward = Forward(
+            problem, self.basis, options.response_npix, progress, options.relinearise
+        )
         self.shape = options.prior.shape(self.basis)
+        self.amplitude_deviation = options.prior.amplitude_deviation(self.basis)
         self.group = self.basis.group_index
         self.scales = torch.tensor(
             [options.prior.scales[name] for name in self.basis.groups], dtype=torch.float64
         )
-        self.start_values = problem.optical_start(self.optical)
-        self.fixed_deviation = torch.tensor(
-            [
-                parameter(name).prior
-                for name in (*self.optical, *self.linear)
-                for _ in range(parameter(name).size)
-            ],
-            dtype=torch.float64,
-        )
         self.history: list[dict[str, Any]] = []
-        self._slopes = torch.zeros(0)
-        self._modes: Tensor | None = None
-        self._linearised_at: Tensor | None = None
+        self.damping = 0.0
+        self.unknowns, self.point = self._begin()
 
-    # -- the model ---------------------------------------------------------------------------
+    def _begin(self) -> tuple[Unknowns, Point]:
+        problem, free = self.problem, self.options.free
+        start = problem.optical_start(tuple(n for n in free if n in problem.model.parameters))
+        zero = torch.zeros(1, dtype=torch.float64)
+        unknowns = Unknowns(
+            free,
+            {**start, "flux": zero, "background": zero},
+            len(self.basis),
+            len(self.amplitude_deviation),
+        )
+        point = self.forward.at(unknowns, unknowns.initial())
+        # Photon-noise weights before the star is known would trust the faint pixels only.
+        flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
+        flux, level = problem.flux_and_background(point.image, flat, unknowns.linear)
+        unknowns.start["flux"] = torch.tensor([flux], dtype=torch.float64)
+        unknowns.start["background"] = torch.tensor([level], dtype=torch.float64)
+        return unknowns, self.forward.at(unknowns, unknowns.initial())
 
-    def opd(self, coefficients: Tensor) -> Tensor:
-        if not bool((coefficients != 0).any()):
-            return self.problem.opd0
-        change = self.basis.opd(coefficients * NANOMETRE, self.grid)
-        return self.problem.opd0 + change.to(self.model.device)
+    # -- how far the model is from the data --------------------------------------------------
 
-    def rendered(self, state: _State) -> _State:
-        with torch.no_grad():
-            image = self.model(self.opd(state.coefficients), **state.values).double()
-        return replace(state, image=image)
+    def sigma(self, point: Point, kappa: float) -> Tensor:
+        return torch.sqrt(self.problem.sigma**2 + (kappa * point.total) ** 2)
 
-    def whitened(self, state: _State, sigma: Tensor) -> Tensor:
-        residual = (self.problem.data - state.star() - state.background) / sigma
+    def whitened(self, point: Point, sigma: Tensor) -> Tensor:
+        residual = (self.problem.data - point.total) / sigma
         return torch.where(self.problem.valid, residual, 0.0)
 
-    def sigma(self, state: _State, kappa: float) -> Tensor:
-        return torch.sqrt(self.problem.sigma**2 + (kappa * state.star()) ** 2)
+    def chi2_per_pixel(self, point: Point) -> float:
+        """With the observation's own errors."""
+        return float((self.whitened(point, self.problem.sigma) ** 2).sum()) / self.problem.pixels
 
-    def weights(self, residual: Tensor) -> Tensor:
-        """Square roots of Huber's weights."""
-        if math.isinf(self.options.robust):
-            return torch.ones_like(residual)
-        return torch.sqrt((self.options.robust / residual.abs().clamp(min=1e-30)).clamp(max=1.0))
-
-    def cost(self, state: _State, sigma: Tensor) -> float:
-        """Penalised chi2 (Huber's loss where robust), what every step must lower."""
-        residual = self.whitened(state, sigma).abs()
-        limit = self.options.robust
-        loss = torch.where(residual <= limit, residual**2, 2 * limit * residual - limit**2)
-        if math.isinf(limit):
-            loss = residual**2
-        penalty = ((state.coefficients / (self.scales[self.group] * self.shape)) ** 2).sum()
-        offset = self._from_start(state) / self.fixed_deviation
-        return float(loss.sum() + penalty + (offset**2).sum())
-
-    def _from_start(self, state: _State) -> Tensor:
-        """Distance of the parameters that are not modes from where their priors are centred."""
-        optical = [(state.values[n] - self.start_values[n]).cpu() for n in self.optical]
-        free = torch.zeros(len(self.linear), dtype=torch.float64)
-        return torch.cat([*optical, free])
-
-    def model_error(self, state: _State) -> float:
+    def model_error(self, point: Point) -> float:
         """The share kappa of the star that brings chi2 per pixel to 1; 0 if it is there."""
-        residual = (self.problem.data - state.star() - state.background)[self.problem.valid]
-        noise, star = self.problem.sigma[self.problem.valid], state.star()[self.problem.valid]
-        if float(((residual / noise) ** 2).mean()) <= 1:
+        valid = self.problem.valid
+        residual = (self.problem.data - point.total)[valid] ** 2
+        noise, star = self.problem.sigma[valid] ** 2, point.total[valid] ** 2
+        if float((residual / noise).mean()) <= 1:
             return 0.0
         low, high = 0.0, 10.0
         for _ in range(50):
             middle = (low + high) / 2
-            chi2 = float((residual**2 / (noise**2 + (middle * star) ** 2)).mean())
-            low, high = (middle, high) if chi2 > 1 else (low, middle)
+            excess = float((residual / (noise + middle**2 * star)).mean()) > 1
+            low, high = (middle, high) if excess else (low, middle)
         return high
 
-    # -- derivatives -------------------------------------------------------------------------
+    def deviation(self, unknowns: Unknowns) -> Tensor:
+        """Prior standard deviations of all unknowns."""
+        wavefront = self.scales[self.group] * self.shape
+        return torch.cat([unknowns.prior_deviation(), self.amplitude_deviation, wavefront])
 
-    def jacobian(self, state: _State, with_modes: bool) -> Tensor:
-        """(parameters, ny, nx) in the data's unit; optical, flux, background, modes."""
-        if self._moved_since_linearised(state):
-            opd = downsample(self.opd(state.coefficients), self.coarse.npix)
-            self._slopes = (
-                parameter_jacobian(self.coarse, opd, state.values, self.optical).double()
-                if self.optical
-                else torch.zeros(0, *self.problem.data.shape, dtype=torch.float64)
-            )
-            self._modes = None
-            self._linearised_at = state.star()
-        if with_modes and self._modes is None:
-            self._modes = wavefront_jacobian(
-                self.model,
-                self.basis,
-                self.opd(state.coefficients),
-                state.values,
-                npix=self.options.response_npix,
-                progress=self.progress,
-            )
-        assert state.image is not None
-        rows = [state.flux * self._slopes]
-        if "flux" in self.linear:
-            rows.append(state.image[None])
-        if "background" in self.linear:
-            rows.append(torch.ones_like(state.image)[None])
-        if with_modes and self._modes is not None:
-            rows.append(state.flux * self._modes.double())
-        return torch.cat(rows)
-
-    def _moved_since_linearised(self, state: _State) -> bool:
-        """Whether the star differs by more than the allowed share from the linearised one."""
-        if self._linearised_at is None:
-            return True
-        weight = torch.where(self.problem.valid, self.problem.sigma**-2, 0.0)
-        moved = (weight * (state.star() - self._linearised_at) ** 2).sum()
-        size = (weight * state.star() ** 2).sum()
-        return float(torch.sqrt(moved / size)) > self.options.relinearise
+    def cost(self, point: Point, sigma: Tensor) -> float:
+        """Penalised chi2 (Cauchy's loss where robust), which every step must lower."""
+        squared = self.whitened(point, sigma) ** 2
+        if math.isfinite(self.options.robust):
+            limit = self.options.robust**2
+            squared = limit * torch.log1p(squared / limit)
+        unknowns = point.unknowns
+        away = (point.vector - unknowns.initial()) / self.deviation(unknowns)
+        return float(squared.sum() + (away**2).sum())
 
     # -- steps -------------------------------------------------------------------------------
 
-    def normal_equations(
-        self, state: _State, sigma: Tensor, with_modes: bool
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Curvature, gradient and the parameters' current distances from their priors."""
-        residual = self.whitened(state, sigma)
-        weight = self.weights(residual)
-        jacobian = self.jacobian(state, with_modes)
-        scale = torch.where(self.problem.valid, weight / sigma, 0.0)
-        whitened = (jacobian * scale).flatten(1).cpu()
-        del jacobian
-        target = (residual * weight).flatten().cpu()
-        current = self._from_start(state)
-        if with_modes:
-            current = torch.cat([current, state.coefficients])
-        curvature = whitened @ whitened.T
-        # The unknown is the distance from the prior's centre, not the step.
-        gradient = whitened @ target + curvature @ current
-        return curvature, gradient, current
+    def linearised(self, point: Point, sigma: Tensor, with_modes: bool) -> _Linearised:
+        """Normal equations about a point, for the unknowns as distances from their starts."""
+        residual = self.whitened(point, sigma)
+        weight = torch.where(self.problem.valid, 1 / sigma, 0.0)
+        if math.isfinite(self.options.robust):
+            halving = torch.rsqrt(1 + (residual / self.options.robust) ** 2)
+            residual, weight = residual * halving, weight * halving
+        whitened = (self.forward.jacobian(point, with_modes) * weight).flatten(1).cpu()
+        current = (point.vector - point.unknowns.initial())[: len(whitened)]
+        curvature = _self_product(whitened)
+        gradient = whitened @ residual.flatten().cpu() + curvature @ current
+        return _Linearised(curvature, gradient, current)
 
     def solve(
-        self, state: _State, sigma: Tensor, with_modes: bool, *, covariance: bool = False
-    ) -> tuple[EvidenceUpdate, Tensor]:
-        curvature, gradient, current = self.normal_equations(state, sigma, with_modes)
+        self,
+        unknowns: Unknowns,
+        equations: _Linearised,
+        *,
+        damping: float = 0.0,
+        fit_scales: bool = False,
+        covariance: bool = False,
+    ) -> EvidenceUpdate:
+        """Most probable unknowns, as distances from their starts, for the linearised model."""
+        curvature = equations.curvature
+        before = unknowns.where("modes").start
+        with_modes = len(curvature) > unknowns.where("companions").stop
+        fixed = unknowns.prior_deviation()
+        if with_modes:
+            fixed = torch.cat([fixed, self.amplitude_deviation])
         # Columns differ by many powers of ten (flux against nm): solve in their own units.
-        length = torch.sqrt(curvature.diagonal()).clamp(min=1e-300)
-        length[len(self.fixed_deviation) :] = 1.0
-        own = 1 / length
-        others = len(self.fixed_deviation)
+        own = torch.ones(len(curvature), dtype=torch.float64)
+        own[: len(fixed)] = curvature.diagonal()[: len(fixed)].clamp(min=1e-300) ** -0.5
+        modes = slice(None) if with_modes else slice(0, 0)
+        assert not with_modes or before == len(fixed)
         update = solve_with_evidence(
             curvature * own[:, None] * own,
-            gradient * own,
-            self.shape if with_modes else self.shape[:0],
-            self.group if with_modes else self.group[:0],
+            equations.gradient * own,
+            self.shape[modes],
+            self.group[modes],
             self.scales,
-            self.fixed_deviation / own[:others],
-            iterations=2 if with_modes and self.options.prior.fit_scales else 0,
+            fixed / own[: len(fixed)],
+            iterations=2 if fit_scales and with_modes else 0,
+            damping=damping,
+            current=equations.current / own,
             covariance=covariance,
         )
-        spread = update.covariance
-        if spread is not None:
-            spread = spread * own[:, None] * own
-        return replace(update, step=update.step * own, covariance=spread), current
+        return update.in_units(own)
 
-    def moved(self, state: _State, step: Tensor, fraction: float) -> _State:
-        values, k = dict(state.values), 0
-        for name in self.optical:
-            entry = parameter(name)
-            value = values[name] + fraction * step[k : k + entry.size].to(values[name].device)
-            values[name] = value.clamp(entry.lower, entry.upper)
-            k += entry.size
-        flux, background = state.flux, state.background
-        if "flux" in self.linear:
-            flux, k = flux + fraction * float(step[k]), k + 1
-        if "background" in self.linear:
-            background, k = background + fraction * float(step[k]), k + 1
-        coefficients = state.coefficients
-        if k < len(step):
-            coefficients = coefficients + fraction * step[k:]
-        return self.rendered(_State(values, flux, background, coefficients))
-
-    def descend(self, state: _State, sigma: Tensor, with_modes: bool) -> tuple[_State, float]:
-        """One damped step; returns the new state and by how much chi2 per pixel fell."""
-        update, current = self.solve(state, sigma, with_modes)
-        if with_modes:
-            self.scales = update.scales
-        before = self.cost(state, sigma)
-        fraction = 1.0
-        while fraction > 0.01:
-            trial = self.moved(state, update.step - current, fraction)
+    def descend(self, point: Point, sigma: Tensor, with_modes: bool) -> tuple[Point, float]:
+        """One damped step; returns the new point and by how much chi2 per pixel fell."""
+        unknowns = point.unknowns
+        equations = self.linearised(point, sigma, with_modes)
+        fit_scales = with_modes and self.options.prior.fit_scales
+        if fit_scales:
+            self.scales = self.solve(unknowns, equations, fit_scales=True).scales
+        before = self.cost(point, sigma)
+        for _ in range(_TRIES):
+            update = self.solve(unknowns, equations, damping=self.damping)
+            vector = point.vector.clone()
+            vector[: len(update.step)] += update.step - equations.current
+            trial = self.forward.at(unknowns, unknowns.clamped(vector))
             after = self.cost(trial, sigma)
             if after < before:
+                self._relax((before - after) / self.predicted_gain(unknowns, equations, update.step))
                 return trial, (before - after) / self.problem.pixels
-            fraction /= 2
-        return state, 0.0
+            self.damping = max(6 * self.damping, 0.05)
+        return point, 0.0
 
-    def initial_state(self) -> _State:
-        state = _State(
-            self.start_values, 0.0, 0.0, torch.zeros(len(self.basis), dtype=torch.float64)
+    def predicted_gain(self, unknowns: Unknowns, equations: _Linearised, step: Tensor) -> float:
+        """By how much the penalised chi2 would fall if the model were linear."""
+        precision = self.deviation(unknowns)[: len(step)] ** -2
+        curvature, current = equations.curvature, equations.current
+
+        def quadratic(x: Tensor) -> float:
+            return float(x @ (curvature @ x) - 2 * equations.gradient @ x + precision @ x**2)
+
+        return max(quadratic(current) - quadratic(step), 1e-12)
+
+    def _relax(self, ratio: float) -> None:
+        """Adapt the damping to how much of the predicted gain a step brought."""
+        if ratio > 0.7:
+            self.damping = self.damping / 4 if self.damping > 1e-3 else 0.0
+        elif ratio < 0.3:
+            self.damping = max(2.5 * self.damping, 0.05)
+
+    def add_companions(self, point: Point, kappa: float) -> Point:
+        """Give companions that stand out parameters of their own."""
+        unknowns = point.unknowns
+        sigma = self.sigma(point, kappa)
+        residual = torch.where(self.problem.valid, self.problem.data - point.total, 0.0)
+        found = bright_companions(
+            self.forward.coarse,
+            self.forward.coarse_opd(point),
+            unknowns.values(point.vector),
+            residual.cpu().numpy(),
+            torch.where(self.problem.valid, sigma, math.inf).cpu().numpy(),
+            unknowns.level("flux", point.vector),
+            most=self.options.companions - len(unknowns.companions),
+            threshold=self.options.companion_threshold,
         )
-        state = self.rendered(state)
-        # Photon-noise weights before the star is known would trust the faint pixels only.
-        flat = torch.full_like(self.problem.sigma, float(self.problem.sigma.median()))
-        assert state.image is not None
-        state.flux, state.background = self.problem.flux_and_background(
-            state.image, flat, self.linear
-        )
-        return state
+        if not found:
+            return point
+        _log.info("companions given parameters of their own: %s", found)
+        return self.forward.at(*unknowns.with_companions(found, point.vector))
 
     def run(self, seed: int) -> Refinement:
         """Anneal kappa; fit alignment, then alignment and wavefront; return the best iterate."""
         began = time.perf_counter()
-        options = self.options
-        state = self.initial_state()
-        kappa = max(self.model_error(state), options.kappa_floor)
-        best, best_error = state, kappa
+        options, point = self.options, self.point
+        kappa = max(self.model_error(point), options.kappa_floor)
+        best, best_error = point, math.inf
         status = Status.ITERATION_LIMIT
         with_modes = False
         bar = tqdm(total=options.max_iterations, desc="refine", disable=not self.progress)
         for iteration in range(options.max_iterations):
-            sigma = self.sigma(state, kappa)
-            state, gain = self.descend(state, sigma, with_modes)
-            needed = self.model_error(state)
-            if needed <= best_error:
-                best, best_error = state, needed
-            chi2 = self.chi2_per_pixel(state)
-            self.history.append(
-                {
-                    "iteration": iteration,
-                    "wavefront": with_modes,
-                    "kappa": kappa,
-                    "chi2_per_pixel": chi2,
-                    "model_error": needed,
-                    "gain": gain,
-                }
-            )
-            _log.info(
-                "iteration %d: chi2/pixel %.4g, model error %.3g, kappa %.3g, scales %s",
-                iteration, chi2, needed, kappa, self.scales.tolist() if with_modes else None,
-            )  # fmt: skip
+            point, gain = self.descend(point, self.sigma(point, kappa), with_modes)
+            needed, chi2 = self.model_error(point), self.chi2_per_pixel(point)
+            if needed < best_error:
+                best, best_error = point, needed
+            record = {
+                "iteration": iteration,
+                "wavefront": with_modes,
+                "kappa": kappa,
+                "chi2_per_pixel": chi2,
+                "model_error": needed,
+                "gain": gain,
+                "damping": self.damping,
+            }
+            self.history.append(record)
+            _log.info("%s, scales %s", record, self.scales.tolist())
             bar.update()
             bar.set_postfix(chi2=f"{chi2:.3g}", kappa=f"{kappa:.2g}")
             settled = gain < options.tolerance
             if not with_modes:
+                kappa = max(options.kappa_floor, min(kappa, needed))
+                if gain < 0.05 and len(point.unknowns.companions) < options.companions:
+                    known = len(point.unknowns.companions)
+                    point = self.add_companions(point, kappa)
+                    if len(point.unknowns.companions) > known:
+                        continue
                 if gain < 0.05 and options.wavefront:
                     with_modes = True
                 elif settled:
                     status = self.status_of(chi2)
                     break
-                kappa = max(options.kappa_floor, min(kappa, needed))
                 continue
-            lower = max(options.kappa_floor, min(kappa, needed / 2))
-            if needed < _NEGLIGIBLE:
-                lower = options.kappa_floor
-            if settled and lower >= 0.9 * kappa:
+            if settled and kappa <= options.kappa_floor:
                 status = self.status_of(chi2)
                 break
-            kappa = lower
+            kappa = min(_ANNEALING * kappa, needed / 2)
+            if kappa < max(_NEGLIGIBLE, options.kappa_floor):
+                kappa = options.kappa_floor
         bar.close()
-        if best.flux <= 0:
+        if best.unknowns.level("flux", best.vector) <= 0:
             status = Status.DIVERGED
         return self.result(best, status, began, seed)
-
-    def chi2_per_pixel(self, state: _State) -> float:
-        """With the observation's own errors."""
-        residual = self.whitened(state, self.problem.sigma)
-        return float((residual**2).sum()) / self.problem.pixels
 
     def status_of(self, chi2: float) -> Status:
         """How a fit that has settled ended."""
         return Status.CONVERGED if chi2 < _EXPLAINED else Status.MODEL_MISMATCH
 
-    def result(self, state: _State, status: Status, began: float, seed: int) -> Refinement:
-        kappa = self.model_error(state)
-        chi2 = self.chi2_per_pixel(state)
-        if chi2 < _EXPLAINED:
-            kappa = 0.0
-        sigma = self.sigma(state, kappa)
-        update, _ = self.solve(state, sigma, self.options.wavefront, covariance=True)
+    def result(self, point: Point, status: Status, began: float, seed: int) -> Refinement:
+        """Errors at the end, and everything in the form that users see."""
+        chi2 = self.chi2_per_pixel(point)
+        kappa = 0.0 if chi2 < _EXPLAINED else self.model_error(point)
+        sigma = self.sigma(point, kappa)
+        unknowns = point.unknowns
+        equations = self.linearised(point, sigma, self.options.wavefront)
+        update = self.solve(unknowns, equations, covariance=True)
         assert update.covariance is not None
         deviation = torch.sqrt(update.covariance.diagonal())
-        values, errors, k = {}, {}, 0
-        for name in (*self.optical, *self.linear):
-            size = parameter(name).size
-            errors[name] = deviation[k : k + size].numpy()
-            k += size
-        for name in self.start_values:
-            values[name] = state.values[name].cpu().numpy()
-            errors.setdefault(name, np.full(len(values[name]), np.nan))
-        values["flux"] = np.array([state.flux])
-        values["background"] = np.array([state.background])
+        values = {n: v.cpu().numpy() for n, v in unknowns.values(point.vector).items()}
         for name in ("flux", "background"):
-            errors.setdefault(name, np.array([np.nan]))
+            values[name] = np.array([unknowns.level(name, point.vector)])
+        errors = {name: np.full(len(value), np.nan) for name, value in values.items()}
+        for name in unknowns.ordered:
+            errors[name] = deviation[unknowns.where(name)].numpy()
         return Refinement(
-            model=self.model,
+            model=self.problem.model,
             observation=self.problem.observation,
             initial=self.problem.initial,
-            opd=self.opd(state.coefficients).cpu().numpy(),
-            star_image=(state.star() + state.background).cpu().numpy(),
+            opd=self.forward.opd(unknowns, point.vector).cpu().numpy(),
+            star_image=point.star.cpu().numpy(),
             values=values,
             errors=errors,
             status=status,
@@ -419,11 +384,14 @@ class _GaussNewton:
             history=self.history,
             seconds=time.perf_counter() - began,
             seed=seed,
+            companions=unknowns.sources(point.vector).numpy(),
+            companion_errors=deviation[unknowns.where("companions")].reshape(-1, 3).numpy(),
+            companion_image=(point.total - point.star).cpu().numpy(),
             scales=dict(zip(self.basis.groups, self.scales.tolist(), strict=True)),
             effective_parameters=update.effective,
-            coefficients=state.coefficients,
+            coefficients=point.vector[unknowns.where("modes")],
             covariance=update.covariance,
-            response=self.jacobian(state, self.options.wavefront),
+            response=self.forward.jacobian(point, self.options.wavefront),
         )
 
 

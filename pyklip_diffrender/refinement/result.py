@@ -72,6 +72,11 @@ class Refinement:
         One entry an iteration.
     seconds : float
     seed : int
+    companions, companion_errors : ndarray, (companions, 3)
+        Companions that had parameters of their own: contrast, x and y from the star in arcsec.
+        They are not part of `star_image`.
+    companion_image : ndarray, (ny, nx)
+        Their light, in the observation's unit.
     scales : dict of str to float
         Prior scales at the end, nm.
     effective_parameters : float
@@ -96,6 +101,9 @@ class Refinement:
     history: list[dict[str, Any]]
     seconds: float
     seed: int
+    companions: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    companion_errors: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    companion_image: NDArray[np.float64] | float = 0.0
     scales: dict[str, float] = field(default_factory=dict)
     effective_parameters: float = float("nan")
     coefficients: Tensor | None = None

@@ -1,0 +1,103 @@
+"""Fields between the planes, as poppy's own objects."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import poppy
+import torch
+from astropy import units as u
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.masks import FourierMask, SampledOcculter
+from pyklip_diffrender.orientation import Orientation
+from pyklip_diffrender.units import ARCSEC
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.bridges.poppy import PoppySystem
+
+__all__ = ["intermediate_wavefronts"]
+
+Array = NDArray[Any]
+
+
+def intermediate_wavefronts(
+    system: PoppySystem, normalize: str, only_last: bool
+) -> list[poppy.Wavefront]:
+    """Fields as poppy's own objects, one per plane, weighted and summed as poppy does.
+
+    Image planes: the field behind the mask, on that part of the image where it was sampled.
+    """
+    if normalize.lower() != "first":
+        raise IncompatibleSetupError(
+            f"normalize={normalize!r}: intermediate wavefronts come with 'first' only"
+        )
+    summed: list[poppy.Wavefront] = []
+    for wavelength, weight in zip(
+        system.bandpass.wavelengths, system.bandpass.weights, strict=True
+    ):
+        for k, wave in enumerate(_wavefronts(system, wavelength, only_last)):
+            wave.wavefront = wave.wavefront * weight
+            if k == len(summed):
+                summed.append(wave)
+            elif summed[k].shape == wave.shape:
+                summed[k].wavefront = summed[k].wavefront + wave.wavefront
+            # Otherwise the samples of an image plane, which scale with the wavelength, differ
+            # in number; those of the first wavelength are kept.
+    return summed
+
+
+def _wavefronts(system: PoppySystem, wavelength: float, only_last: bool) -> list[poppy.Wavefront]:
+    values = system.values({})
+    full = system.entrance.full
+    found = []
+    with torch.no_grad():
+        wavefront = system.pupil_field(system.opd(None), wavelength, values)
+        onto = system.windows(values)
+        planes: list[Any] = [system.entrance, *system.planes]
+        for k, plane in enumerate(planes):
+            back = system.frames[k].inverse
+            if isinstance(plane, SampledOcculter | FourierMask):
+                field, spacing = plane.focal_sample(wavefront)
+                wave = _wave_of(field, wavelength, full.diameter, spacing / ARCSEC)
+                if isinstance(plane, FourierMask):
+                    field = back.apply_to_lattice(field)
+                else:
+                    # On the image the inversion of y is undone, see `propagation`.
+                    field = Orientation.inversion("y").then(back).apply(field)
+                wave.wavefront = _numpy(field)
+            if k > 0:
+                wavefront = system.planes[k - 1].apply(wavefront, values, onto[k - 1])
+            if not isinstance(plane, SampledOcculter | FourierMask):
+                whole = back.apply(wavefront.grid.crop(wavefront.field, full)) * full.spacing
+                wave = _wave_of(whole, wavelength, full.diameter, None)
+            wave.location = f"after {plane.name}"
+            found.append(wave)
+        detector = system.detector
+        final = detector.field(wavefront, values)
+    scale = detector.pixelscale[0] / detector.oversample
+    last = _wave_of(final, wavelength, full.diameter, scale)
+    last.oversample = detector.oversample
+    last.location = f"at {detector.name}"
+    return [last] if only_last else [*found, last]
+
+
+def _numpy(field: Tensor) -> Array:
+    return np.asarray(field.cpu().numpy(), dtype=np.complex128)
+
+
+def _wave_of(
+    field: Tensor, wavelength: float, diameter: float, arcsec: float | None
+) -> poppy.Wavefront:
+    """A field in a pupil, or on an image with samples of a given size."""
+    where = {} if arcsec is None else {"pixelscale": arcsec * u.arcsec / u.pix}
+    wave = poppy.Wavefront(wavelength=wavelength * u.m, npix=1, diam=diameter * u.m, **where)
+    wave.wavefront = _numpy(field)
+    if arcsec is None:
+        wave.pixelscale = diameter / len(field) * u.m / u.pix
+    else:
+        wave.fov = len(field) * arcsec * u.arcsec
+    return wave

@@ -1,0 +1,132 @@
+"""The vector of a fit's unknowns: which parameter is where, and what is known beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.parameters import FLUX_AND_BACKGROUND, parameter
+from pyklip_diffrender.scene import Planet
+
+__all__ = ["COMPANION_PRIOR", "Unknowns"]
+
+_LINEAR = tuple(p.name for p in FLUX_AND_BACKGROUND)
+
+COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
+"""Prior deviation of a companion's contrast and of its x and y (arcsec) about the start."""
+
+
+@dataclass
+class Unknowns:
+    """Layout of the vector: optical parameters, flux, background, companions, amplitude, wavefront.
+
+    Units are those of the parameter table; a companion is (contrast, x, y) with x, y in arcsec
+    from the star, image orientation; modes are in nm.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Free optical parameters, flux and background.
+    start : dict of str to Tensor
+        Values of all optical parameters that are not at their defaults, free or not, and of
+        flux and background.
+    modes : int
+        Wavefront modes.
+    amplitude_modes : int
+        Amplitude modes of the pupil.
+    companions : list of Planet
+        Where companions start.
+    """
+
+    names: tuple[str, ...]
+    start: dict[str, Tensor]
+    modes: int
+    amplitude_modes: int = 0
+    companions: list[Planet] = field(default_factory=list)
+
+    @property
+    def optical(self) -> tuple[str, ...]:
+        """Free parameters of the model."""
+        return tuple(name for name in self.names if name not in _LINEAR)
+
+    @property
+    def linear(self) -> tuple[str, ...]:
+        """Which of flux and background are free, in this order."""
+        return tuple(name for name in _LINEAR if name in self.names)
+
+    @property
+    def ordered(self) -> tuple[str, ...]:
+        """Names in the order of the vector."""
+        return (*self.optical, *self.linear)
+
+    def where(self, name: str) -> slice:
+        """Place of a named parameter, of "companions", "amplitude" or "modes"."""
+        begin = 0
+        for each in self.ordered:
+            size = parameter(each).size
+            if each == name:
+                return slice(begin, begin + size)
+            begin += size
+        for each, size in (
+            ("companions", 3 * len(self.companions)),
+            ("amplitude", self.amplitude_modes),
+            ("modes", self.modes),
+        ):
+            if each == name:
+                return slice(begin, begin + size)
+            begin += size
+        raise KeyError(name)
+
+    def initial(self) -> Tensor:
+        """The starting vector."""
+        named = [self.start[name] for name in self.ordered]
+        planets = [
+            torch.tensor([p.contrast, *p.offset], dtype=torch.float64) for p in self.companions
+        ]
+        zeros = torch.zeros(self.amplitude_modes + self.modes, dtype=torch.float64)
+        return torch.cat([*named, *planets, zeros])
+
+    def values(self, vector: Tensor) -> dict[str, Tensor]:
+        """All optical parameters as the model takes them."""
+        values = {name: value for name, value in self.start.items() if name not in _LINEAR}
+        for name in self.optical:
+            values[name] = vector[self.where(name)]
+        return values
+
+    def level(self, name: str, vector: Tensor) -> float:
+        """Flux or background."""
+        value = vector[self.where(name)] if name in self.linear else self.start[name]
+        return float(value[0])
+
+    def sources(self, vector: Tensor) -> Tensor:
+        """Companions, (companions, 3)."""
+        return vector[self.where("companions")].reshape(-1, 3)
+
+    def prior_deviation(self) -> Tensor:
+        """Prior deviations of everything before the amplitude and the modes."""
+        named = [
+            torch.full((parameter(name).size,), parameter(name).prior, dtype=torch.float64)
+            for name in self.ordered
+        ]
+        planets = torch.tensor(COMPANION_PRIOR, dtype=torch.float64).repeat(len(self.companions))
+        return torch.cat([*named, planets])
+
+    def clamped(self, vector: Tensor) -> Tensor:
+        """The vector with every parameter inside its bounds."""
+        vector = vector.clone()
+        for name in self.ordered:
+            entry = parameter(name)
+            vector[self.where(name)] = vector[self.where(name)].clamp(entry.lower, entry.upper)
+        return vector
+
+    def with_companions(self, found: Sequence[Planet], vector: Tensor) -> tuple[Unknowns, Tensor]:
+        """A layout with more companions, and the same point in it."""
+        grown = replace(self, companions=[*self.companions, *found])
+        moved = grown.initial()
+        before, after = self.where("companions").stop, grown.where("companions").stop
+        moved[:before] = vector[:before]
+        moved[after:] = vector[before:]
+        return grown, moved

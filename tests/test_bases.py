@@ -1,0 +1,214 @@
+"""Wavefront modes: their size, place and orientation, and that sums and windows agree."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pyklip_diffrender.bases import (
+    Basis,
+    FourierModes,
+    JointBasis,
+    SegmentMotions,
+    default_basis,
+)
+from pyklip_diffrender.geometry import (
+    TABULATED_GAP,
+    PupilGrid,
+    jwst_pupil,
+    jwst_segments,
+    polygon_coverage,
+    widen_polygon,
+)
+
+GRID = PupilGrid.full(128)
+
+
+@pytest.fixture(scope="module")
+def segments() -> SegmentMotions:
+    return SegmentMotions()
+
+
+def support(k: int) -> torch.Tensor:
+    """Share of every pixel that lies on a segment, half the gaps around it included."""
+    outline = list(jwst_segments().values())[k]
+    return polygon_coverage([widen_polygon(outline, TABULATED_GAP / 2)], GRID)
+
+
+def bases() -> list[Basis]:
+    return [SegmentMotions(), FourierModes(5), JointBasis([SegmentMotions(), FourierModes(5)])]
+
+
+# -- segments --------------------------------------------------------------------------------
+
+
+def test_segment_modes_have_unit_rms_on_their_segment(segments: SegmentMotions) -> None:
+    modes = segments.modes(GRID, 0, len(segments))
+    assert modes.shape == (54, 128, 128)
+    for k in range(18):
+        cover = support(k)
+        inside = cover > 0
+        for mode in modes[3 * k : 3 * k + 3]:
+            shape = torch.where(inside, mode / cover.clamp(min=1e-12), 0.0)
+            rms = torch.sqrt((cover * shape**2).sum() / cover.sum())
+            assert float(rms) == pytest.approx(1.0, rel=1e-9)
+            assert not mode[~inside].any()
+
+
+def test_tips_and_tilts_have_no_piston(segments: SegmentMotions) -> None:
+    modes = segments.modes(GRID, 0, len(segments))
+    for k in (1, 2, 28, 53):
+        assert abs(float(modes[k].sum() / modes[k].abs().sum())) < 1e-12
+
+
+def test_all_pistons_together_fill_the_pupil(segments: SegmentMotions) -> None:
+    """No point of the pupil, gaps included, is left out or moved twice."""
+    coefficients = torch.zeros(54, dtype=torch.float64)
+    coefficients[0::3] = 1.0
+    total = segments.opd(coefficients, GRID)
+    np.testing.assert_allclose(total[jwst_pupil(128) > 0.999], 1.0, atol=0.02)
+    assert float(total.max()) < 1.02
+
+
+def test_a_tip_rises_along_x_and_a_tilt_along_y(segments: SegmentMotions) -> None:
+    for k in (0, 3, 8, 15):
+        rows, columns = np.nonzero(support(k).numpy() > 0.999)
+        tip, tilt = (segments.modes(GRID, 3 * k + j, 3 * k + j + 1)[0].numpy() for j in (1, 2))
+        # At coefficient 1 a plane: slope in its own axis, none in the other. "Full" pixels that
+        # the outline touches are up to 0.1 % less than full.
+        design = np.stack([columns, rows, np.ones_like(rows)], axis=1).astype(float)
+        for mode, axis in ((tip, 0), (tilt, 1)):
+            slope, residual, *_ = np.linalg.lstsq(design, mode[rows, columns], rcond=None)
+            assert slope[axis] > 0.1
+            assert abs(slope[1 - axis]) < 1e-4
+            assert float(residual[0]) / len(rows) < 1e-6
+
+
+def test_segments_are_where_the_telescope_has_them(segments: SegmentMotions) -> None:
+    """A1 at the top (+V3) and the names in their sequence around the ring."""
+    assert segments.names[0].startswith("A1")
+    assert segments.names[0].endswith("piston")
+    assert segments.names[1].endswith("tip")
+    assert segments.names[2].endswith("tilt")
+    piston = segments.modes(GRID, 0, 1)[0]
+    y = float((piston * GRID.y[:, None]).sum() / piston.sum())
+    x = float((piston * GRID.x).sum() / piston.sum())
+    assert y == pytest.approx(1.32, abs=0.03)
+    assert x == pytest.approx(0.0, abs=0.03)
+
+
+def test_segment_modes_are_orthogonal(segments: SegmentMotions) -> None:
+    modes = segments.modes(GRID, 0, len(segments)).flatten(1)
+    gram = modes @ modes.T
+    length = gram.diagonal().rsqrt()
+    gram = gram * length[:, None] * length
+    # Neighbours share the pixels of their common edge, hexagons are not perfectly regular.
+    assert float((gram - torch.eye(54)).abs().max()) < 0.05
+    same = gram.reshape(18, 3, 18, 3)[range(18), :, range(18), :]
+    assert float((same - torch.eye(3)).abs().max()) < 0.02
+
+
+# -- Fourier modes ---------------------------------------------------------------------------
+
+
+def test_fourier_modes_are_orthonormal_over_the_array() -> None:
+    basis = FourierModes(6)
+    grid = PupilGrid.full(32)
+    modes = basis.modes(grid, 0, len(basis)).flatten(1)
+    gram = modes @ modes.T / modes.shape[1]
+    torch.testing.assert_close(gram, torch.eye(len(basis), dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+def test_fourier_modes_are_the_cosines_and_sines_that_they_say() -> None:
+    basis = FourierModes(4)
+    modes = basis.modes(GRID, 0, len(basis))
+    x, y = GRID.x[None, :] / GRID.diameter, GRID.y[:, None] / GRID.diameter
+    for k, (fx, fy) in enumerate(basis.cycles.tolist()):
+        phase = 2 * math.pi * (fx * x + fy * y)
+        for mode, wave in ((modes[2 * k], phase.cos()), (modes[2 * k + 1], phase.sin())):
+            torch.testing.assert_close(mode, math.sqrt(2) * wave, rtol=0, atol=1e-12)
+        assert float(basis.frequencies[2 * k]) == pytest.approx(math.hypot(fx, fy))
+        assert basis.frequencies[2 * k] == basis.frequencies[2 * k + 1]
+
+
+def test_fourier_modes_fill_the_half_plane_between_their_limits() -> None:
+    basis = FourierModes(5.0, min_cycles=2.0)
+    cycles = {tuple(pair) for pair in basis.cycles.tolist()}
+    both = cycles | {(-x, -y) for x, y in cycles}
+    expected = {
+        (x, y) for x in range(-5, 6) for y in range(-5, 6) if 4 <= x * x + y * y <= 25
+    }  # fmt: skip
+    assert both == expected
+    assert len(both) == 2 * len(cycles) == len(basis)
+
+
+# -- all bases -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("basis", bases(), ids=lambda b: type(b).__name__)
+@pytest.mark.parametrize("grid", [GRID, PupilGrid(128, GRID.diameter, (9, 70), (40, 127))])
+def test_the_opd_is_the_sum_of_the_modes(basis: Basis, grid: PupilGrid) -> None:
+    generator = torch.Generator().manual_seed(8)
+    coefficients = torch.randn(len(basis), dtype=torch.float64, generator=generator)
+    modes = basis.modes(grid, 0, len(basis))
+    expected = torch.tensordot(coefficients, modes, dims=1)
+    torch.testing.assert_close(basis.opd(coefficients, grid), expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("basis", bases(), ids=lambda b: type(b).__name__)
+def test_modes_in_a_window_are_the_window_of_the_modes(basis: Basis) -> None:
+    window = PupilGrid(128, GRID.diameter, (9, 70), (40, 127))
+    whole = basis.modes(GRID, 0, len(basis))[:, 9:70, 40:127]
+    modes = basis.modes(window, 0, len(basis))
+    if isinstance(basis, FourierModes):
+        torch.testing.assert_close(modes, whole, rtol=0, atol=1e-12)
+        return
+    # Whatever the window, a mode of a segment that it cuts must stay the same mode.
+    torch.testing.assert_close(modes, whole, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("basis", bases(), ids=lambda b: type(b).__name__)
+def test_any_slice_of_the_modes_is_a_slice_of_them_all(basis: Basis) -> None:
+    every = basis.modes(GRID, 0, len(basis))
+    for start, stop in ((0, 1), (1, 2), (3, 8), (50, 61), (len(basis) - 3, len(basis))):
+        torch.testing.assert_close(
+            basis.modes(GRID, start, min(stop, len(basis))), every[start:stop], rtol=0, atol=0
+        )
+
+
+@pytest.mark.parametrize("basis", bases(), ids=lambda b: type(b).__name__)
+def test_the_opd_has_the_modes_as_its_derivative(basis: Basis) -> None:
+    grid = PupilGrid.full(24)
+    zero = torch.zeros(len(basis), dtype=torch.float64)
+    (slope,) = torch.func.jacrev(lambda c: (basis.opd(c, grid),))(zero)
+    torch.testing.assert_close(
+        slope.movedim(-1, 0), basis.modes(grid, 0, len(basis)), rtol=0, atol=1e-12
+    )
+
+
+def test_a_fine_basis_binned_is_the_coarse_basis(segments: SegmentMotions) -> None:
+    coefficients = torch.randn(54, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    fine = segments.opd(coefficients, PupilGrid.full(512))
+    binned = fine.reshape(128, 4, 128, 4).mean(dim=(1, 3))
+    coarse = segments.opd(coefficients, GRID)
+    # Ramps on pixels cut by an edge differ by a fraction of a pixel of the ramp.
+    assert float((coarse - binned).abs().max()) < 0.05 * float(coarse.abs().max())
+    assert float((coarse - binned).square().mean().sqrt()) < 0.005 * float(coarse.std())
+
+
+def test_the_joint_basis_keeps_kinds_apart() -> None:
+    parts = [SegmentMotions(), FourierModes(3)]
+    basis = JointBasis(parts)
+    assert len(basis) == 54 + len(parts[1])
+    assert basis.groups == ("segment", "texture")
+    assert basis.group_index.tolist() == [0] * 54 + [1] * len(parts[1])
+    assert not basis.frequencies[:54].any()
+    torch.testing.assert_close(basis.frequencies[54:], parts[1].frequencies)
+
+
+def test_the_default_basis_has_about_1850_modes() -> None:
+    assert 1800 < len(default_basis()) < 1900
+    assert float(default_basis().frequencies.max()) == 24.0

@@ -1,0 +1,141 @@
+"""The command line: what it writes, where errors go, and that it starts quickly."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from astropy.io import fits
+
+from pyklip_diffrender.cli import main
+from pyklip_diffrender.files import open_fits
+from pyklip_diffrender.nircam import nircam_coronagraph
+from pyklip_diffrender.opd import random_opd, resample
+
+ROOT = Path(__file__).resolve().parents[1]
+
+WAVELENGTH = ["--monochromatic", "4.5e-6"]
+
+
+def opd_file(path: Path, unit: str | None = "nm") -> Path:
+    hdu = fits.PrimaryHDU(random_opd(3, npix=128).data * 1e9)
+    if unit:
+        hdu.header["BUNIT"] = unit
+    hdu.writeto(path)
+    return path
+
+
+def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--help"])
+    assert ended.value.code == 0
+    shown = capsys.readouterr().out
+    for command in ("demo", "psf", "refine"):
+        assert command in shown
+
+
+def test_no_command_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([])
+    assert ended.value.code == 2
+    assert "COMMAND" in capsys.readouterr().err
+
+
+def test_help_does_not_wait_for_torch() -> None:
+    program = (
+        "import sys, pyklip_diffrender.cli as cli\n"
+        "try:\n    cli.main(['--help'])\n"
+        "except SystemExit:\n    pass\n"
+        "heavy = {'torch', 'numpy', 'pyklip', 'matplotlib', 'poppy'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_psf_writes_the_image_of_the_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "star.fits"
+    opd = opd_file(tmp_path / "opd.fits")
+    arguments = ["psf", str(path), *WAVELENGTH, "--fov-pixels", "20", "--opd", str(opd)]
+    assert main([*arguments, "--offset", "0.02", "-0.3"]) == 0
+    assert str(path) in capsys.readouterr().out
+    with open_fits(path) as hdus:
+        image, header = hdus[0].data, hdus[0].header
+    assert header["FILTER"] == "F444W"
+    assert header["PIXELSCL"] == pytest.approx(0.062424185)
+    model = nircam_coronagraph("F444W", monochromatic=4.5e-6, fov_pixels=20)
+    map_ = resample(random_opd(3, npix=128).data, 1024)
+    with torch.no_grad():
+        expected = model(map_, (0.02, -0.3)).numpy()
+    np.testing.assert_allclose(image, expected, rtol=1e-9)
+    # The star is below the middle, as asked for.
+    assert np.unravel_index(image.argmax(), image.shape)[0] < 9
+    assert not np.allclose(image, expected[::-1], rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (["--filter", "F200W"], ["F200W", "MASK335R", "F444W"]),
+        (["--monochromatic", "4.5"], ["4.5", "metres"]),
+        (["--fov-pixels", "0"], ["at least 1"]),
+        (["--opd", "nowhere.fits"], ["nowhere.fits", "no such file"]),
+    ],
+    ids=["filter", "wavelength", "field", "file"],
+)
+def test_errors_go_to_stderr_and_nothing_is_written(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    extra: list[str],
+    words: list[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["psf", "star.fits", *extra]) == 1
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith("pyklip-diffrender: ")
+    assert "Traceback" not in shown.err
+    for word in words:
+        assert word in shown.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_map_without_a_unit_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opd = opd_file(tmp_path / "opd.fits", unit=None)
+    product = tmp_path / "star.fits"
+    assert main(["psf", str(product), *WAVELENGTH, "--opd", str(opd)]) == 1
+    assert "opd.fits: the header has no BUNIT" in capsys.readouterr().err
+    assert not product.exists()
+
+
+@pytest.mark.parametrize("percent", [0, 50])
+def test_refine_of_a_broken_file_leaves_no_product(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], percent: int
+) -> None:
+    frames, product = tmp_path / "calints.fits", tmp_path / "fit.fits"
+    if percent:
+        fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((2, 90, 90)), name="SCI")]).writeto(
+            frames
+        )
+        whole = frames.read_bytes()
+        frames.write_bytes(whole[: len(whole) * percent // 100])
+    opd = opd_file(tmp_path / "opd.fits")
+    assert main(["refine", str(frames), str(opd), "-o", str(product)]) == 1
+    assert "calints.fits" in capsys.readouterr().err
+    assert not product.exists()

@@ -1,0 +1,125 @@
+"""Every effect of the detector against the library whose numerics it repeats."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.ndimage
+import torch
+from astropy.convolution import convolve
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+
+from pyklip_diffrender.detector_effects import (
+    ChainDetector,
+    Effect,
+    GaussianBlur,
+    LinearResampling,
+    PixelCrosstalk,
+)
+from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.planes import Detector
+from pyklip_diffrender.rotation import SplineRotation
+
+Array = NDArray[np.float64]
+
+SHAPE = (24, 31)
+KERNEL = np.array([[0.01, 0.02, 0.03], [0.04, 0.8, 0.05], [0.06, 0.07, 0.08]])
+
+
+@pytest.fixture
+def image(rng: np.random.Generator) -> Array:
+    return rng.uniform(size=SHAPE)
+
+
+def apply(effect: Effect, image: Array) -> Array:
+    return effect(torch.from_numpy(image)).numpy()
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.124, 0.126, 0.4, 1.15, 3.0, 12.0])
+def test_blur_is_that_of_scipy(image: Array, sigma: float) -> None:
+    truth = scipy.ndimage.gaussian_filter(image, sigma)
+    assert np.abs(apply(GaussianBlur(sigma), image) - truth).max() < 1e-13
+    assert np.array_equal(truth, image) == (sigma < 0.125)
+
+
+@pytest.mark.parametrize("angle", [0.0776, -0.5, 12.3, 90.0, 200.0])
+def test_rotation_is_that_of_scipy(image: Array, angle: float) -> None:
+    truth = scipy.ndimage.rotate(image, angle, reshape=False)
+    assert np.abs(apply(SplineRotation(angle, SHAPE), image) - truth).max() < 1e-12
+
+
+def test_rotation_takes_complex_fields(image: Array) -> None:
+    rotation = SplineRotation(7.0, SHAPE)
+    field = torch.from_numpy(image + 1j * image[::-1])
+    parts = torch.complex(rotation(field.real.contiguous()), rotation(field.imag.contiguous()))
+    assert torch.allclose(rotation(field), parts, atol=1e-14)
+    assert rotation(field.to(torch.complex64)).dtype == torch.complex64
+
+
+def test_resampling_is_that_of_scipy(image: Array, rng: np.random.Generator) -> None:
+    rows = rng.uniform(-2, SHAPE[0] + 1, size=(17, 19))
+    columns = rng.uniform(-2, SHAPE[1] + 1, size=(17, 19))
+    rows[0, :3], columns[0, :3] = (0, SHAPE[0] - 1, 5), (0, SHAPE[1] - 1, 7)
+    axes = tuple(np.arange(n) for n in SHAPE)
+    function = RegularGridInterpolator(axes, image, bounds_error=False, fill_value=0)
+    found = apply(LinearResampling(rows, columns, SHAPE), image)
+    assert np.abs(found - function((rows, columns))).max() < 1e-14
+    with pytest.raises(ShapeError, match="made for"):
+        LinearResampling(rows, columns, (8, 8))(torch.from_numpy(image))
+
+
+def test_crosstalk_is_that_of_astropy(image: Array) -> None:
+    truth = convolve(image, KERNEL, boundary="fill", fill_value=0)
+    assert np.abs(apply(PixelCrosstalk(KERNEL), image) - truth).max() < 1e-14
+    # What the kernel has to the right of its middle goes to the right.
+    point = np.zeros(SHAPE)
+    point[10, 10] = 1
+    assert np.allclose(apply(PixelCrosstalk(KERNEL), point)[9:12, 9:12], KERNEL / KERNEL.sum())
+    with pytest.raises(ShapeError, match="two odd lengths"):
+        PixelCrosstalk(np.ones((2, 3)))
+
+
+def effects() -> dict[str, Effect]:
+    y, x = np.mgrid[:9, :11] * 0.93
+    return {
+        "blur": GaussianBlur(0.7),
+        "rotation": SplineRotation(3.0, (9, 11)),
+        "resampling": LinearResampling(y + 0.21, x + 0.33, (9, 11)),
+        "crosstalk": PixelCrosstalk(KERNEL),
+    }
+
+
+@pytest.mark.parametrize("name", effects())
+def test_adjoints(name: str) -> None:
+    """<A u, v> = <u, A* v>, where autograd gives A*."""
+    effect, generator = effects()[name], torch.manual_seed(3)
+    u = torch.randn(9, 11, dtype=torch.float64, generator=generator).requires_grad_()
+    v = torch.randn(9, 11, dtype=torch.float64, generator=generator)
+    image = effect(u)
+    (back,) = torch.autograd.grad(image, u, v)
+    left, right = (image * v).sum(), (u * back).sum()
+    assert abs(left - right) < 1e-12 * image.norm() * v.norm()
+    assert torch.allclose(effect(torch.stack([u, 2 * u]))[1], 2 * image, atol=1e-14)
+
+
+def test_the_width_of_the_blur_can_be_fitted() -> None:
+    image = torch.rand(7, 8, dtype=torch.float64, generator=torch.manual_seed(4))
+    sigma = torch.tensor(0.83, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s: GaussianBlur(s)(image), (sigma,), eps=1e-6)
+
+
+def test_a_chain_bins_between_samples_and_pixels(rng: np.random.Generator) -> None:
+    shape, oversample = (6, 8), 3
+    fine = rng.uniform(size=(18, 24))
+    blur, crosstalk = GaussianBlur(1.3), PixelCrosstalk(KERNEL)
+    common = {"shape": shape, "pixelscale": (0.06, 0.06), "oversample": oversample,
+              "dtype": torch.float64, "device": torch.device("cpu")}  # fmt: skip
+    chain = ChainDetector(**common, on_samples=(blur,), on_pixels=(crosstalk,))
+    binned = apply(blur, fine).reshape(6, 3, 8, 3).sum(axis=(1, 3))
+    found = chain.image(torch.from_numpy(fine), {}).numpy()
+    assert np.allclose(found, apply(crosstalk, binned), atol=1e-14)
+    # The free blur of a fit is the same with and without a chain behind it.
+    values = {"blur": torch.tensor([0.05], dtype=torch.float64)}
+    plain = Detector(**common).image(torch.from_numpy(fine), values)
+    assert torch.allclose(ChainDetector(**common).image(torch.from_numpy(fine), values), plain)

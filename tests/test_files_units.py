@@ -1,0 +1,311 @@
+"""The gates for numbers and files: units, byte order, broken files, products never half written."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+from astropy.io import fits
+
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    DiffrenderError,
+    NonFiniteError,
+    ShapeError,
+    UnitError,
+)
+from pyklip_diffrender.files import embedded_table, open_fits, replacing, sha256, write_fits
+from pyklip_diffrender.units import (
+    ARCSEC,
+    native_float64,
+    require_finite,
+    require_shape,
+    to_arcsec,
+    to_metres,
+    to_unit,
+)
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def written(path: Path, value: float = 1.0, size: int = 64) -> Path:
+    """A small FITS file with a header, an image and a second extension."""
+    data = value * np.arange(size * size, dtype=np.float32).reshape(size, size)
+    hdus = [fits.PrimaryHDU(), fits.ImageHDU(data, name="A"), fits.ImageHDU(-data, name="B")]
+    fits.HDUList(hdus).writeto(path)
+    return path
+
+
+# -- units -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "metres"),
+    [(3.0, 3.0), (3 * u.um, 3e-6), (3 * u.nm, 3e-9), (3 * u.AA, 3e-10), (0.003 * u.mm, 3e-6)],
+)
+def test_lengths_become_metres(value: object, metres: float) -> None:
+    assert float(to_metres(value, "opd")) == pytest.approx(metres, rel=1e-15)
+
+
+def test_angles_become_arcseconds() -> None:
+    assert float(to_arcsec(20 * u.mas, "offset")) == pytest.approx(0.020, rel=1e-15)
+    assert float(to_arcsec(2.0, "offset")) == 2.0
+    assert pytest.approx(np.pi / 180 / 3600, rel=1e-15) == ARCSEC
+
+
+def test_a_list_of_quantities_of_mixed_units_keeps_each_unit() -> None:
+    np.testing.assert_allclose(
+        to_metres([1 * u.um, 2 * u.nm, 3 * u.m], "opd"), [1e-6, 2e-9, 3.0], rtol=1e-15
+    )
+    np.testing.assert_allclose(to_arcsec((20 * u.mas, 1 * u.arcmin), "x"), [0.02, 60], rtol=1e-15)
+
+
+@pytest.mark.parametrize("bad", [1 * u.s, np.ones(3) * u.kg, 5 * u.arcsec])
+def test_a_unit_that_does_not_convert_is_named_with_the_expected_one(bad: u.Quantity) -> None:
+    with pytest.raises(UnitError, match=rf"opd: got the unit '{bad.unit}'.*'m'") as caught:
+        to_metres(bad, "opd")
+    assert isinstance(caught.value, ValueError | DiffrenderError)
+
+
+def test_to_unit_takes_any_unit() -> None:
+    assert float(to_unit(180 * u.deg, "rad", "angle")) == pytest.approx(np.pi, rel=1e-15)
+
+
+# -- arrays ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def plain() -> np.ndarray:
+    # Multiples of 1/4 below 2^14: exact in every type that is tried.
+    return np.arange(-24, 24, dtype=np.float64).reshape(6, 8) / 4
+
+
+@pytest.mark.parametrize(
+    "dress",
+    [
+        lambda a: a.astype(">f8"),
+        lambda a: a.astype(">f4"),
+        lambda a: a.astype(np.float32),
+        lambda a: np.asfortranarray(a),
+        lambda a: np.repeat(a, 2, axis=1)[:, ::2],
+        lambda a: torch.from_numpy(a).requires_grad_(),
+        lambda a: a.tolist(),
+        lambda a: np.ma.masked_array(a, np.zeros(a.shape, dtype=bool)),
+    ],
+    ids=["f8be", "f4be", "f4", "fortran", "strided", "tensor", "list", "masked"],
+)
+def test_every_kind_of_array_becomes_the_same_native_copy(dress: object, plain: np.ndarray) -> None:
+    got = native_float64(dress(plain))  # type: ignore[operator]
+    np.testing.assert_array_equal(got, plain)
+    assert got.dtype == np.dtype("=f8")
+    assert got.dtype.isnative
+    assert got.flags.c_contiguous
+    assert got.flags.writeable
+    torch.from_numpy(got)
+
+
+def test_a_memory_mapped_read_only_file_is_copied(tmp_path: Path, plain: np.ndarray) -> None:
+    path = tmp_path / "map.dat"
+    plain.astype(">f8").tofile(path)
+    mapped = np.memmap(path, dtype=">f8", mode="r", shape=plain.shape)
+    got = native_float64(mapped)
+    got += 1
+    np.testing.assert_array_equal(mapped, plain)
+    assert not isinstance(got, np.memmap)
+
+
+def test_the_input_is_never_modified(plain: np.ndarray) -> None:
+    before = plain.copy()
+    native_float64(plain)[:] = 7
+    to_metres(plain, "x")[:] = 7
+    quantity = plain * u.m
+    to_metres(quantity, "x")[:] = 7
+    tensor = torch.from_numpy(plain)
+    native_float64(tensor)[:] = 7
+    np.testing.assert_array_equal(plain, before)
+    np.testing.assert_array_equal(quantity.value, before)
+
+
+def test_masked_values_become_nan() -> None:
+    masked = np.ma.masked_array([1, 2, 3], mask=[False, True, False])
+    np.testing.assert_array_equal(native_float64(masked), [1.0, np.nan, 3.0])
+    assert masked.data[1] == 2
+
+
+# -- checks ----------------------------------------------------------------------------------
+
+
+def test_require_shape_says_what_was_got_what_was_expected_and_what_to_do() -> None:
+    require_shape(np.empty((3, 4)), (None, 4), "data", "Turn it.")
+    with pytest.raises(ShapeError, match=r"data: got shape \(3, 4\).*\('any', 5\).*Turn it"):
+        require_shape(np.empty((3, 4)), (None, 5), "data", "Turn it.")
+    with pytest.raises(ShapeError, match=r"\(3, 4\)"):
+        require_shape(np.empty((3, 4)), (3, 4, 1), "data", "")
+
+
+def test_require_finite_counts_and_locates() -> None:
+    array = np.zeros((5, 6))
+    array[2, 3], array[4, 1], array[0, 5] = np.nan, np.inf, -np.inf
+    with pytest.raises(NonFiniteError, match=r"map: 3 values.*\(0, 5\)"):
+        require_finite(array, "map")
+    where = np.zeros((5, 6), dtype=bool)
+    require_finite(array, "map", where)
+    where[2:] = True
+    with pytest.raises(NonFiniteError, match=r"map: 2 values.*\(2, 3\)"):
+        require_finite(array, "map", where)
+
+
+# -- reading ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
+def test_a_whole_file_is_read_and_usable_afterwards(tmp_path: Path, suffix: str) -> None:
+    path = written(tmp_path / f"whole{suffix}")
+    with open_fits(path) as hdus:
+        kept = hdus["B"].data
+        assert [hdu.name for hdu in hdus] == ["PRIMARY", "A", "B"]
+    assert kept[63, 63] == -4095.0
+
+
+@pytest.mark.parametrize("percent", [25, 50, 99])
+@pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
+def test_a_truncated_file_is_an_error_that_names_it(
+    tmp_path: Path, suffix: str, percent: int
+) -> None:
+    whole = written(tmp_path / f"whole{suffix}").read_bytes()
+    cut = tmp_path / f"cut{suffix}"
+    cut.write_bytes(whole[: len(whole) * percent // 100])
+    complaint = pytest.raises(CorruptFileError, match=r"cut\.fits.*not a complete FITS file")
+    with complaint as caught, open_fits(cut):
+        pass
+    assert isinstance(caught.value, OSError)
+    assert str(cut.stat().st_size) in str(caught.value)
+
+
+def test_damaged_compression_is_a_corrupt_file(tmp_path: Path) -> None:
+    path = written(tmp_path / "damaged.fits.gz")
+    whole = bytearray(path.read_bytes())
+    for place in range(len(whole) // 3, len(whole) // 3 + 40):
+        whole[place] ^= 0xFF
+    path.write_bytes(bytes(whole))
+    with pytest.raises(CorruptFileError, match=r"damaged\.fits\.gz"), open_fits(path):
+        pass
+
+
+@pytest.mark.parametrize("content", [b"", b"this is no FITS file\n" * 300, gzip.compress(b"no")])
+def test_what_is_not_fits_is_a_corrupt_file(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "other.fits"
+    path.write_bytes(content)
+    with pytest.raises(CorruptFileError, match=r"other\.fits"), open_fits(path):
+        pass
+
+
+def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
+    for path in (tmp_path / "nowhere.fits", tmp_path):
+        with pytest.raises(CorruptFileError, match=path.name), open_fits(path):
+            pass
+
+
+def test_an_unusual_but_complete_header_is_no_corruption(tmp_path: Path) -> None:
+    """BLANK on floats is against the standard, common, and harmless: astropy only warns."""
+    path = tmp_path / "blank.fits"
+    hdu = fits.PrimaryHDU(np.ones((4, 4), dtype=np.float32))
+    hdu.writeto(path)
+    # Put in by hand, for astropy would not write it.
+    raw = bytearray(path.read_bytes())
+    end = raw.index(b"END" + b" " * 77)
+    raw[end : end + 160] = b"BLANK   =                -9999".ljust(80) + b"END".ljust(80)
+    path.write_bytes(bytes(raw))
+    with pytest.warns(fits.verify.VerifyWarning, match="BLANK"), open_fits(path) as hdus:
+        assert hdus[0].data.sum() == 16.0
+
+
+# -- writing ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
+def test_a_written_file_reads_back_and_leaves_nothing_else(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / "new" / f"product{suffix}"
+    data = np.arange(12.0).reshape(3, 4)
+    for scale in (1, 2):
+        write_fits(fits.HDUList([fits.PrimaryHDU(scale * data)]), path)
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    assert (path.read_bytes()[:2] == b"\x1f\x8b") == (suffix == ".fits.gz")
+    with open_fits(path) as hdus:
+        np.testing.assert_array_equal(hdus[0].data, 2 * data)
+
+
+def test_products_have_the_permissions_that_the_user_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "product.fits"
+    before = os.umask(0o027)
+    try:
+        write_fits(fits.HDUList([fits.PrimaryHDU()]), path)
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == 0o640
+
+
+def test_a_failure_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "product.txt"
+    path.write_text("old")
+
+    def write_half() -> None:
+        with replacing(path) as temporary:
+            temporary.write_text("ne")
+            raise RuntimeError("halfway")
+
+    with pytest.raises(RuntimeError, match="halfway"):
+        write_half()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.hard
+def test_a_process_killed_while_writing_leaves_the_old_product_intact(tmp_path: Path) -> None:
+    path = written(tmp_path / "product.fits")
+    before = sha256(path)
+    program = textwrap.dedent(
+        """
+        import sys, time
+        from pyklip_diffrender.files import replacing
+        with replacing(sys.argv[1]) as temporary:
+            temporary.write_bytes(b"half")
+            print("writing", flush=True)
+            time.sleep(60)
+        """
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(path)],
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"writing\n"
+        process.send_signal(signal.SIGKILL)
+    assert sha256(path) == before
+
+
+def test_sha256_is_that_of_the_bytes(tmp_path: Path) -> None:
+    path = tmp_path / "bytes"
+    path.write_bytes(b"abc")
+    assert sha256(path) == hashlib.sha256(b"abc").hexdigest()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["jwst_primary_polygons", "nircam_lw_filters", "nircam_maskrnd_openings", "nircam_si_zernikes"],
+)
+def test_embedded_tables_say_where_they_come_from(name: str) -> None:
+    table = embedded_table(name)
+    assert len(table) > 0
+    assert table.meta

@@ -1,0 +1,491 @@
+"""Refinement of a small system: what it recovers, what it must not look at, how it ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+
+from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.errors import (
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    MissingOPDError,
+    NonFiniteError,
+    NoValidPixelsError,
+    ShapeError,
+)
+from pyklip_diffrender.geometry import PupilGrid, maskrnd_openings, polygon_coverage
+from pyklip_diffrender.nircam import nircam_coronagraph
+from pyklip_diffrender.observation import Observation
+from pyklip_diffrender.opd import random_opd
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.priors import WavefrontPrior
+from pyklip_diffrender.refinement import METHODS, Refinement, Status, refine
+
+NPIX = 128
+FLUX = 3e11
+BACKGROUND = 500.0
+READ_NOISE = 42.0
+ALIGNMENT = {"star_offset": (0.008, -0.006), "lyot_shift": (0.006, -0.004), "lyot_rotation": 0.3}
+BASIS = JointBasis([SegmentMotions(), FourierModes(6)])
+FEW = FourierModes(3)
+
+NOT_SUCCESS = (Status.MODEL_MISMATCH, Status.ITERATION_LIMIT, Status.DIVERGED)
+
+
+@dataclass
+class Case:
+    """A model, an old wavefront, and one frame of a star under a later wavefront."""
+
+    model: OpticalSystem
+    opd: np.ndarray
+    later: np.ndarray
+    star: np.ndarray
+    observation: Observation
+
+    @property
+    def noise(self) -> np.ndarray:
+        return np.sqrt(self.star + BACKGROUND + READ_NOISE**2)
+
+    def error_of(self, star_and_background: np.ndarray) -> float:
+        """Rms of a star model's error in units of the noise."""
+        away = (star_and_background - BACKGROUND - self.star) / self.noise
+        return float(np.sqrt(np.mean(away**2)))
+
+
+def observed(star: np.ndarray, pixelscale: tuple[float, float], seed: int) -> Observation:
+    rng = np.random.default_rng(seed)
+    counts = rng.poisson(star + BACKGROUND) + rng.normal(0, READ_NOISE, star.shape)
+    error = np.sqrt(np.maximum(counts, 0) + READ_NOISE**2)
+    return Observation.from_arrays(counts, error, pixelscale=pixelscale, name="test star")
+
+
+def case(
+    basis: JointBasis | FourierModes,
+    nanometres: float,
+    alignment: dict[str, object],
+    flux: float = FLUX,
+    **changes: object,
+) -> Case:
+    settings = {"monochromatic": 4.5e-6, "npix": NPIX, "fov_pixels": 32, **changes}
+    model = nircam_coronagraph("F444W", **settings)  # type: ignore[arg-type]
+    opd = random_opd(3, npix=model.npix).data
+    generator = torch.Generator().manual_seed(1)
+    size = torch.where(basis.frequencies == 0, nanometres, nanometres / 4)
+    change = torch.randn(len(basis), dtype=torch.float64, generator=generator) * size * 1e-9
+    later = opd + basis.opd(change, PupilGrid.full(model.npix)).numpy()
+    star = flux * model(later, **alignment).numpy()
+    return Case(model, opd, later, star, observed(star, model.detector.pixelscale, 2))
+
+
+@pytest.fixture(scope="module")
+def bright() -> Case:
+    return case(BASIS, 2.0, ALIGNMENT)
+
+
+@pytest.fixture(scope="module")
+def fit(bright: Case) -> Refinement:
+    return refine(bright.model, bright.observation, bright.opd, basis=BASIS, response_npix=NPIX)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> Case:
+    """Few modes, few pixels, a star that is hardly misaligned."""
+    return case(FEW, 4.0, {"star_offset": (0.002, -0.001)}, flux=1e10, npix=64, fov_pixels=(24, 20))
+
+
+def quick(case: Case, observation: Observation | None = None, **options: object) -> Refinement:
+    return refine(
+        case.model,
+        case.observation if observation is None else observation,
+        case.opd,
+        **{"basis": FEW, "response_npix": 64, **options},  # type: ignore[arg-type]
+    )
+
+
+# -- what Gauss-Newton recovers --------------------------------------------------------------
+
+
+def test_gauss_newton_explains_the_data(fit: Refinement) -> None:
+    assert fit.status is Status.CONVERGED
+    assert fit.status.usable
+    assert fit.method == "gauss-newton"
+    # 1024 pixels less about 100 parameters that they determine, and the scatter of chi2.
+    expected = 1 - fit.effective_parameters / 1024
+    assert fit.chi2_per_pixel == pytest.approx(expected, abs=0.1)
+    assert fit.model_error == 0.0
+
+
+def test_gauss_newton_lowers_the_error_of_the_star_to_about_the_noise(
+    bright: Case, fit: Refinement
+) -> None:
+    outdated = FLUX * bright.model(bright.opd).numpy() + BACKGROUND
+    aligned = FLUX * bright.model(bright.opd, **ALIGNMENT).numpy() + BACKGROUND
+    assert bright.error_of(outdated) > 100
+    assert bright.error_of(aligned) > 20
+    assert bright.error_of(fit.star_image) < 0.5
+    # What no fit may pass: nothing, a turned star, one that is 1 % too bright.
+    assert bright.error_of(0 * fit.star_image) > 20
+    assert bright.error_of(fit.star_image.T) > 5
+    assert bright.error_of(1.01 * fit.star_image) > 0.5
+
+
+def test_gauss_newton_recovers_alignment_flux_and_background(fit: Refinement) -> None:
+    truth = {**ALIGNMENT, "flux": FLUX, "background": BACKGROUND}
+    within = {
+        "star_offset": 0.001, "lyot_shift": 0.002, "lyot_rotation": 0.1, "flux": 0.03 * FLUX,
+        "background": 20.0,
+    }  # fmt: skip
+    assert set(fit.values) == set(truth)
+    for name, value in truth.items():
+        away = fit.values[name] - np.atleast_1d(value)
+        assert np.abs(away).max() < within[name], name
+        assert np.abs(away / fit.errors[name]).max() < 4, name
+        assert (fit.errors[name] > 0).all()
+
+
+def test_the_refined_wavefront_is_nearer_to_the_truth(bright: Case, fit: Refinement) -> None:
+    """Behind the Lyot stop; what the stop hides stays at the prior."""
+    stop = polygon_coverage(maskrnd_openings(), PupilGrid.full(NPIX)).numpy() > 0.5
+    before, after = ((map_ - bright.later)[stop].std() for map_ in (bright.opd, fit.opd))
+    assert after < 0.6 * before
+
+
+def test_the_history_tells_of_every_iteration(fit: Refinement) -> None:
+    assert [entry["iteration"] for entry in fit.history] == list(range(len(fit.history)))
+    kappas = [entry["kappa"] for entry in fit.history]
+    assert kappas == sorted(kappas, reverse=True)
+    wavefront = [entry["wavefront"] for entry in fit.history]
+    assert wavefront == sorted(wavefront)
+    assert not wavefront[0]
+    # The best iterate is given, not the last.
+    assert fit.chi2_per_pixel < 1.01 * min(entry["chi2_per_pixel"] for entry in fit.history)
+
+
+def test_residual_is_data_minus_star(bright: Case, fit: Refinement) -> None:
+    np.testing.assert_array_equal(fit.residual, bright.observation.data - fit.star_image)
+    assert fit.residual.shape == (1, 32, 32)
+    np.testing.assert_array_equal(
+        fit.star_image,
+        fit.values["flux"][0] * bright.model(fit.opd, **fit.optical_values).numpy()
+        + fit.values["background"][0],
+    )
+
+
+def test_the_parameter_table_has_values_errors_and_units(fit: Refinement) -> None:
+    table = fit.parameters
+    rows = {row["name"]: row for row in table}
+    assert list(rows) == [
+        "star_offset[0]", "star_offset[1]", "lyot_shift[0]", "lyot_shift[1]", "lyot_rotation",
+        "flux", "background",
+    ]  # fmt: skip
+    assert [str(rows[n]["unit"]) for n in rows] == ["arcsec"] * 2 + [""] * 2 + ["deg", "", ""]
+    assert float(rows["star_offset[1]"]["value"]) == fit.values["star_offset"][1]
+    assert float(rows["lyot_rotation"]["error"]) == fit.errors["lyot_rotation"][0]
+    assert "arcsec" not in str(rows["flux"]["unit"])
+
+
+def test_the_summary_holds_what_provenance_needs(bright: Case, fit: Refinement) -> None:
+    summary = fit.summary()
+    assert summary["method"] == "gauss-newton"
+    assert summary["status"] == "CONVERGED"
+    assert summary["opd_sha256"] == fit.initial.sha256
+    assert summary["seed"] == 0
+    assert summary["seconds"] > 0
+    assert "gauss-newton" in repr(fit)
+    assert "CONVERGED" in repr(fit)
+
+
+def test_a_wavefront_in_nanometres_is_the_same_start(tiny: Case) -> None:
+    metres, nanometres = (
+        refine(tiny.model, tiny.observation, opd, basis=FEW, response_npix=64, max_iterations=3)
+        for opd in (tiny.opd, tiny.opd * 1e9 * u.nm)
+    )
+    np.testing.assert_allclose(nanometres.star_image, metres.star_image, rtol=1e-9)
+
+
+def test_a_map_of_another_size_is_resampled(tiny: Case) -> None:
+    fine = np.repeat(np.repeat(tiny.opd, 2, axis=0), 2, axis=1)
+    got = refine(tiny.model, tiny.observation, fine, basis=FEW, response_npix=64)
+    np.testing.assert_allclose(got.star_image, quick(tiny).star_image, rtol=1e-9)
+
+
+def test_alignment_alone_leaves_the_wavefront_as_it_was(tiny: Case) -> None:
+    got = quick(tiny, wavefront=False)
+    np.testing.assert_array_equal(got.opd, tiny.opd)
+    assert got.status is Status.MODEL_MISMATCH
+    assert got.chi2_per_pixel > 3 * quick(tiny).chi2_per_pixel
+
+
+def test_what_is_not_free_stays_where_it_was(tiny: Case) -> None:
+    got = quick(tiny, free=("flux",), start={"star_offset": (0.002, -0.001), "background": 500.0})
+    assert got.values["star_offset"].tolist() == [0.002, -0.001]
+    assert got.values["background"].tolist() == [500.0]
+    assert np.isnan(got.errors["star_offset"]).all()
+    assert got.status is Status.CONVERGED
+    assert got.values["flux"][0] == pytest.approx(1e10, rel=0.02)
+
+
+def test_frames_of_the_same_star_are_averaged(tiny: Case) -> None:
+    frames = [observed(tiny.star, tiny.observation.pixelscale, seed) for seed in (11, 12, 13)]
+    stack = replace(
+        frames[0],
+        data=np.concatenate([f.data for f in frames]),
+        error=np.concatenate([f.error for f in frames]),
+        valid=np.concatenate([f.valid for f in frames]),
+        center=np.concatenate([f.center for f in frames]),
+    )
+    one, three = quick(tiny, frames[0]), quick(tiny, stack)
+    assert three.residual.shape == (3, 24, 20)
+    assert three.errors["flux"][0] == pytest.approx(one.errors["flux"][0] / 3**0.5, rel=0.1)
+
+
+# -- what a fit must not see -----------------------------------------------------------------
+
+
+@pytest.mark.hard
+@pytest.mark.parametrize("junk", [1e30, -1e30, np.nan, np.inf])
+def test_masked_pixels_change_nothing_bitwise(tiny: Case, junk: float) -> None:
+    valid = np.random.default_rng(4).random(tiny.observation.shape) > 0.05
+    fits = []
+    for value in (0.0, junk):
+        data = tiny.observation.data[0].copy()
+        error = tiny.observation.error[0].copy()
+        data[~valid], error[~valid] = value, abs(value)
+        masked = Observation.from_arrays(
+            data, error, valid=valid, pixelscale=tiny.observation.pixelscale
+        )
+        fits.append(quick(tiny, masked))
+    clean, dirty = fits
+    assert dirty.opd.tobytes() == clean.opd.tobytes()
+    assert dirty.star_image.tobytes() == clean.star_image.tobytes()
+    assert dirty.chi2_per_pixel == clean.chi2_per_pixel
+    assert dirty.status is clean.status is Status.CONVERGED
+    assert np.array_equal(np.isnan(dirty.residual[0]), ~valid)
+
+
+@pytest.mark.hard
+@pytest.mark.parametrize("share", [0.05, 0.5])
+def test_missing_pixels_cost_precision_not_truth(tiny: Case, share: float) -> None:
+    valid = np.random.default_rng(9).random(tiny.observation.shape) > share
+    got = quick(tiny, replace(tiny.observation, valid=valid[None]))
+    assert got.status is Status.CONVERGED
+    assert got.values["flux"][0] == pytest.approx(1e10, abs=4 * got.errors["flux"][0])
+    assert got.errors["flux"][0] > quick(tiny).errors["flux"][0]
+    # Also where no pixel was seen the star is modelled.
+    noise = np.sqrt(tiny.star + BACKGROUND + READ_NOISE**2)
+    away = ((got.star_image - BACKGROUND - tiny.star) / noise)[~valid]
+    assert np.sqrt(np.mean(away**2)) < 1.0
+
+
+def test_the_same_seed_gives_the_same_bits(tiny: Case) -> None:
+    first, again = (quick(tiny, seed=5) for _ in range(2))
+    assert first.opd.tobytes() == again.opd.tobytes()
+    assert first.star_image.tobytes() == again.star_image.tobytes()
+    assert first.history == again.history
+    assert first.seed == 5
+
+
+def test_nothing_that_was_passed_in_is_modified(tiny: Case) -> None:
+    before = tiny.opd.copy(), tiny.observation.data.copy(), tiny.observation.error.copy()
+    for method in METHODS:
+        limit = {"iterations": 2} if method == "adam" else {"basis": FEW, "max_iterations": 2}
+        refine(tiny.model, tiny.observation, tiny.opd, method=method, **limit)
+    np.testing.assert_array_equal(tiny.opd, before[0])
+    np.testing.assert_array_equal(tiny.observation.data, before[1])
+    np.testing.assert_array_equal(tiny.observation.error, before[2])
+
+
+# -- how a fit ends --------------------------------------------------------------------------
+
+
+@pytest.mark.hard
+@pytest.mark.parametrize(
+    "turn",
+    [lambda a: a[::-1].copy(), lambda a: a.T.copy()],
+    ids=["upside down", "transposed"],
+)
+def test_a_turned_wavefront_does_not_end_in_success(bright: Case, turn: object) -> None:
+    got = refine(
+        bright.model,
+        bright.observation,
+        turn(bright.opd),  # type: ignore[operator]
+        basis=BASIS,
+        response_npix=NPIX,
+    )
+    assert got.status in NOT_SUCCESS
+    assert got.chi2_per_pixel > 10
+    assert got.model_error > 0.03
+    # Errors are inflated by what is not explained.
+    assert got.errors["flux"][0] > 1e-3 * FLUX
+
+
+def test_too_few_iterations_are_said(bright: Case) -> None:
+    got = refine(
+        bright.model, bright.observation, bright.opd, basis=FEW, response_npix=64, max_iterations=2
+    )
+    assert got.status is Status.ITERATION_LIMIT
+    assert len(got.history) == 2
+
+
+def test_a_frame_without_a_star_is_no_success(tiny: Case) -> None:
+    dark = observed(0 * tiny.star, tiny.observation.pixelscale, 3)
+    negative = replace(dark, data=-tiny.observation.data)
+    got = quick(tiny, negative)
+    assert got.status is Status.DIVERGED
+    assert not got.status.usable
+
+
+# -- rendering elsewhere ---------------------------------------------------------------------
+
+
+def test_render_on_another_array_is_a_shifted_render(fit: Refinement) -> None:
+    np.testing.assert_allclose(fit.render(), fit.star_image, rtol=1e-12)
+    # The star, at (15.5, 15.5) of 32 x 32, comes to (8.5, 11.5): 7 columns and 4 rows back.
+    moved = fit.render((20, 24), center=(8.5, 11.5))
+    assert moved.shape == (20, 24)
+    np.testing.assert_allclose(moved, fit.star_image[4:24, 7:31], rtol=1e-8)
+    # By default the middle of the array is the middle of the array.
+    np.testing.assert_allclose(fit.render(20), fit.star_image[6:26, 6:26], rtol=1e-8)
+    larger = fit.render(40)
+    np.testing.assert_allclose(larger[4:36, 4:36], fit.star_image, rtol=1e-8)
+    np.testing.assert_allclose(
+        fit.render(background=False), fit.star_image - fit.values["background"][0], rtol=1e-9
+    )
+
+
+def test_a_star_off_the_middle_of_the_frame_is_followed(tiny: Case) -> None:
+    """Two columns right and one row down: the same fit, and `render` brings it back."""
+    scale = tiny.model.detector.pixelscale
+    shift = {"star_offset": (0.002, -0.001), "detector_shift": (2 * scale[0], -scale[1])}
+    star = 1e10 * tiny.model(tiny.later, **shift).numpy()
+    np.testing.assert_allclose(star[:-1, 2:], tiny.star[1:, :-2], rtol=1e-9)
+    away = observed(star, scale, 2)
+    away = replace(away, center=np.array([[9.5 + 2, 11.5 - 1]]))
+    got = quick(tiny, away)
+    assert got.status is Status.CONVERGED
+    np.testing.assert_allclose(got.values["detector_shift"], shift["detector_shift"], rtol=1e-12)
+    assert abs(got.values["star_offset"][0] - 0.002) < 4 * got.errors["star_offset"][0]
+    back = got.render(center=(9.5, 11.5))
+    np.testing.assert_allclose(back[1:, :-2], got.star_image[:-1, 2:], rtol=1e-8)
+
+
+# -- gradient methods ------------------------------------------------------------------------
+
+
+def test_adam_lowers_the_mean_absolute_error_and_nothing_but_the_opd_moves(tiny: Case) -> None:
+    start = {"star_offset": (0.002, -0.001), "flux": 1e10, "background": BACKGROUND}
+    got = refine(tiny.model, tiny.observation, tiny.opd, method="adam", iterations=30, start=start)
+    loss = [entry["loss"] for entry in got.history]
+    assert len(loss) == 30
+    with torch.no_grad():
+        first = 1e10 * tiny.model(tiny.opd, start["star_offset"]).numpy() + BACKGROUND
+    assert loss[0] == pytest.approx(np.abs(first - tiny.observation.data[0]).mean(), rel=1e-10)
+    assert loss[-1] < 0.97 * loss[0]
+    assert loss == sorted(loss, reverse=True)
+    assert {name: value.tolist() for name, value in got.values.items()} == {
+        "star_offset": [0.002, -0.001], "flux": [1e10], "background": [BACKGROUND],
+    }  # fmt: skip
+    assert got.status is Status.COMPLETED
+    # 30 steps of at most about 1e-11 m, and the image belongs to the OPD that is returned.
+    assert 1e-10 < np.abs(got.opd - tiny.opd).max() < 3.1e-10
+    final = 1e10 * tiny.model(got.opd, start["star_offset"]).numpy() + BACKGROUND
+    np.testing.assert_allclose(got.star_image, final, rtol=1e-10)
+    assert np.abs(final - tiny.observation.data[0]).mean() == pytest.approx(min(loss), rel=1e-10)
+
+
+def test_the_first_step_of_adam_is_the_learning_rate_against_the_gradient(tiny: Case) -> None:
+    start = {"star_offset": (0.002, -0.001), "flux": 1e10, "background": BACKGROUND}
+    got = refine(tiny.model, tiny.observation, tiny.opd, method="adam", iterations=2, start=start)
+    opd = torch.from_numpy(tiny.opd.copy()).requires_grad_()
+    data = torch.from_numpy(tiny.observation.data[0])
+    image = 1e10 * tiny.model(opd, start["star_offset"]) + BACKGROUND
+    (gradient,) = torch.autograd.grad((image - data).abs().mean(), opd)
+    strong = gradient.abs() > 1e-3 * gradient.abs().max()
+    expected = -1e-11 * gradient.sign()
+    step = torch.from_numpy(got.opd - tiny.opd)
+    torch.testing.assert_close(step[strong], expected[strong], rtol=1e-3, atol=0)
+
+
+@pytest.mark.hard
+def test_adam_does_not_look_at_masked_pixels(tiny: Case) -> None:
+    valid = np.random.default_rng(4).random(tiny.observation.shape) > 0.05
+    fits = []
+    for junk in (0.0, 1e30):
+        data = np.where(valid, tiny.observation.data[0], junk)
+        masked = replace(tiny.observation, data=data[None], valid=valid[None])
+        fits.append(refine(tiny.model, masked, tiny.opd, method="adam", iterations=3))
+    assert fits[0].opd.tobytes() == fits[1].opd.tobytes()
+    assert fits[0].history == fits[1].history
+
+
+def test_lbfgs_ends_where_gauss_newton_does(tiny: Case) -> None:
+    """The same objective, when the prior's scales are fixed."""
+    options = {
+        "basis": FourierModes(2),
+        "prior": WavefrontPrior({"texture": 3.0}, fit_scales=False),
+        "free": ("star_offset", "flux", "background"),
+    }
+    small = case(FourierModes(2), 12.0, {}, flux=3e10, npix=64, fov_pixels=24)
+    newton = quick(small, **options)
+    other = refine(
+        small.model, small.observation, small.opd, method="lbfgs", tolerance=1e-10, **options
+    )
+    assert newton.status is other.status is Status.CONVERGED
+    assert other.chi2_per_pixel == pytest.approx(newton.chi2_per_pixel, rel=0.01)
+    np.testing.assert_allclose(other.values["flux"], newton.values["flux"], rtol=0.01)
+    noise = np.sqrt(small.star + BACKGROUND + READ_NOISE**2)
+    assert np.abs((other.star_image - newton.star_image) / noise).max() < 0.2
+    assert other.history[0]["chi2_per_pixel"] > 5 * other.chi2_per_pixel
+
+
+# -- bad input -------------------------------------------------------------------------------
+
+
+def test_a_missing_wavefront_is_an_error_not_a_default(tiny: Case) -> None:
+    with pytest.raises(MissingOPDError, match="path to an OPD map"):
+        refine(tiny.model, tiny.observation, None)
+
+
+def test_an_observation_of_another_shape_says_what_to_do(tiny: Case) -> None:
+    frame = np.ones((20, 24))
+    turned = Observation.from_arrays(frame, frame, pixelscale=0.0624)
+    for method in METHODS:
+        with pytest.raises(ShapeError, match=r"20 x 24.*24 x 20.*cutout"):
+            refine(tiny.model, turned, tiny.opd, method=method)
+
+
+def test_unknown_methods_options_and_parameters_list_the_known(tiny: Case) -> None:
+    with pytest.raises(IncompatibleSetupError, match=r"'newton'.*gauss-newton.*adam.*lbfgs"):
+        quick(tiny, method="newton")
+    with pytest.raises(IncompatibleSetupError, match=r"learning_rat.*iterations, learning_rate"):
+        refine(tiny.model, tiny.observation, tiny.opd, method="adam", learning_rat=1)
+    with pytest.raises(IncompatibleSetupError, match=r"iterations.*max_iterations"):
+        quick(tiny, iterations=3)
+    with pytest.raises(IncompatibleSetupError, match=r"'lyot_shfit'.*lyot_shift"):
+        quick(tiny, free=("lyot_shfit",))
+
+
+def test_all_pixels_masked_is_an_error(tiny: Case) -> None:
+    blind = replace(tiny.observation, valid=np.zeros_like(tiny.observation.valid))
+    for method in METHODS:
+        with pytest.raises(NoValidPixelsError, match="test star"):
+            refine(tiny.model, blind, tiny.opd, method=method)
+
+
+def test_a_broken_wavefront_is_an_error(tiny: Case) -> None:
+    bad = tiny.opd.copy()
+    bad[20, 20] = np.nan
+    with pytest.raises(NonFiniteError, match=r"1 values inside the pupil.*\(20, 20\)"):
+        refine(tiny.model, tiny.observation, bad)
+    with pytest.raises(ShapeError, match="square"):
+        refine(tiny.model, tiny.observation, tiny.opd[:, :50])
+    with pytest.warns(DiffrenderWarning, match="nm it would be plausible"):
+        refine(
+            tiny.model, tiny.observation, tiny.opd * 1e9, basis=FEW, response_npix=64,
+            max_iterations=1,
+        )  # fmt: skip

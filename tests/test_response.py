@@ -1,0 +1,276 @@
+"""Jacobians of the image against differences of the model, and the priors that weigh them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+
+from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.geometry import PupilGrid
+from pyklip_diffrender.nircam import nircam_coronagraph
+from pyklip_diffrender.opd import random_opd
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.parameters import parameter
+from pyklip_diffrender.priors import WavefrontPrior, solve_with_evidence
+from pyklip_diffrender.response import (
+    NANOMETRE,
+    WavefrontResponse,
+    coarse_copy,
+    downsample,
+    parameter_jacobian,
+)
+
+NPIX = 256
+BASIS = JointBasis([SegmentMotions(), FourierModes(6)])
+
+
+def system(**changes: object) -> OpticalSystem:
+    settings = {"monochromatic": 4.5e-6, "npix": NPIX, "fov_pixels": (20, 24), **changes}
+    return nircam_coronagraph("F444W", **settings)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def opd() -> torch.Tensor:
+    return torch.from_numpy(random_opd(5, npix=NPIX).data)
+
+
+@pytest.fixture(scope="module")
+def values() -> dict[str, torch.Tensor]:
+    """Off every special point."""
+    given = {
+        "star_offset": (0.012, -0.007), "lyot_shift": (0.004, 0.002), "lyot_rotation": (0.3,),
+        "blur": (0.02,),
+    }  # fmt: skip
+    return {name: torch.tensor(value, dtype=torch.float64) for name, value in given.items()}
+
+
+def slope(
+    model: OpticalSystem, opd: torch.Tensor, change: torch.Tensor, values: dict[str, torch.Tensor]
+) -> torch.Tensor:
+    """Derivative of the image along a change of the OPD per nm, by central differences."""
+    step = 0.05 * NANOMETRE
+    with torch.no_grad():
+        ahead, behind = (model(opd + s * step * change, **values) for s in (1, -1))
+    return (ahead - behind) / 0.1
+
+
+MODES = (0, 1, 29, 41, 54, 57, 90, len(BASIS) - 1)
+
+
+@pytest.mark.parametrize("changes", [{}, {"monochromatic": None, "nlambda": 2}], ids=["1", "2"])
+@pytest.mark.parametrize(("npix", "tolerance"), [(NPIX, 1e-4), (128, 0.025)])
+def test_wavefront_response_is_the_slope_of_the_fine_model(
+    opd: torch.Tensor,
+    values: dict[str, torch.Tensor],
+    changes: dict[str, object],
+    npix: int,
+    tolerance: float,
+) -> None:
+    """To single precision on the same grid; a coarse copy is off by a percent or two."""
+    model = system(**changes)
+    response = WavefrontResponse(model, BASIS, opd, values, npix=npix)
+    assert response.coarse.npix == npix
+    image = response.image(model.fields(opd, **values), values)
+    assert image.shape == (len(BASIS), 20, 24)
+    grid = PupilGrid.full(NPIX)
+    for k in MODES:
+        expected = slope(model, opd, BASIS.modes(grid, k, k + 1)[0], values)
+        error = (image[k] - expected).norm() / expected.norm()
+        assert float(error) < tolerance, k
+
+
+def test_wavefront_response_takes_the_field_of_the_star_it_is_asked_about(
+    opd: torch.Tensor, values: dict[str, torch.Tensor]
+) -> None:
+    """Kept from one wavefront, used at another 12 nm away: the slope there, not the old one."""
+    model = system()
+    grid = PupilGrid.full(NPIX)
+    coefficients = torch.zeros(len(BASIS), dtype=torch.float64)
+    coefficients[[0, 20, 60, 61]] = torch.tensor([20.0, -20.0, 8.0, 8.0], dtype=torch.float64)
+    moved = opd + BASIS.opd(coefficients, grid) * NANOMETRE
+    response = WavefrontResponse(model, BASIS, opd, values, npix=NPIX)
+    there = response.image(model.fields(moved, **values), values)
+    here = response.image(model.fields(opd, **values), values)
+    chosen = [29, 41, 57, 90, 110]
+    expected = torch.stack(
+        [slope(model, moved, BASIS.modes(grid, k, k + 1)[0], values) for k in chosen]
+    )
+    error, old_error = (
+        float((image[chosen] - expected).norm() / expected.norm()) for image in (there, here)
+    )
+    # The field's derivative turns with the pupil's phase, by little: the image's does more.
+    assert error < 0.025
+    assert error < 0.6 * old_error
+    fields = [2 * field for field in model.fields(opd, **values)]
+    torch.testing.assert_close(response.image(fields, values), 2 * here, rtol=1e-6, atol=0)
+
+
+def test_a_response_larger_than_the_limit_is_refused(opd: torch.Tensor) -> None:
+    with pytest.raises(IncompatibleSetupError, match=r"modes on 20 x 24.*0\.0 GB.*fewer"):
+        WavefrontResponse(system(), BASIS, opd, {}, npix=64, memory_limit=1e5)
+
+
+def test_piston_of_the_whole_pupil_does_nothing(opd: torch.Tensor) -> None:
+    model = system(npix=128)
+    response = WavefrontResponse(model, SegmentMotions(), downsample(opd, 128), {}, npix=128)
+    image = response.image(model.fields(downsample(opd, 128)), {})
+    together = image[0::3].sum(dim=0)
+    # The outlines, widened to the middle of the gaps, leave a few thousandths at the corners.
+    assert float(together.norm()) < 5e-3 * float(image[0::3].norm())
+
+
+NAMES = ("star_offset", "lyot_shift", "lyot_rotation", "si_zernikes", "detector_shift", "blur")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_parameter_jacobian_is_the_slope_of_the_model(
+    opd: torch.Tensor, values: dict[str, torch.Tensor], name: str
+) -> None:
+    model = system(npix=64)
+    small = downsample(opd, 64)
+    entry = parameter(name)
+    start = values.get(name, torch.zeros(entry.size, dtype=torch.float64))
+    given = {**values, name: start}
+    jacobian = parameter_jacobian(model, small, given, (name,))
+    assert jacobian.shape == (entry.size, 20, 24)
+    for k in range(entry.size > 2, entry.size, 7):  # The first Zernike is piston, unseen.
+        # Areas of cut pixels are only once differentiable: the Lyot stop takes small steps.
+        step = (1e-5 if name.startswith("lyot") else 1e-3) * entry.prior
+        change = torch.zeros(entry.size, dtype=torch.float64)
+        change[k] = step
+        with torch.no_grad():
+            at = [model(small, **{**given, name: start + s * change}) for s in (-2, -1, 1, 2)]
+        expected = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * step)
+        assert float((jacobian[k] - expected).norm() / expected.norm()) < 1e-5
+
+
+def test_parameter_jacobian_keeps_the_order_of_names(
+    opd: torch.Tensor, values: dict[str, torch.Tensor]
+) -> None:
+    model, small = system(npix=64), downsample(opd, 64)
+    both = parameter_jacobian(model, small, values, ("lyot_rotation", "star_offset"))
+    assert both.shape[0] == 3
+    rotation, offset = (
+        parameter_jacobian(model, small, values, (n,)) for n in ("lyot_rotation", "star_offset")
+    )
+    torch.testing.assert_close(both[:1], rotation, rtol=1e-12, atol=0)
+    torch.testing.assert_close(both[1:], offset, rtol=1e-12, atol=0)
+
+
+def test_coarse_copy_is_coarser_or_the_model_itself() -> None:
+    model = system()
+    coarse = coarse_copy(model, 64)
+    assert coarse.npix == 64
+    assert coarse.dtype == torch.float32
+    assert coarse.detector.shape == model.detector.shape
+    assert coarse.bandpass == model.bandpass
+    assert coarse_copy(model, 256) is model
+    assert coarse_copy(model, 100) is model  # 256 pixels do not divide into 100.
+
+
+def test_downsample_takes_means(opd: torch.Tensor) -> None:
+    expected = opd.reshape(64, 4, 64, 4).mean(dim=(1, 3))
+    torch.testing.assert_close(downsample(opd, 64), expected, rtol=1e-12, atol=1e-22)
+    assert downsample(opd, NPIX) is opd
+
+
+# -- priors ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def linear() -> dict[str, torch.Tensor]:
+    """A whitened problem: 2 parameters, one without a prior, and modes of two kinds."""
+    generator = torch.Generator().manual_seed(6)
+    modes, data = 160, 500
+    group = torch.arange(modes) % 2
+    shape = 1 / (1 + torch.linspace(0, 2, modes, dtype=torch.float64))
+    scale = torch.tensor([3.0, 0.4], dtype=torch.float64)
+    design = torch.randn(data, modes + 2, dtype=torch.float64, generator=generator)
+    truth = torch.randn(modes + 2, dtype=torch.float64, generator=generator)
+    truth[:2] = torch.tensor([5.0, -0.3], dtype=torch.float64)
+    truth[2:] *= scale[group] * shape
+    observed = design @ truth + torch.randn(data, dtype=torch.float64, generator=generator)
+    return {
+        "design": design, "observed": observed, "truth": truth, "group": group, "shape": shape,
+        "scale": scale, "fixed": torch.tensor([torch.inf, 0.5], dtype=torch.float64),
+    }  # fmt: skip
+
+
+def solved(linear: dict[str, torch.Tensor], scales: torch.Tensor, iterations: int) -> object:
+    return solve_with_evidence(
+        linear["design"].T @ linear["design"],
+        linear["design"].T @ linear["observed"],
+        linear["shape"],
+        linear["group"],
+        scales,
+        linear["fixed"],
+        iterations=iterations,
+        covariance=True,
+    )
+
+
+def test_with_fixed_scales_the_solution_is_that_of_ridge_regression(
+    linear: dict[str, torch.Tensor],
+) -> None:
+    got = solved(linear, linear["scale"], 0)
+    deviation = torch.cat([linear["fixed"], linear["scale"][linear["group"]] * linear["shape"]])
+    system_ = linear["design"].T @ linear["design"] + torch.diag(deviation**-2)
+    expected = torch.linalg.solve(system_, linear["design"].T @ linear["observed"])
+    torch.testing.assert_close(got.step, expected, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(got.covariance, torch.linalg.inv(system_), rtol=1e-8, atol=1e-14)
+    torch.testing.assert_close(got.scales, linear["scale"])
+    # Posterior variance relative to prior variance, summed, is what the data do not determine.
+    share = (got.covariance.diagonal() / deviation**2)[2:]
+    assert got.effective == pytest.approx(160 - float(share.sum()), rel=1e-9)
+    away = (got.step - linear["truth"]) / got.covariance.diagonal().sqrt()
+    assert float(away.square().mean().sqrt()) == pytest.approx(1.0, abs=0.2)
+
+
+def test_the_evidence_finds_the_scales(linear: dict[str, torch.Tensor]) -> None:
+    start = torch.tensor([0.3, 30.0], dtype=torch.float64)
+    got = solved(linear, start, 60)
+    # 80 modes of a kind: their rms is known to 8 %, less well where noise is as large.
+    torch.testing.assert_close(got.scales, linear["scale"], rtol=0.25, atol=0)
+    for factor in (0.8, 1.25):
+        for k in (0, 1):
+            scales = got.scales.clone()
+            scales[k] *= factor
+            assert solved(linear, scales, 0).log_evidence < got.log_evidence
+
+
+def test_the_log_evidence_is_that_of_the_data(linear: dict[str, torch.Tensor]) -> None:
+    """Differences between scales equal those of the data's own Gaussian density."""
+    proper = {**linear, "fixed": torch.tensor([4.0, 0.5], dtype=torch.float64)}
+
+    def exact(scales: torch.Tensor) -> float:
+        deviation = torch.cat([proper["fixed"], scales[proper["group"]] * proper["shape"]])
+        weighted = proper["design"] * deviation
+        covariance = (weighted @ weighted.T + torch.eye(500)).numpy()
+        return float(multivariate_normal(cov=covariance).logpdf(proper["observed"].numpy()))
+
+    one, other = (torch.tensor(s, dtype=torch.float64) for s in ([3.0, 0.4], [2.0, 1.0]))
+    got = solved(proper, one, 0).log_evidence - solved(proper, other, 0).log_evidence
+    assert got == pytest.approx(exact(one) - exact(other), rel=1e-6)
+
+
+def test_an_absent_kind_ends_at_the_floor(linear: dict[str, torch.Tensor]) -> None:
+    truth = linear["truth"].clone()
+    truth[2:][linear["group"] == 1] = 0
+    silent = {**linear, "observed": linear["design"] @ truth}
+    got = solved(silent, torch.tensor([3.0, 0.4], dtype=torch.float64), 200)
+    assert float(got.scales[1]) < 0.02
+    assert torch.isfinite(got.step).all()
+
+
+def test_the_prior_falls_with_frequency() -> None:
+    prior = WavefrontPrior(knee=3.0, slope=2.0)
+    shape = prior.shape(BASIS)
+    assert (shape[:54] == 1).all()
+    at_three = (BASIS.frequencies == 3.0) & (BASIS.group_index == 1)
+    assert at_three.any()
+    torch.testing.assert_close(shape[at_three], torch.full_like(shape[at_three], 0.5))
+    order = BASIS.frequencies[54:].argsort()
+    assert (np.diff(shape[54:][order].numpy()) <= 0).all()

@@ -1,0 +1,217 @@
+"""Simulated scenes: the paper's photons, where planets appear, noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units as u
+
+from pyklip_diffrender.nircam import nircam_coronagraph
+from pyklip_diffrender.opd import drift, random_opd, read_opd
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.scene import ALPHA_PICTORIS_W2, UNOCCULTED_PEAK, Planet, Scene, Star
+from pyklip_diffrender.simulation import expected_photons, planet_photons, simulate, star_photons
+
+WAVELENGTH = 4.5e-6
+NPIX = 96
+
+
+@pytest.fixture(scope="module")
+def model() -> OpticalSystem:
+    return nircam_coronagraph("F444W", monochromatic=WAVELENGTH, npix=NPIX, fov_pixels=(32, 36))
+
+
+@pytest.fixture(scope="module")
+def opd() -> np.ndarray:
+    return random_opd(5, npix=NPIX).data
+
+
+# -- photometry ------------------------------------------------------------------------------
+
+
+def test_the_papers_star_sends_the_papers_photons() -> None:
+    assert Star().peak_photons == pytest.approx(1.0334e10, rel=2e-4)
+    assert Star().photons == pytest.approx(2.7807e12, rel=2e-4)
+
+
+def test_photons_follow_magnitude_exposure_and_gain() -> None:
+    star = Star()
+    assert replace(star, w2_magnitude=star.w2_magnitude + 2.5).photons == pytest.approx(
+        star.photons / 10, rel=1e-12
+    )
+    assert replace(star, exposure=400.0).photons == pytest.approx(star.photons / 18, rel=1e-12)
+    assert replace(star, gain=2 * star.gain).photons == pytest.approx(2 * star.photons, rel=1e-12)
+    assert replace(star, quantum_efficiency=0.4).photons == pytest.approx(
+        2 * star.photons, rel=1e-12
+    )
+    assert Star(w2_magnitude=ALPHA_PICTORIS_W2, exposure=400.0).photons == pytest.approx(
+        star.photons / 18 * 10 ** (0.4 * 2.203), rel=1e-12
+    )
+
+
+def test_the_unocculted_star_has_the_papers_peak() -> None:
+    """Contrast 1 is the brightest pixel with the Lyot stop and without the occulter.
+
+    How much falls there depends on where in the pixel the star is: the corner or the middle.
+    """
+    peak = {}
+    for count in (80, 81):
+        model = nircam_coronagraph(
+            "F444W", monochromatic=WAVELENGTH, npix=512, fov_pixels=count, image_mask=None,
+            segment_gap=0.0,
+        )  # fmt: skip
+        peak[count] = float(model(random_opd(1, npix=512).data).max())
+    assert 0.93 * UNOCCULTED_PEAK < peak[80] < UNOCCULTED_PEAK < peak[81] < 1.08 * UNOCCULTED_PEAK
+
+
+# -- planets ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("angle", "direction"), [(0, (0, 1)), (90, (-1, 0)), (180, (0, -1)), (270, (1, 0))]
+)
+def test_position_angle_is_counter_clockwise_from_up(
+    angle: float, direction: tuple[int, int]
+) -> None:
+    np.testing.assert_allclose(
+        Planet(1e-6, 0.8, angle).offset, 0.8 * np.array(direction), atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("angle", [20.0, 110.0, 200.0, 290.0])
+def test_a_planet_appears_where_it_was_put(
+    model: OpticalSystem, opd: np.ndarray, angle: float
+) -> None:
+    scene = Scene(star_offset=(0.05, -0.03))
+    planet = Planet(1e-3, 0.75, angle)
+    image = planet_photons(model, scene, planet, opd)
+    scale = model.detector.pixelscale[0]
+    ny, nx = image.shape
+    # Up is +y (rows), left is -x: angles from up to the left.
+    expected_x = (nx - 1) / 2 + (0.05 - 0.75 * np.sin(np.radians(angle))) / scale
+    expected_y = (ny - 1) / 2 + (-0.03 + 0.75 * np.cos(np.radians(angle))) / scale
+    y, x = np.indices(image.shape)
+    core = np.hypot(x - expected_x, y - expected_y) < 2.5
+    total = image[core].sum()
+    assert float((image * x)[core].sum() / total) == pytest.approx(expected_x, abs=0.35)
+    assert float((image * y)[core].sum() / total) == pytest.approx(expected_y, abs=0.35)
+    assert np.hypot(*(np.array(np.unravel_index(image.argmax(), image.shape))
+                      - (expected_y, expected_x))) < 1.0  # fmt: skip
+
+
+def test_planet_photons_are_linear_in_contrast(model: OpticalSystem, opd: np.ndarray) -> None:
+    scene = Scene()
+    one = planet_photons(model, scene, Planet(1e-6, 0.6, 54), opd)
+    assert one.max() > 0
+    for contrast in (0.0, 1e-10, 5e-6, 1e-3):
+        np.testing.assert_allclose(
+            planet_photons(model, scene, Planet(contrast, 0.6, 54), opd),
+            one * (contrast / 1e-6),
+            rtol=1e-12,
+        )
+
+
+def test_a_planet_of_contrast_one_on_the_star_is_the_star(
+    model: OpticalSystem, opd: np.ndarray
+) -> None:
+    scene = Scene(star_offset=(0.02, 0.01))
+    np.testing.assert_allclose(
+        planet_photons(model, scene, Planet(1.0, 0.0), opd),
+        star_photons(model, scene, opd),
+        rtol=1e-12,
+    )
+
+
+def test_a_scene_is_the_sum_of_its_parts(model: OpticalSystem, opd: np.ndarray) -> None:
+    planets = (Planet(1e-5, 0.6, 54), Planet(2e-6, 0.7, 58))
+    scene = Scene(planets=planets, background=321.0, star_offset=(0.01, 0.0))
+    parts = star_photons(model, scene, opd) + 321.0
+    parts = parts + sum(planet_photons(model, scene, p, opd) for p in planets)
+    total = expected_photons(model, scene, opd)
+    np.testing.assert_allclose(total, parts, rtol=1e-12)
+    # A brighter star, and its planets with it: contrasts are relative.
+    brighter = replace(scene, star=replace(scene.star, w2_magnitude=2.182), background=0.0)
+    np.testing.assert_allclose(
+        expected_photons(model, brighter, opd), (total - 321.0) * 10**0.4, rtol=1e-9
+    )
+
+
+def test_units_of_the_wavefront_are_honoured(model: OpticalSystem, opd: np.ndarray) -> None:
+    np.testing.assert_allclose(
+        star_photons(model, Scene(), opd * 1e9 * u.nm), star_photons(model, Scene(), opd), rtol=1e-9
+    )
+
+
+# -- noise -----------------------------------------------------------------------------------
+
+
+def test_noise_has_the_mean_and_variance_of_photons_and_readout() -> None:
+    model = nircam_coronagraph("F444W", monochromatic=WAVELENGTH, npix=48, fov_pixels=12)
+    # From 1e2 to 1e5 photons: readout matters in some pixels, photons in others.
+    scene = Scene(star=Star(exposure=20.0), background=100.0)
+    opd = random_opd(5, npix=48).data
+    expected = expected_photons(model, scene, opd)
+    assert expected.max() > 30 * expected.min()
+    count = 4000
+    frames = simulate(model, scene, opd, seed=3, frames=count).data
+    variance = expected + 42.0**2
+    away = (frames.mean(axis=0) - expected) / np.sqrt(variance / count)
+    # 144 standard normal numbers: their rms is 1 +- 0.06.
+    assert np.sqrt(np.mean(away**2)) == pytest.approx(1.0, abs=0.25)
+    assert abs(np.mean(away)) < 4 / np.sqrt(away.size)
+    ratio = frames.var(axis=0, ddof=1) / variance
+    # Each ratio is 1 +- sqrt(2 / 4000), their mean 1 +- 0.002.
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.006)
+    assert np.abs(ratio - 1).max() < 5 * np.sqrt(2 / count)
+    # Frames and pixels are independent.
+    residual = (frames - expected) / np.sqrt(variance)
+    assert abs(np.mean(residual[1:] * residual[:-1])) < 5 / np.sqrt(residual.size)
+    assert abs(np.mean(residual[:, 1:] * residual[:, :-1])) < 5 / np.sqrt(residual.size)
+
+
+def test_many_seeds_average_to_the_scene(model: OpticalSystem, opd: np.ndarray) -> None:
+    scene = Scene(star=Star(exposure=20.0))
+    expected = expected_photons(model, scene, opd)
+    seeds = [simulate(model, scene, opd, seed=s).data[0] for s in range(100)]
+    away = (np.mean(seeds, axis=0) - expected) / np.sqrt((expected + 42.0**2) / 100)
+    assert np.sqrt(np.mean(away**2)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_same_seed_gives_the_same_frames(model: OpticalSystem, opd: np.ndarray) -> None:
+    scene = Scene(planets=(Planet(1e-5, 0.6, 54),))
+    first = simulate(model, scene, opd, seed=8, frames=2)
+    again = simulate(model, scene, opd, seed=8, frames=2)
+    other = simulate(model, scene, opd, seed=9, frames=2)
+    assert first.data.tobytes() == again.data.tobytes()
+    assert not np.array_equal(first.data, other.data)
+    assert not np.array_equal(first.data[0], first.data[1])
+
+
+def test_a_simulation_says_what_it_is(model: OpticalSystem, opd: np.ndarray) -> None:
+    got = simulate(model, Scene(), opd, seed=4, frames=3)
+    assert got.data.shape == (3, 32, 36)
+    assert got.unit == u.photon
+    assert got.filter == "F444W"
+    assert got.pixelscale == model.detector.pixelscale
+    assert got.valid.all()
+    assert "seed=4" in got.name
+    np.testing.assert_array_equal(got.center, [[17.5, 15.5]] * 3)
+    np.testing.assert_allclose(got.error, np.sqrt(np.maximum(got.data, 0) + 42.0**2), rtol=1e-14)
+
+
+# -- the paper's scene -----------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_papers_scene_has_the_published_photon_levels(shared_data: Path) -> None:
+    model = nircam_coronagraph("F444W", monochromatic=WAVELENGTH, segment_gap=0.0)
+    pair = [read_opd(shared_data / f"opd_2022-08-{day}.fits.gz") for day in (11, 14)]
+    star = star_photons(model, Scene(), drift(*pair, hours=40.0))
+    assert star.max() == pytest.approx(1.12e7, rel=0.10)
+    y, x = np.indices(star.shape)
+    separation = np.hypot(x - 39.5, y - 39.5) * 0.062424185
+    ring = np.abs(separation - 0.7) <= 0.2
+    assert star[ring].mean() == pytest.approx(1.2e6, rel=0.05)
