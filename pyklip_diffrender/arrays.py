@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from pyklip_diffrender.detector import Detector
 from pyklip_diffrender.geometry import PupilGrid
 from pyklip_diffrender.orientation import Orientation
-from pyklip_diffrender.planes import Detector, EntrancePupil, Values, Wavefront
+from pyklip_diffrender.planes import EntrancePupil, Values, Wavefront
 from pyklip_diffrender.units import ARCSEC
 from pyklip_diffrender.zernike import zernike_basis
 

@@ -25,7 +25,13 @@ from pyklip_diffrender.opd import OPDMap, random_drift, random_opd
 from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.pyklip_backend.comparison import klip_rdi
 from pyklip_diffrender.refinement import Refinement, refine
-from pyklip_diffrender.scene import ALPHA_PICTORIS_W2, Planet, Scene, Star
+from pyklip_diffrender.scene import (
+    ALPHA_PICTORIS_W2,
+    PAPER_SEGMENT_GAP,
+    Planet,
+    Scene,
+    Star,
+)
 from pyklip_diffrender.simulation import planet_photons, simulate, star_photons
 
 __all__ = ["DITHERS", "DemoResult", "run_demo", "simulate_references"]
@@ -98,7 +104,9 @@ def run_demo(
     progress : bool
         Show bars.
     """
-    model = nircam_coronagraph("F444W", monochromatic=4.5e-6, fov_pixels=80)
+    model = nircam_coronagraph(
+        "F444W", monochromatic=4.5e-6, fov_pixels=80, segment_gap=PAPER_SEGMENT_GAP
+    )
     measured = random_opd(seed)
     true_opd = measured.data + random_drift(seed + 1000, hours).data
     planet = Planet(contrast, separation, position_angle)

@@ -286,7 +286,8 @@ def jwst_pupil(npix: int, segment_gap: float | None = None) -> Tensor:
     if segment_gap is not None:
         growth = (TABULATED_GAP - segment_gap) / 2
         outlines = [widen_polygon(outline, growth) for outline in outlines]
-    pupil = polygon_coverage(outlines, grid)
+    # Outlines without gaps overlap by up to a tenth of a millimetre where three of them meet.
+    pupil = polygon_coverage(outlines, grid).clamp(max=1.0)
     for strut in _polygons("jwst_primary_polygons", "name", kind="strut").values():
         pupil = pupil * (1 - polygon_coverage([strut], grid))
     return pupil.reshape(npix, fine // npix, npix, fine // npix).mean(dim=(1, 3))

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 from scipy.special import j1
 from torch import Tensor
 
+from pyklip_diffrender.detector import Detector
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.files import embedded_table
 from pyklip_diffrender.geometry import JWST_DIAMETER, jwst_pupil, maskrnd_openings
 from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.planes import (
     CompactOcculter,
-    Detector,
     EntrancePupil,
     InternalAberration,
     LyotStop,

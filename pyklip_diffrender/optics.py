@@ -11,12 +11,12 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from pyklip_diffrender.detector import Detector
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.geometry import PupilGrid
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.planes import (
     CompactOcculter,
-    Detector,
     EntrancePupil,
     Plane,
     Values,

@@ -78,7 +78,7 @@ OPTICAL_PARAMETERS = (
 FLUX_AND_BACKGROUND = (
     Parameter(
         "flux", "", 1, 1.0, 0.0, inf, inf, 1e-4,
-        "light of the star collected by the pupil, in units of the starting value",
+        "light of the star collected by the pupil, in the unit of the image",
     ),
     Parameter(
         "background", "", 1, 0.0, -inf, inf, inf, 1e-4,

@@ -51,12 +51,100 @@ def tilt_phases(offset: Tensor, grid: PupilGrid, wavelength: float) -> tuple[Ten
     return tuple(2 * math.pi * (t - torch.round(t.detach())) for t in (x_turns, y_turns))  # type: ignore[return-value]
 
 
+class _Transform:
+    """The kernel ``exp(sign 2 pi i q p / lambda)`` between positions q and p, along axis -2.
+
+    Where the positions lie symmetrically about zero, as cells and centred pixels do, the kernel
+    splits into a cosine that is even and a sine that is odd: two real products of half the size,
+    and a quarter of it where both kinds of position are symmetric.
+    """
+
+    def __init__(
+        self,
+        image: Tensor,
+        pupil: Tensor,
+        wavelength: float,
+        sign: int,
+        dtype: torch.dtype,
+        fold: bool,
+    ) -> None:
+        self.sign = sign
+        self.sizes = len(image), len(pupil)
+        self._image_folds = fold and _symmetric(image)
+        self._pupil_folds = self._image_folds and _symmetric(pupil)
+        if self._image_folds:
+            image = image[len(image) // 2 :]
+            pupil = pupil[len(pupil) // 2 :] if self._pupil_folds else pupil
+        kernel = _kernel(image, pupil, wavelength, sign)
+        if self._image_folds:
+            self._cosine = kernel.real.contiguous().to(dtype.to_real())
+            self._sine = (sign * kernel.imag).contiguous().to(dtype.to_real())
+        else:
+            self._matrix = kernel.to(dtype)
+
+    def forward(self, field: Tensor) -> Tensor:
+        """(..., pupil, k) to (..., image, k)."""
+        if not self._image_folds:
+            return self._matrix @ field
+        even, odd = _fold(field) if self._pupil_folds else (field, field)
+        return _unfold(
+            _real_product(self._cosine, even),
+            self.sign * _real_product(self._sine, odd),
+            self.sizes[0],
+        )
+
+    def adjoint(self, field: Tensor) -> Tensor:
+        """(..., image, k) to (..., pupil, k)."""
+        if not self._image_folds:
+            return self._matrix.conj().T @ field
+        even, odd = _fold(field)
+        cosine = _real_product(self._cosine.T, even)
+        sine = -self.sign * _real_product(self._sine.T, odd)
+        return _unfold(cosine, sine, self.sizes[1]) if self._pupil_folds else cosine + 1j * sine
+
+
+def _symmetric(positions: Tensor) -> bool:
+    """Whether positions lie symmetrically about zero."""
+    if len(positions) < 2:
+        return False
+    step = float((positions[1] - positions[0]).abs())
+    return float((positions + positions.flip(0)).abs().max()) < 1e-12 * step * len(positions)
+
+
+def _fold(field: Tensor) -> tuple[Tensor, Tensor]:
+    """Even and odd parts along axis -2 on the half at and above zero, as sums over +-."""
+    half = field.shape[-2] // 2
+    upper, lower = field[..., half:, :], field[..., :half, :].flip(-2)
+    if field.shape[-2] % 2:
+        # The middle is its own mirror image: it counts once, and has no odd part.
+        middle, above = upper[..., :1, :], upper[..., 1:, :]
+        return (
+            torch.cat([middle, above + lower], dim=-2),
+            torch.cat([torch.zeros_like(middle), above - lower], dim=-2),
+        )
+    return upper + lower, upper - lower
+
+
+def _unfold(even: Tensor, odd: Tensor, size: int) -> Tensor:
+    """``even + i odd`` above zero and ``even - i odd`` mirrored below it."""
+    turned = 1j * odd
+    below = (even - turned)[..., size % 2 :, :].flip(-2)
+    return torch.cat([below, even + turned], dim=-2)
+
+
+def _real_product(matrix: Tensor, field: Tensor) -> Tensor:
+    """Real matrix times complex field, without complex arithmetic."""
+    parts = torch.view_as_real(field.contiguous())
+    product = matrix @ parts.flatten(-2)
+    return torch.view_as_complex(product.unflatten(-1, (-1, 2)))
+
+
 class MatrixFourier:
     """The Fourier transform between one pupil window and one set of image positions.
 
     The matrices are built once, in double precision, and cast; forward and inverse are two
-    matrix products each, in the cheaper order (R. Soummer et al., "Fast computation of
-    Lyot-style coronagraph propagation", Opt. Express 15, 15935, 2007).
+    matrix products each (R. Soummer et al., "Fast computation of Lyot-style coronagraph
+    propagation", Opt. Express 15, 15935, 2007). The large product is the one along y.
 
     Parameters
     ----------
@@ -70,6 +158,9 @@ class MatrixFourier:
         complex128 or complex64.
     shear : float
         How much y grows with x on the image: the true y of pixel (i, j) is ``y[i] + shear x[j]``.
+    fold : bool
+        Use the symmetry of the positions about zero, if there is any. False for positions that
+        are differentiated: they may leave it.
     """
 
     def __init__(
@@ -80,35 +171,28 @@ class MatrixFourier:
         wavelength: float,
         dtype: torch.dtype = torch.complex128,
         shear: float = 0.0,
+        fold: bool = True,
     ) -> None:
         self.grid = grid
-        device = x.device
-        self._columns = _kernel(x, grid.x.to(device), wavelength, +1).T.contiguous().to(dtype)
-        self._rows = _kernel(y, grid.y.to(device), wavelength, -1).to(dtype)
+        pupil_x, pupil_y = grid.x.to(x.device), grid.y.to(x.device)
+        self._columns = _kernel(x, pupil_x, wavelength, +1).T.contiguous().to(dtype)
+        self._rows = _Transform(y, pupil_y, wavelength, -1, dtype, fold)
         self._shear = (
-            _kernel(shear * x, grid.y.to(device), wavelength, -1).T.contiguous().to(dtype)
-            if shear
-            else None
+            _kernel(shear * x, pupil_y, wavelength, -1).T.contiguous().to(dtype) if shear else None
         )
         self._scale = grid.spacing**2 / wavelength
         self._inverse_scale = 1 / wavelength
-        rows, columns = grid.shape
-        self._columns_first = shear != 0 or rows * columns * len(x) + rows * len(x) * len(
-            y
-        ) <= rows * columns * len(y) + columns * len(x) * len(y)
 
     def forward(self, field: Tensor) -> Tensor:
         """Pupil field (..., rows, columns), per m, to image field (..., y, x), per radian."""
-        if self._columns_first:
-            partial = field @ self._columns
-            if self._shear is not None:
-                partial = partial * self._shear
-            return self._scale * (self._rows @ partial)
-        return self._scale * ((self._rows @ field) @ self._columns)
+        if self._shear is None:
+            return self._scale * (self._rows.forward(field) @ self._columns)
+        # Along x first: only then does every column have its own shift in y.
+        return self._scale * self._rows.forward((field @ self._columns) * self._shear)
 
     def inverse(self, field: Tensor, cell: float) -> Tensor:
         """Image field (..., y, x) on cells of solid angle `cell` (sr), back to the pupil."""
-        back = self._rows.conj().T @ field
-        if self._shear is not None:
-            back = back * self._shear.conj()
-        return (cell * self._inverse_scale) * (back @ self._columns.conj().T)
+        scale = cell * self._inverse_scale
+        if self._shear is None:
+            return scale * self._rows.adjoint(field @ self._columns.conj().T)
+        return scale * ((self._rows.adjoint(field) * self._shear.conj()) @ self._columns.conj().T)

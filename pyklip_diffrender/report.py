@@ -151,7 +151,7 @@ def draw_subtraction(fit: Refinement) -> Figure:
 
     figure = Figure(figsize=(15.5, 4.4), layout="constrained")
     axes = figure.subplots(1, 4)
-    panels = (
+    panels: tuple[tuple[NDArray[np.float64], dict[str, Any], str, str], ...] = (
         (data, {"norm": norm, "cmap": "magma"}, "Data, mean of the integrations", unit),
         (fit.star_image, {"norm": norm, "cmap": "magma"}, "Rendered star", unit),
         (residual, {"limits": (-span, span), "cmap": "RdBu_r"}, "Data - star", unit),

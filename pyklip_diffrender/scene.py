@@ -14,6 +14,7 @@ from pyklip_diffrender.units import ARCSEC
 __all__ = [
     "ALPHA_PICTORIS_W2",
     "BETA_PICTORIS_W2",
+    "PAPER_SEGMENT_GAP",
     "UNOCCULTED_PEAK",
     "Planet",
     "Scene",
@@ -25,6 +26,11 @@ BETA_PICTORIS_W2 = 3.182
 
 ALPHA_PICTORIS_W2 = 0.979
 """WISE W2 magnitude of the paper's reference star."""
+
+PAPER_SEGMENT_GAP = 0.0
+"""Width of the mirror's segment gaps, m, at which the paper's photon levels come out: webbpsf's
+sampled pupil, which the paper used, hardly resolves them (they are 7 mm). Light that leaks through
+the coronagraph from gaps of their true width makes the star 1.5 times as bright."""
 
 UNOCCULTED_PEAK = 3.71638e-3
 """Share of the light collected by the pupil that falls on the brightest pixel of the paper's star

@@ -20,7 +20,7 @@ LAYERS = (
     ("errors", "units", "files"),
     ("geometry", "zernike", "spectrum", "parameters", "orientation"),
     ("propagation",),
-    ("planes", "masks", "arrays", "rotation", "detector_effects", "psf_file", "optics"),
+    ("planes", "detector", "masks", "arrays", "rotation", "detector_effects", "psf_file", "optics"),
     ("nircam",),
     ("bridges",),
     ("observation", "scene", "simulation"),

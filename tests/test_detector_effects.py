@@ -10,6 +10,7 @@ from astropy.convolution import convolve
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
+from pyklip_diffrender.detector import Detector
 from pyklip_diffrender.detector_effects import (
     ChainDetector,
     Effect,
@@ -18,7 +19,6 @@ from pyklip_diffrender.detector_effects import (
     PixelCrosstalk,
 )
 from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.planes import Detector
 from pyklip_diffrender.rotation import SplineRotation
 
 Array = NDArray[np.float64]

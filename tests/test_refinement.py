@@ -412,15 +412,30 @@ def test_the_first_step_of_adam_is_the_learning_rate_against_the_gradient(tiny: 
 
 
 @pytest.mark.hard
-def test_adam_does_not_look_at_masked_pixels(tiny: Case) -> None:
+@pytest.mark.parametrize("method", ["adam", "lbfgs"])
+def test_gradient_methods_do_not_look_at_masked_pixels(tiny: Case, method: str) -> None:
     valid = np.random.default_rng(4).random(tiny.observation.shape) > 0.05
+    start = {"star_offset": (0.002, -0.001), "flux": 1e10, "background": BACKGROUND}
+    options = {
+        "adam": {"iterations": 3},
+        "lbfgs": {"basis": FEW, "free": ("star_offset",), "max_iterations": 3},
+    }[method]
     fits = []
     for junk in (0.0, 1e30):
         data = np.where(valid, tiny.observation.data[0], junk)
         masked = replace(tiny.observation, data=data[None], valid=valid[None])
-        fits.append(refine(tiny.model, masked, tiny.opd, method="adam", iterations=3))
+        fits.append(refine(tiny.model, masked, tiny.opd, method=method, start=start, **options))
     assert fits[0].opd.tobytes() == fits[1].opd.tobytes()
     assert fits[0].history == fits[1].history
+    # Nor are they taken for dark pixels: the first loss is that of the others.
+    star = 1e10 * tiny.model(tiny.opd, start["star_offset"]).numpy() + BACKGROUND
+    away = np.abs(star - tiny.observation.data[0])[valid]
+    whitened = away / tiny.observation.error[0][valid]
+    first = fits[0].history[0]
+    expected = away.mean() if method == "adam" else (whitened**2).mean()
+    assert first["loss" if method == "adam" else "chi2_per_pixel"] == pytest.approx(
+        expected, rel=1e-9
+    )
 
 
 def test_lbfgs_ends_where_gauss_newton_does(tiny: Case) -> None:

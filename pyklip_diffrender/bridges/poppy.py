@@ -17,10 +17,10 @@ from torch import Tensor
 from pyklip_diffrender.arrays import PupilOptic
 from pyklip_diffrender.bridges.convert import Converted, Converter
 from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
+from pyklip_diffrender.detector import Detector
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.orientation import Orientation
-from pyklip_diffrender.planes import Detector
 from pyklip_diffrender.psf_file import poppy_psf
 from pyklip_diffrender.units import to_metres
 

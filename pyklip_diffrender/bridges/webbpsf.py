@@ -25,10 +25,10 @@ from pyklip_diffrender.bridges.settings import (
     oversampling,
     private_copy,
 )
+from pyklip_diffrender.detector import Detector
 from pyklip_diffrender.detector_effects import ChainDetector
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.geometry import JWST_DIAMETER
-from pyklip_diffrender.planes import Detector
 from pyklip_diffrender.psf_file import poppy_psf, save
 from pyklip_diffrender.units import to_metres
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -81,7 +81,7 @@ class GaussNewtonOptions:
     free: tuple[str, ...] = ("star_offset", "lyot_shift", "lyot_rotation", "flux", "background")
     wavefront: bool = True
     basis: Basis | None = None
-    prior: WavefrontPrior = WavefrontPrior()
+    prior: WavefrontPrior = field(default_factory=WavefrontPrior)
     companions: int = 0
     companion_threshold: float = 4.0
     response_npix: int = 128
@@ -111,12 +111,14 @@ class _GaussNewton:
     def __init__(self, problem: Problem, options: GaussNewtonOptions, progress: bool) -> None:
         self.problem, self.options, self.progress = problem, options, progress
         self.basis = options.basis or default_basis()
-        known = (*problem.model.parameters, "flux", "background")
-        for name in options.free:
-            if name not in known:
-                raise IncompatibleSetupError(
-                    f"free: {name!r} is not a parameter of this model, which has {known}"
-                )
+        problem.require_parameters(options.free)
+        if not options.free and not options.wavefront:
+            raise IncompatibleSetupError("free is empty and wavefront is False: nothing to fit")
+        if "flux" not in options.free and not float(problem.start.get("flux", 0.0)):
+            raise IncompatibleSetupError(
+                "flux is not free and start has no 'flux': how bright is the star? Add 'flux' to "
+                "free, or give start={'flux': light that the pupil collects}"
+            )
         self.forward = Forward(
             problem, self.basis, options.response_npix, progress, options.relinearise
         )
@@ -255,7 +257,9 @@ class _GaussNewton:
             trial = self.forward.at(unknowns, unknowns.clamped(vector))
             after = self.cost(trial, sigma)
             if after < before:
-                self._relax((before - after) / self.predicted_gain(unknowns, equations, update.step))
+                self._relax(
+                    (before - after) / self.predicted_gain(unknowns, equations, update.step)
+                )
                 return trial, (before - after) / self.problem.pixels
             self.damping = max(6 * self.damping, 0.05)
         return point, 0.0
@@ -302,15 +306,15 @@ class _GaussNewton:
         began = time.perf_counter()
         options, point = self.options, self.point
         kappa = max(self.model_error(point), options.kappa_floor)
-        best, best_error = point, math.inf
+        best, best_error = point, (math.inf, math.inf)
         status = Status.ITERATION_LIMIT
-        with_modes = False
+        with_modes = not options.free
         bar = tqdm(total=options.max_iterations, desc="refine", disable=not self.progress)
         for iteration in range(options.max_iterations):
             point, gain = self.descend(point, self.sigma(point, kappa), with_modes)
             needed, chi2 = self.model_error(point), self.chi2_per_pixel(point)
-            if needed < best_error:
-                best, best_error = point, needed
+            if (needed, chi2) < best_error:
+                best, best_error = point, (needed, chi2)
             record = {
                 "iteration": iteration,
                 "wavefront": with_modes,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -61,7 +61,7 @@ class LBFGSOptions:
 
     free: tuple[str, ...] = ("star_offset", "lyot_shift", "lyot_rotation", "flux", "background")
     basis: Basis | None = None
-    prior: WavefrontPrior = WavefrontPrior()  # noqa: RUF009 - frozen
+    prior: WavefrontPrior = field(default_factory=WavefrontPrior)
     max_iterations: int = 300
     tolerance: float = 1e-7
 
@@ -141,6 +141,7 @@ def lbfgs(problem: Problem, options: LBFGSOptions, *, seed: int, progress: bool)
     grid = PupilGrid.full(model.npix, model.diameter)
     extra = {p.name for p in FLUX_AND_BACKGROUND}
     optical = tuple(name for name in options.free if name not in extra)
+    problem.require_parameters(optical)
     linear = tuple(name for name in options.free if name in extra)
     start = problem.optical_start(optical)
     with torch.no_grad():
@@ -185,7 +186,9 @@ def lbfgs(problem: Problem, options: LBFGSOptions, *, seed: int, progress: bool)
         total = (chi2.cpu() + (free_of_prior * unknown**2).sum()) / problem.pixels
         total.backward()
         assert unknown.grad is not None
-        history.append({"iteration": len(history), "chi2_per_pixel": float(chi2) / problem.pixels})
+        history.append(
+            {"iteration": len(history), "chi2_per_pixel": float(chi2.detach()) / problem.pixels}
+        )
         return float(total.detach()), unknown.grad.numpy()
 
     bar = tqdm(total=options.max_iterations, desc="l-bfgs", disable=not progress)

@@ -40,15 +40,15 @@ NIRCAM_FIT: dict[str, Any] = {
         knee=5.0,
         slope=1.0,
         fit_scales=False,
-        amplitude_cycles=20.0,
+        amplitude_cycles=24.0,
         amplitude_scale=2.0,
         amplitude_slope=0.5,
     ),
     "companions": 1,
     "robust": 3.0,
     "kappa_floor": 0.01,
-    "max_iterations": 24,
-    "tolerance": 3e-3,
+    "max_iterations": 40,
+    "tolerance": 2e-3,
 }
 """Arguments of `refine`. One percent of the star stays as model error; a companion as bright as
 the speckles gets parameters of its own; pixels that no model explains lose their weight."""

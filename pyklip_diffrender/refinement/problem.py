@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.errors import NoValidPixelsError, ShapeError
+from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
 from pyklip_diffrender.observation import Observation
 from pyklip_diffrender.opd import OPDMap, resample
 from pyklip_diffrender.optics import OpticalSystem
@@ -32,7 +33,8 @@ class Problem:
         As given.
     initial : OPDMap
     start : dict
-        Starting values of optical parameters, and of "flux" and "background" where known.
+        Starting values of optical parameters (numbers in the units of the parameter table, or
+        Quantities), and of "flux" and "background" where known.
     """
 
     model: OpticalSystem
@@ -48,6 +50,7 @@ class Problem:
                 f"pixels, the model {ny} x {nx}. Cut with observation.cutout({ny}), or make the "
                 "model with fov_pixels to match"
             )
+        self.require_parameters(self.start, "start")
         combined = self.observation.combined()
         device = self.model.device
         self.data = torch.from_numpy(combined.data[0]).to(device)
@@ -65,15 +68,20 @@ class Problem:
 
     def optical_start(self, names: tuple[str, ...]) -> dict[str, Tensor]:
         """Starting values of the named optical parameters and of any given otherwise."""
-        values = {}
-        wanted = dict.fromkeys((*names, *self.start))
-        for name in wanted:
-            if name not in self.model.parameters:
-                continue
+        starts = {n: v for n, v in self.start.items() if n in self.model.parameters}
+        for name in names:
             entry = parameter(name)
-            given = np.broadcast_to(self.start.get(name, entry.default), (entry.size,))
-            values[name] = torch.tensor(given.copy(), dtype=torch.float64, device=self.model.device)
-        return values
+            starts.setdefault(name, np.full(entry.size, entry.default))
+        return self.model.values(starts)
+
+    def require_parameters(self, names: Iterable[str], argument: str = "free") -> None:
+        """Raise `IncompatibleSetupError` for a name that is no parameter of this problem."""
+        known = (*self.model.parameters, "flux", "background")
+        for name in names:
+            if name not in known:
+                raise IncompatibleSetupError(
+                    f"{argument}: {name!r} is not a parameter of this model, which has {known}"
+                )
 
     def flux_and_background(
         self, image: Tensor, sigma: Tensor, names: tuple[str, ...]
