@@ -118,7 +118,9 @@ class EntrancePupil:
         phase = wavenumber * opd.to(self.dtype)
         x, y = tilt_phases(star_offset * ARCSEC, self.grid, wavelength)
         phase = phase + (x[..., None, :] + y[..., :, None]).to(self.dtype)
-        return Wavefront(torch.polar(amplitude.expand_as(phase), phase), wavelength, self.grid)
+        # torch.polar does the same in twice the time.
+        field = torch.complex(amplitude * torch.cos(phase), amplitude * torch.sin(phase))
+        return Wavefront(field, wavelength, self.grid)
 
 
 class PupilStop:

@@ -13,7 +13,7 @@ from pyklip_diffrender.priors import WavefrontPrior
 __all__ = ["NIRCAM_FIT", "NIRCAM_MODEL"]
 
 NIRCAM_MODEL: dict[str, Any] = {
-    "nlambda": 5,
+    "nlambda": 7,
     "npix": 256,
     "occulter_sampling": 2.0,
     "pixelscale": SIAF_PIXELSCALE,
@@ -36,18 +36,20 @@ NIRCAM_FIT: dict[str, Any] = {
     # Pixel and charge diffusion (0.29 pixel each) make 0.42 pixel together.
     "start": {"blur": 0.026},
     "prior": WavefrontPrior(
-        scales={"segment": 20.0, "texture": 6.0},
-        knee=5.0,
+        scales={"segment": 20.0, "texture": 18.0},
+        knee=1.0,
         slope=1.0,
         fit_scales=False,
         amplitude_cycles=24.0,
-        amplitude_scale=2.0,
+        amplitude_scale=3.2,
         amplitude_slope=0.5,
     ),
     "companions": 1,
+    "companion_threshold": 3.0,
     "robust": 3.0,
     "kappa_floor": 0.01,
     "max_iterations": 40,
+    "relinearise": 0.3,
     "tolerance": 2e-3,
 }
 """Arguments of `refine`. One percent of the star stays as model error; a companion as bright as
