@@ -75,6 +75,7 @@ def draw_demo(result: DemoResult) -> Figure:
     figure.colorbar(shown, ax=axes[0, 0], label="photons", shrink=0.85)
 
     planet = result.scene.planets[0]
+    axes[0, 0].plot(*planet.offset, "o", mfc="none", mec="white", ms=13, mew=1.2)
     places = ((0, 1, "initial"), (0, 2, "KLIP"), (0, 3, "optimal"), (1, 0, "refined"))
     titles = {
         "initial": f"Star from the {result.table.meta['hours']:.0f} h old wavefront",
@@ -85,10 +86,12 @@ def draw_demo(result: DemoResult) -> Figure:
     for row, column, name in places:
         ax = axes[row, column]
         facts = result.table[list(result.table["star model"]).index(name)]
+        share = 100 * facts["planet throughput"]
+        # Where the star is left over, the planet's share of the light means nothing.
+        kept = f", planet light kept {share:.0f} %" if facts["star error"] < 20 else ""
         shown = draw_image(
             ax, result.images[name] / result.noise, scale, limits=(-6, 6), cmap="RdBu_r",
-            title=f"{titles[name]}\nSNR {facts['annulus SNR']:.1f}, planet light kept "
-            f"{100 * facts['planet throughput']:.0f} %",
+            title=f"{titles[name]}\nSNR {facts['annulus SNR']:.1f}{kept}",
         )  # fmt: skip
         ax.plot(*planet.offset, "o", mfc="none", mec=_INK, ms=13, mew=1.2, clip_on=True)
         figure.colorbar(shown, ax=ax, label="residual / noise", shrink=0.85)

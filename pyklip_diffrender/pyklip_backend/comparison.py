@@ -60,10 +60,11 @@ def klip_rdi(
         IWA=inner,
         filenames=names[:1],
     )
-    # pyKLIP and its file writer print as they go.
+    # pyKLIP and its file writer print as they go, and show a bar.
     with (
         tempfile.TemporaryDirectory() as folder,
         contextlib.redirect_stdout(io.StringIO()),
+        contextlib.redirect_stderr(io.StringIO()),
     ):
         library = rdi.PSFLibrary(stack, center, names, compute_correlation=True)
         library.prepare_library(dataset)
