@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.pyklip_backend import (
         DiffrenderSettings,
         backend,
+        observation_from_dataset,
         register,
         unregister,
     )
@@ -41,6 +42,7 @@ __all__ = [
     "from_poppy",
     "from_webbpsf",
     "nircam_coronagraph",
+    "observation_from_dataset",
     "random_opd",
     "read_opd",
     "refine",
@@ -63,6 +65,7 @@ _MODULE_OF = {
     "from_poppy": "bridges",
     "from_webbpsf": "bridges",
     "nircam_coronagraph": "nircam",
+    "observation_from_dataset": "pyklip_backend",
     "random_opd": "opd",
     "read_opd": "opd",
     "refine": "refinement",

@@ -148,7 +148,7 @@ def draw_subtraction(fit: Refinement) -> Figure:
     scale = fit.model.detector.pixelscale[0]
     unit = str(fit.observation.unit)
     limit = float(np.nanpercentile(data, 99.8))
-    norm = SymLogNorm(limit / 100, vmin=-limit / 20, vmax=limit)
+    norm = SymLogNorm(limit / 30, vmin=-limit / 30, vmax=limit)
     span = float(np.nanpercentile(np.abs(residual), 99.5))
     ratio = np.where(combined.valid[0], residual / noise, np.nan)
 

@@ -387,3 +387,25 @@ def test_inputs_of_any_kind_give_the_same_image_and_stay_unchanged(opd: torch.Te
     array = opd.numpy().astype(">f8")
     array.setflags(write=False)
     torch.testing.assert_close(model(array), model(opd), rtol=0, atol=0)
+
+
+def test_an_imaginary_opd_changes_the_amplitude_and_nothing_else(opd: torch.Tensor) -> None:
+    """OPD -1j a: the amplitude grows by exp(2 pi a / wavelength) everywhere, the light squared."""
+    model = small(image_mask=None)
+    gain = 30e-9
+    brighter = model(torch.complex(opd, torch.full_like(opd, -gain)))
+    expected = model(opd) * math.exp(4 * math.pi * gain / WAVELENGTH)
+    torch.testing.assert_close(brighter, expected, rtol=1e-12, atol=1e-20)
+
+
+def test_gradcheck_of_the_amplitude() -> None:
+    model = small(npix=12, fov_pixels=5)
+    opd = torch.from_numpy(random_opd(7, npix=12).data)
+    absorbed = torch.full_like(opd, 20.0).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda nm: 1e5 * model(torch.complex(opd, nm * 1e-9)),
+        (absorbed,),
+        eps=1e-3,
+        atol=1e-7,
+        rtol=1e-5,
+    )

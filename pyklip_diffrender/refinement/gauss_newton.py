@@ -136,9 +136,10 @@ class _GaussNewton:
         problem, free = self.problem, self.options.free
         start = problem.optical_start(tuple(n for n in free if n in problem.model.parameters))
         zero = torch.zeros(1, dtype=torch.float64)
+        # The unknowns and their algebra stay on the CPU, wherever the model renders.
         unknowns = Unknowns(
             free,
-            {**start, "flux": zero, "background": zero},
+            {**{n: v.cpu() for n, v in start.items()}, "flux": zero, "background": zero},
             len(self.basis),
             len(self.amplitude_deviation),
         )
