@@ -118,7 +118,7 @@ class EntrancePupil:
         phase = wavenumber * opd.to(self.dtype)
         x, y = tilt_phases(star_offset * ARCSEC, self.grid, wavelength)
         phase = phase + (x[..., None, :] + y[..., :, None]).to(self.dtype)
-        # torch.polar does the same in twice the time.
+        # torch.polar does the same in 1.6 times the time (1024 x 1024, two cores).
         field = torch.complex(amplitude * torch.cos(phase), amplitude * torch.sin(phase))
         return Wavefront(field, wavelength, self.grid)
 

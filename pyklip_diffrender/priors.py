@@ -152,7 +152,7 @@ def solve_with_evidence(
         step = torch.cholesky_solve(pulled[:, None], factor)[:, 0]
         if not iterations and not covariance:
             break
-        # Twenty times faster than torch.cholesky_inverse, which does not use level-3 BLAS.
+        # Three times faster than torch.cholesky_inverse (1,855 unknowns, two cores).
         inverse = torch.linalg.solve_triangular(factor, identity, upper=False)
         variance = (inverse**2).sum(dim=0)
         # How many of a group's modes the data determine, and the scale that they have.

@@ -112,7 +112,7 @@ class Forward:
         return Point(unknowns, vector, fields, image, star, total)
 
     def _companion(self, opd: Tensor, values: dict[str, Tensor], source: Tensor) -> Tensor:
-        """A companion at contrast 1; the coarse copy is good to a percent of it."""
+        """A companion at contrast 1. At 128 samples it is 1.3 % brighter than at 1024."""
         with torch.no_grad():
             small = downsample(opd, self.coarse.npix)
             return self.coarse(small, **self._towards(values, source)).double()

@@ -30,7 +30,7 @@ class Status(Enum):
     )
     ITERATION_LIMIT = "stopped at the limit of iterations, before it converged"
     COMPLETED = "all iterations of a fixed recipe were done"
-    DIVERGED = "stopped: no step made the fit better than a model without a star"
+    DIVERGED = "failed: the fitted star has no light, or the loss is not a number"
 
     @property
     def message(self) -> str:
