@@ -152,7 +152,7 @@ def test_a_fit_that_diverges_stops_the_reduction(
     made = dataset(-frames[:1], small)
     with (
         backend(opd=OLD, refine_options=ALIGNED),
-        pytest.raises(RefinementError, match="roll0: stopped") as caught,
+        pytest.raises(RefinementError, match="roll0: failed") as caught,
     ):
         reduce(made, tmp_path)
     assert caught.value.result.star_image.shape == (32, 32)
