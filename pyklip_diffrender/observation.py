@@ -67,6 +67,8 @@ class Observation:
     date : Time or None
     position_angles : ndarray, (frames,)
         Degrees.
+    reference : bool
+        Another star, whose frames show the wavefront but none of the target's companions.
     name : str
     header : Header
         Primary and science headers of the file, merged.
@@ -82,6 +84,7 @@ class Observation:
     date: Time | None = None
     position_angles: NDArray[np.float64] | None = None
     name: str = "observation"
+    reference: bool = False
     header: fits.Header = field(default_factory=fits.Header)
 
     @classmethod

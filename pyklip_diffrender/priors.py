@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import torch
+from scipy.linalg.lapack import dtrtri
 from torch import Tensor
 
 from pyklip_diffrender.bases import Basis
@@ -97,6 +98,14 @@ class EvidenceUpdate:
         return replace(self, step=self.step * unit, covariance=covariance)
 
 
+def _inverse_of_lower(factor: Tensor) -> Tensor:
+    """Inverse of a lower triangle, in half the time that solving for the identity takes."""
+    # LAPACK wants columns contiguous: the transpose of a row-major lower triangle is an upper one.
+    inverse, failure = dtrtri(factor.numpy().T, lower=0)
+    assert not failure, "a Cholesky factor has no zero on its diagonal"
+    return torch.from_numpy(inverse.T)
+
+
 def solve_with_evidence(
     curvature: Tensor,
     gradient: Tensor,
@@ -140,8 +149,7 @@ def solve_with_evidence(
     """
     others = len(fixed_deviation)
     diagonal = torch.arange(len(curvature))
-    identity = torch.eye(len(curvature), dtype=curvature.dtype)
-    inverse, effective = identity, float("nan")
+    inverse, effective = curvature, float("nan")
     for k in range(iterations + 1):
         deviation = torch.cat([fixed_deviation, scales[group] * shape])
         precision = deviation**-2
@@ -152,8 +160,7 @@ def solve_with_evidence(
         step = torch.cholesky_solve(pulled[:, None], factor)[:, 0]
         if not iterations and not covariance:
             break
-        # Three times faster than torch.cholesky_inverse (1,855 unknowns, two cores).
-        inverse = torch.linalg.solve_triangular(factor, identity, upper=False)
+        inverse = _inverse_of_lower(factor)
         variance = (inverse**2).sum(dim=0)
         # How many of a group's modes the data determine, and the scale that they have.
         determined = 1 - precision[others:] * variance[others:]

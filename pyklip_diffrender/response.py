@@ -21,8 +21,16 @@ from pyklip_diffrender.bases import Basis
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.geometry import PupilGrid
 from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.units import ARCSEC
 
-__all__ = ["NANOMETRE", "WavefrontResponse", "coarse_copy", "downsample", "parameter_jacobian"]
+__all__ = [
+    "NANOMETRE",
+    "Responses",
+    "WavefrontResponse",
+    "coarse_copy",
+    "downsample",
+    "parameter_jacobian",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -162,8 +170,53 @@ class WavefrontResponse:
         return self.coarse.detector.image(total, values)
 
 
+class Responses:
+    """The field's responses to a basis that were computed, to be used again nearby.
+
+    Parameters
+    ----------
+    model : OpticalSystem
+    basis : Basis
+    relinearise : float
+        Change of the pupil's phase (rms, radians) after which the response is computed anew.
+    most : int
+        How many are kept, the latest.
+    """
+
+    def __init__(
+        self, model: OpticalSystem, basis: Basis, relinearise: float = 0.3, most: int = 2
+    ) -> None:
+        self.model, self.basis, self.relinearise, self.most = model, basis, relinearise, most
+        self._kept: list[tuple[Tensor, WavefrontResponse]] = []
+
+    def near(
+        self, opd: Tensor, values: dict[str, Tensor], npix: int, progress: bool = False
+    ) -> WavefrontResponse:
+        """The response where the pupil's phase differs little from that of `opd` and `values`."""
+        wavenumber = 2 * math.pi / min(self.model.bandpass.wavelengths)
+        pupil = self.model.entrance
+        x, y = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu() * ARCSEC
+        tilt = y * pupil.full.y[:, None] - x * pupil.full.x[None, :]
+        phase = wavenumber * (opd + tilt.to(opd.device))[pupil.lit]
+        for kept, response in reversed(self._kept):
+            change = (phase - kept).abs()
+            if float(torch.sqrt((change**2).mean())) <= self.relinearise:
+                return response
+        # Room first, for the new one may take as much memory as the old.
+        del self._kept[: len(self._kept) + 1 - self.most]
+        response = WavefrontResponse(
+            self.model, self.basis, opd, values, npix=npix, progress=progress
+        )
+        self._kept.append((phase, response))
+        return response
+
+
 def parameter_jacobian(
-    model: OpticalSystem, opd: Tensor, values: dict[str, Tensor], names: tuple[str, ...]
+    model: OpticalSystem,
+    opd: Tensor,
+    values: dict[str, Tensor],
+    names: tuple[str, ...],
+    fields: Sequence[Tensor] | None = None,
 ) -> Tensor:
     """Derivative of the image with respect to the components of named parameters.
 
@@ -178,6 +231,9 @@ def parameter_jacobian(
     values : dict of Tensor
         Where to differentiate; must hold every name.
     names : tuple of str
+    fields : sequence of Tensor, optional
+        The finer model's fields there, at each wavelength. Then only the fields' derivatives are
+        the coarse model's: E = E_fine + (E_coarse - E_coarse at `values`).
 
     Returns
     -------
@@ -186,12 +242,21 @@ def parameter_jacobian(
     """
     # Constants are built and kept at the first call; that must not happen inside a transform.
     with torch.no_grad():
-        model(opd, **values)
+        here = model.fields(opd, **values)
+    if fields is None:
+        missing = [torch.zeros_like(field) for field in here]
+    else:
+        missing = [
+            fine.to(coarse.dtype) - coarse for fine, coarse in zip(fields, here, strict=True)
+        ]
     rows = []
     for name in names:
 
         def image(value: Tensor, name: str = name) -> Tensor:
-            return model(opd, **{**values, name: value})
+            there = {**values, name: value}
+            moved = model.fields(opd, **there)
+            corrected = [field + rest for field, rest in zip(moved, missing, strict=True)]
+            return model.image_of(corrected, there)
 
         rows.append(torch.func.jacfwd(image)(values[name]).movedim(-1, 0))
     return torch.cat(rows)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
-from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
+from pyklip_diffrender.errors import (
+    IncompatibleSetupError,
+    MissingOPDError,
+    NoValidPixelsError,
+    ShapeError,
+)
 from pyklip_diffrender.observation import Observation
 from pyklip_diffrender.opd import as_opd_map
 from pyklip_diffrender.optics import OpticalSystem
@@ -27,40 +33,73 @@ __all__ = [
 ]
 
 METHODS = {
-    "gauss-newton": (gauss_newton, GaussNewtonOptions),
-    "adam": (adam, AdamOptions),
-    "lbfgs": (lbfgs, LBFGSOptions),
+    "gauss-newton": GaussNewtonOptions,
+    "adam": AdamOptions,
+    "lbfgs": LBFGSOptions,
 }
+"""Methods and their settings."""
 
 
+@overload
 def refine(
     model: OpticalSystem,
     observation: Observation,
     opd: Any,
     *,
+    method: str = ...,
+    start: dict[str, Any] | None = ...,
+    seed: int = ...,
+    progress: bool = ...,
+    **options: Any,
+) -> Refinement: ...
+
+
+@overload
+def refine(
+    model: OpticalSystem,
+    observation: Sequence[Observation],
+    opd: Any,
+    *,
+    method: str = ...,
+    start: dict[str, Any] | Sequence[dict[str, Any]] | None = ...,
+    seed: int = ...,
+    progress: bool = ...,
+    **options: Any,
+) -> list[Refinement]: ...
+
+
+def refine(
+    model: OpticalSystem,
+    observation: Observation | Sequence[Observation],
+    opd: Any,
+    *,
     method: str = "gauss-newton",
-    start: dict[str, Any] | None = None,
+    start: dict[str, Any] | Sequence[dict[str, Any]] | None = None,
     seed: int = 0,
     progress: bool = False,
     **options: Any,
-) -> Refinement:
+) -> Refinement | list[Refinement]:
     """Refine an outdated wavefront until the rendered star matches an observation.
 
     Parameters
     ----------
     model : OpticalSystem
         Its detector must have the observation's shape.
-    observation : Observation
-        All its frames see the same star through the same wavefront; refine rolls one by one.
+    observation : Observation or sequence of Observation
+        The frames of one observation see the same star through the same wavefront and are
+        averaged. Several observations (rolls, dithers, snapshots, a reference star) are fitted
+        together: each has its own star position, flux and background (option `own`), their
+        wavefront is shared, or differs by as much as the option `drift` allows, and what is said
+        to be a companion turns with the position angle.
     opd : path, OPDMap, Quantity or array
         The wavefront to start from, entrance-pupil orientation; bare arrays in metres. It is
         resampled to the model's pupil.
     method : "gauss-newton", "adam" or "lbfgs"
         The default fits segment motions and Fourier modes with a prior and gives errors; adam is
         the recipe of Feng et al. 2025; lbfgs needs no response matrix.
-    start : dict, optional
-        Starting values by parameter name; "detector_shift" follows from the observation's star
-        position unless given.
+    start : dict or sequence of dict, optional
+        Starting values by parameter name, for all observations or one by one; "detector_shift"
+        follows from the observation's star position unless given.
     seed : int
         Recorded with the result. The methods themselves draw no random numbers.
     progress : bool
@@ -70,8 +109,8 @@ def refine(
 
     Returns
     -------
-    Refinement
-        The best iterate; look at its `status`.
+    Refinement, or a list of them, one an observation
+        The best iterate; look at its `status`. Those of a list share one linear model.
 
     Raises
     ------
@@ -89,7 +128,7 @@ def refine(
         )
     if method not in METHODS:
         raise IncompatibleSetupError(f"method: got {method!r}, expected one of {tuple(METHODS)}")
-    run, settings = METHODS[method]
+    settings = METHODS[method]
     try:
         chosen = settings(**options)
     except TypeError as error:
@@ -97,10 +136,48 @@ def refine(
             f"refine(method={method!r}): {error}. It takes "
             f"{', '.join(field.name for field in fields(settings))}"
         ) from error
-    begin = dict(start or {})
+    several = not isinstance(observation, Observation)
+    observations = [observation] if isinstance(observation, Observation) else list(observation)
+    if not observations:
+        raise NoValidPixelsError("observation: got an empty sequence, expected at least one")
+    starts = _one_by_one(start, len(observations))
+    wavefront = as_opd_map(opd)
+    problems = [
+        Problem(model, each, wavefront, _with_position(model, each, begin))
+        for each, begin in zip(observations, starts, strict=True)
+    ]
+    if isinstance(chosen, GaussNewtonOptions):
+        found = gauss_newton(problems, chosen, seed=seed, progress=progress)
+        return found if several else found[0]
+    if several:
+        raise IncompatibleSetupError(
+            f"refine(method={method!r}) takes one observation, got {len(observations)}: several "
+            'are fitted together by method="gauss-newton"'
+        )
+    if isinstance(chosen, AdamOptions):
+        return adam(problems[0], chosen, seed=seed, progress=progress)
+    return lbfgs(problems[0], chosen, seed=seed, progress=progress)
+
+
+def _one_by_one(
+    start: dict[str, Any] | Sequence[dict[str, Any]] | None, count: int
+) -> list[dict[str, Any]]:
+    if start is None or isinstance(start, dict):
+        return [start or {}] * count
+    if len(start) != count:
+        raise ShapeError(
+            f"start: got {len(start)} dicts for {count} observations, expected one for each or "
+            "one for all"
+        )
+    return list(start)
+
+
+def _with_position(
+    model: OpticalSystem, observation: Observation, start: dict[str, Any]
+) -> dict[str, Any]:
+    """Starting values, with the star's position on the detector if the observation has one."""
     ny, nx = observation.shape
     away = observation.center[0] - np.array([(nx - 1) / 2, (ny - 1) / 2])
-    if "detector_shift" not in begin and np.abs(away).max() > 1e-9:
-        begin["detector_shift"] = away * np.array(model.detector.pixelscale)
-    problem = Problem(model, observation, as_opd_map(opd), begin)
-    return run(problem, chosen, seed=seed, progress=progress)  # type: ignore[operator]
+    if "detector_shift" in start or np.abs(away).max() <= 1e-9:
+        return dict(start)
+    return {**start, "detector_shift": away * np.array(model.detector.pixelscale)}

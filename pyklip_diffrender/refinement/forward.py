@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +13,7 @@ from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.unknowns import Unknowns
 from pyklip_diffrender.response import (
     NANOMETRE,
+    Responses,
     WavefrontResponse,
     coarse_copy,
     downsample,
@@ -59,9 +59,8 @@ class Forward:
     response_npix : int
         Pupil samples of the coarse copy of the model, for derivatives and companions.
     progress : bool
-    relinearise : float
-        Change of the pupil's phase (rms, radians) after which the response of the field to the
-        wavefront is computed anew.
+    responses : Responses
+        Of the model to the basis; shared by frames.
     """
 
     def __init__(
@@ -70,14 +69,12 @@ class Forward:
         basis: Basis,
         response_npix: int,
         progress: bool,
-        relinearise: float = 0.3,
+        responses: Responses,
     ) -> None:
         self.problem, self.basis, self.model = problem, basis, problem.model
-        self.response_npix, self.progress, self.relinearise = response_npix, progress, relinearise
+        self.response_npix, self.progress, self.responses = response_npix, progress, responses
         self.coarse = coarse_copy(problem.model, response_npix)
         self.grid = PupilGrid.full(problem.model.npix, problem.model.diameter)
-        self._response: WavefrontResponse | None = None
-        self._linearised_at: Tensor | None = None
 
     def opd(self, unknowns: Unknowns, vector: Tensor) -> Tensor:
         """The wavefront, (npix, npix), m; complex where the pupil's amplitude is free."""
@@ -107,63 +104,59 @@ class Forward:
             image = self.model.image_of(fields, values).double()
         star = flux * image + unknowns.level("background", vector)
         total = star
-        for source in unknowns.sources(vector):
-            total = total + flux * source[0] * self._companion(opd, values, source)
+        for source in unknowns.sources(vector) if unknowns.shows_companions else ():
+            there = self._towards(values, unknowns.turn @ source[1:])
+            total = total + flux * source[0] * self._companion(opd, there)
         return Point(unknowns, vector, fields, image, star, total)
 
-    def _companion(self, opd: Tensor, values: dict[str, Tensor], source: Tensor) -> Tensor:
+    def _companion(self, opd: Tensor, values: dict[str, Tensor]) -> Tensor:
         """A companion at contrast 1. At 128 samples it is 1.3 % brighter than at 1024."""
         with torch.no_grad():
-            small = downsample(opd, self.coarse.npix)
-            return self.coarse(small, **self._towards(values, source)).double()
+            return self.coarse(downsample(opd, self.coarse.npix), **values).double()
 
     @staticmethod
-    def _towards(values: dict[str, Tensor], source: Tensor) -> dict[str, Tensor]:
+    def _towards(values: dict[str, Tensor], offset: Tensor) -> dict[str, Tensor]:
         star = values.get("star_offset", torch.zeros(2, dtype=torch.float64))
-        return {**values, "star_offset": star + source[1:].to(star.device)}
+        return {**values, "star_offset": star + offset.to(star.device)}
 
     def jacobian(self, point: Point, with_modes: bool) -> Tensor:
         """Derivative of `total`, (unknowns, ny, nx), float64; without the modes if so asked."""
         unknowns, vector = point.unknowns, point.vector
         values, opd = unknowns.values(vector), self.coarse_opd(point)
         flux = unknowns.level("flux", vector)
-        rows = []
+        count = unknowns.where("modes" if with_modes else "companions").stop
+        # One array, filled in place: it is the largest of the fit.
+        rows = torch.empty(count, *point.image.shape, dtype=torch.float64, device=opd.device)
         if unknowns.optical:
-            slopes = parameter_jacobian(self.coarse, opd, values, unknowns.optical)
-            rows.append(flux * slopes.double())
+            slopes = parameter_jacobian(
+                self.coarse, opd, values, unknowns.optical, fields=point.fields
+            )
+            rows[: len(slopes)] = flux * slopes
         if "flux" in unknowns.linear:
-            rows.append(point.image[None])
+            rows[unknowns.where("flux")] = point.image
         if "background" in unknowns.linear:
-            rows.append(torch.ones_like(point.image)[None])
-        for source in unknowns.sources(vector):
-            there = self._towards(values, source)
+            rows[unknowns.where("background")] = 1.0
+        companions = unknowns.where("companions")
+        if not unknowns.shows_companions:
+            rows[companions] = 0.0
+        for k, source in enumerate(unknowns.sources(vector) if unknowns.shows_companions else ()):
+            there = self._towards(values, unknowns.turn @ source[1:])
+            first = companions.start + 3 * k
             with torch.no_grad():
-                rows.append(flux * self.coarse(opd, **there).double()[None])
-            moved = parameter_jacobian(self.coarse, opd, there, ("star_offset",))
-            rows.append(flux * source[0] * moved.double())
+                rows[first] = flux * self.coarse(opd, **there)
+            moved = parameter_jacobian(self.coarse, opd, there, ("star_offset",)).double()
+            turned = torch.tensordot(unknowns.turn.T.to(moved.device), moved, dims=1)
+            rows[first + 1 : first + 3] = flux * source[0] * turned
         if with_modes:
-            count = unknowns.amplitude_modes
-            slopes = self._response_at(point).image(point.fields, values, count).double()
-            rows += [flux * slopes[len(self.basis) :], flux * slopes[: len(self.basis)]]
-        return torch.cat(rows)
+            amplitude, modes = unknowns.where("amplitude"), unknowns.where("modes")
+            slopes = self._response_at(point).image(point.fields, values, unknowns.amplitude_modes)
+            rows[amplitude] = slopes[len(self.basis) :]
+            rows[modes] = slopes[: len(self.basis)]
+            rows[amplitude.start :] *= flux
+        return rows
 
     def _response_at(self, point: Point) -> WavefrontResponse:
         """The field's response to the wavefront, from where the wavefront was much the same."""
         opd = self.opd(point.unknowns, point.vector)
-        if self._response is not None and self._linearised_at is not None:
-            inside = self.problem.model.entrance.lit
-            change = (opd - self._linearised_at)[inside].abs()
-            shortest = min(self.model.bandpass.wavelengths)
-            if float(torch.sqrt((change**2).mean())) * 2 * math.pi / shortest <= self.relinearise:
-                return self._response
-        self._response = None  # Before the new one takes as much memory again.
-        self._response = WavefrontResponse(
-            self.model,
-            self.basis,
-            opd,
-            point.unknowns.values(point.vector),
-            npix=self.response_npix,
-            progress=self.progress,
-        )
-        self._linearised_at = opd
-        return self._response
+        values = point.unknowns.values(point.vector)
+        return self.responses.near(opd, values, self.response_npix, self.progress)

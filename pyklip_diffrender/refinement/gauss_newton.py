@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,12 +23,17 @@ from tqdm import tqdm
 
 from pyklip_diffrender.bases import Basis, default_basis
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.linear_model import LinearFrame, LinearModel
 from pyklip_diffrender.priors import EvidenceUpdate, WavefrontPrior, solve_with_evidence
 from pyklip_diffrender.refinement.companions import bright_companions
-from pyklip_diffrender.refinement.forward import Forward, Point
+from pyklip_diffrender.refinement.forward import Forward
+from pyklip_diffrender.refinement.joint import Joint
+from pyklip_diffrender.refinement.misfit import Misfit, State
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement, Status
 from pyklip_diffrender.refinement.unknowns import Unknowns
+from pyklip_diffrender.response import Responses
+from pyklip_diffrender.scene import Planet
 
 __all__ = ["GaussNewtonOptions", "gauss_newton"]
 
@@ -59,6 +65,16 @@ class GaussNewtonOptions:
     basis : Basis, optional
         Default segment motions and Fourier modes to 24 cycles.
     prior : WavefrontPrior
+    own : tuple of str
+        Of the free parameters, those of which every frame has its own value when several are
+        fitted together.
+    drift : WavefrontPrior, optional
+        How much the wavefronts of several frames may differ from the one they share; by default
+        not at all.
+    drift_cycles : float
+        Highest spatial frequency of such differences.
+    planets : tuple of Planet
+        Companions with parameters of their own from the start; positions relative to the star.
     companions : int
         Most companions that may get parameters of their own, if they stand out of what the
         alignment fit leaves.
@@ -82,6 +98,10 @@ class GaussNewtonOptions:
     wavefront: bool = True
     basis: Basis | None = None
     prior: WavefrontPrior = field(default_factory=WavefrontPrior)
+    own: tuple[str, ...] = ("star_offset", "flux", "background")
+    drift: WavefrontPrior | None = None
+    drift_cycles: float = 8.0
+    planets: tuple[Planet, ...] = ()
     companions: int = 0
     companion_threshold: float = 4.0
     response_npix: int = 128
@@ -107,33 +127,72 @@ def _self_product(rows: Tensor) -> Tensor:
     return upper + upper.triu(1).T
 
 
+def _first_modes(basis: Basis, cycles: float) -> int:
+    """How many modes, from the first one on, have at most a spatial frequency."""
+    beyond = torch.nonzero(basis.frequencies > cycles).flatten()
+    return int(beyond[0]) if len(beyond) else len(basis)
+
+
 class _GaussNewton:
-    def __init__(self, problem: Problem, options: GaussNewtonOptions, progress: bool) -> None:
-        self.problem, self.options, self.progress = problem, options, progress
+    def __init__(
+        self, problems: Sequence[Problem], options: GaussNewtonOptions, progress: bool
+    ) -> None:
+        self.options, self.progress = options, progress
         self.basis = options.basis or default_basis()
-        problem.require_parameters(options.free)
+        for problem in problems:
+            problem.require_parameters(options.free)
         if not options.free and not options.wavefront:
             raise IncompatibleSetupError("free is empty and wavefront is False: nothing to fit")
-        if "flux" not in options.free and not float(problem.start.get("flux", 0.0)):
+        if "flux" not in options.free and not float(problems[0].start.get("flux", 0.0)):
             raise IncompatibleSetupError(
                 "flux is not free and start has no 'flux': how bright is the star? Add 'flux' to "
                 "free, or give start={'flux': light that the pupil collects}"
             )
-        self.forward = Forward(
-            problem, self.basis, options.response_npix, progress, options.relinearise
+        model = problems[0].model
+        # Frames whose stars stand apart need responses of their own; more than a few would
+        # take too much memory.
+        responses = Responses(model, self.basis, options.relinearise, min(len(problems), 4))
+        self.misfit = Misfit(
+            [Forward(p, self.basis, options.response_npix, progress, responses) for p in problems],
+            options.robust,
         )
-        self.shape = options.prior.shape(self.basis)
+        self.drift = _first_modes(self.basis, options.drift_cycles) if options.drift else 0
         self.amplitude_deviation = options.prior.amplitude_deviation(self.basis)
-        self.group = self.basis.group_index
-        self.scales = torch.tensor(
-            [options.prior.scales[name] for name in self.basis.groups], dtype=torch.float64
-        )
+        self._prepare_priors(len(problems))
         self.history: list[dict[str, Any]] = []
         self.damping = 0.0
-        self.unknowns, self.point = self._begin()
+        self.state = self._begin(problems)
 
-    def _begin(self) -> tuple[Unknowns, Point]:
-        problem, free = self.problem, self.options.free
+    def _prepare_priors(self, frames: int) -> None:
+        """Groups, shapes and scales of the shared modes and of each frame's difference."""
+        basis, groups = self.basis, self.basis.groups
+        self.shape = self.options.prior.shape(basis)
+        self.group = basis.group_index
+        self.scale_names = list(groups)
+        scales = [self.options.prior.scales[name] for name in groups]
+        if self.options.drift is not None:
+            own = self.options.drift.shape(basis)[: self.drift]
+            self.shape = torch.cat([self.shape, own.repeat(frames)])
+            self.group = torch.cat(
+                [self.group, (basis.group_index[: self.drift] + len(groups)).repeat(frames)]
+            )
+            self.scale_names += [f"{name} drift" for name in groups]
+            scales += [self.options.drift.scales[name] for name in groups]
+        self.scales = torch.tensor(scales, dtype=torch.float64)
+
+    def _begin(self, problems: Sequence[Problem]) -> State:
+        first = problems[0].observation.position_angles
+        frames = []
+        for problem, forward in zip(problems, self.misfit.forwards, strict=True):
+            angles = problem.observation.position_angles
+            turned = 0.0 if first is None or angles is None else float(angles[0] - first[0])
+            frames.append(self._begin_frame(problem, forward, roll=-turned))
+        several = len(frames) > 1
+        joint = Joint(tuple(frames), self.options.own if several else (), self.drift)
+        return self.misfit.at(joint, joint.initial())
+
+    def _begin_frame(self, problem: Problem, forward: Forward, roll: float) -> Unknowns:
+        free = self.options.free
         start = problem.optical_start(tuple(n for n in free if n in problem.model.parameters))
         zero = torch.zeros(1, dtype=torch.float64)
         # The unknowns and their algebra stay on the CPU, wherever the model renders.
@@ -142,75 +201,70 @@ class _GaussNewton:
             {**{n: v.cpu() for n, v in start.items()}, "flux": zero, "background": zero},
             len(self.basis),
             len(self.amplitude_deviation),
+            list(self.options.planets),
+            roll,
+            not problem.observation.reference,
         )
-        point = self.forward.at(unknowns, unknowns.initial())
+        image = forward.at(unknowns, unknowns.initial()).image
         # Photon-noise weights before the star is known would trust the faint pixels only.
         flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
-        flux, level = problem.flux_and_background(point.image, flat, unknowns.linear)
+        flux, level = problem.flux_and_background(image, flat, unknowns.linear)
         unknowns.start["flux"] = torch.tensor([flux], dtype=torch.float64)
         unknowns.start["background"] = torch.tensor([level], dtype=torch.float64)
-        return unknowns, self.forward.at(unknowns, unknowns.initial())
+        return unknowns
 
-    # -- how far the model is from the data --------------------------------------------------
-
-    def sigma(self, point: Point, kappa: float) -> Tensor:
-        return torch.sqrt(self.problem.sigma**2 + (kappa * point.total) ** 2)
-
-    def whitened(self, point: Point, sigma: Tensor) -> Tensor:
-        residual = (self.problem.data - point.total) / sigma
-        return torch.where(self.problem.valid, residual, 0.0)
-
-    def chi2_per_pixel(self, point: Point) -> float:
-        """With the observation's own errors."""
-        return float((self.whitened(point, self.problem.sigma) ** 2).sum()) / self.problem.pixels
-
-    def model_error(self, point: Point) -> float:
-        """The share kappa of the star that brings chi2 per pixel to 1; 0 if it is there."""
-        valid = self.problem.valid
-        residual = (self.problem.data - point.total)[valid] ** 2
-        noise, star = self.problem.sigma[valid] ** 2, point.total[valid] ** 2
-        if float((residual / noise).mean()) <= 1:
-            return 0.0
-        low, high = 0.0, 10.0
-        for _ in range(50):
-            middle = (low + high) / 2
-            excess = float((residual / (noise + middle**2 * star)).mean()) > 1
-            low, high = (middle, high) if excess else (low, middle)
-        return high
-
-    def deviation(self, unknowns: Unknowns) -> Tensor:
+    def deviation(self, joint: Joint) -> Tensor:
         """Prior standard deviations of all unknowns."""
         wavefront = self.scales[self.group] * self.shape
-        return torch.cat([unknowns.prior_deviation(), self.amplitude_deviation, wavefront])
+        return torch.cat([joint.prior_deviation(), self.amplitude_deviation, wavefront])
 
-    def cost(self, point: Point, sigma: Tensor) -> float:
-        """Penalised chi2 (Cauchy's loss where robust), which every step must lower."""
-        squared = self.whitened(point, sigma) ** 2
-        if math.isfinite(self.options.robust):
-            limit = self.options.robust**2
-            squared = limit * torch.log1p(squared / limit)
-        unknowns = point.unknowns
-        away = (point.vector - unknowns.initial()) / self.deviation(unknowns)
-        return float(squared.sum() + (away**2).sum())
+    def cost(self, state: State, sigmas: Sequence[Tensor]) -> float:
+        """Penalised chi2, which every step must lower."""
+        away = (state.vector - state.joint.initial()) / self.deviation(state.joint)
+        return self.misfit.loss(state, sigmas) + float((away**2).sum())
 
     # -- steps -------------------------------------------------------------------------------
 
-    def linearised(self, point: Point, sigma: Tensor, with_modes: bool) -> _Linearised:
-        """Normal equations about a point, for the unknowns as distances from their starts."""
-        residual = self.whitened(point, sigma)
-        weight = torch.where(self.problem.valid, 1 / sigma, 0.0)
-        if math.isfinite(self.options.robust):
-            halving = torch.rsqrt(1 + (residual / self.options.robust) ** 2)
-            residual, weight = residual * halving, weight * halving
-        whitened = (self.forward.jacobian(point, with_modes) * weight).flatten(1).cpu()
-        current = (point.vector - point.unknowns.initial())[: len(whitened)]
-        curvature = _self_product(whitened)
-        gradient = whitened @ residual.flatten().cpu() + curvature @ current
-        return _Linearised(curvature, gradient, current)
+    def linearised(
+        self, state: State, kappa: float, with_modes: bool, keep: list[LinearFrame] | None = None
+    ) -> _Linearised:
+        """Normal equations about a state, for the unknowns as distances from their starts.
+
+        `keep` collects what a `LinearModel` needs of every frame.
+        """
+        joint = state.joint
+        size = joint.size if with_modes else joint.where("companions").stop
+        current = (state.vector - joint.initial())[:size]
+        curvature = torch.zeros(size, size, dtype=torch.float64)
+        gradient = torch.zeros(size, dtype=torch.float64)
+        for k, (forward, point) in enumerate(zip(self.misfit.forwards, state.points, strict=True)):
+            residual, weight = self.misfit.weighted(k, point, kappa)
+            rendered = forward.jacobian(point, with_modes)
+            modes = point.unknowns.where("modes").start
+            rows = joint.rows(k)[: len(rendered)]
+            drift = joint.drift_rows(k) if with_modes else torch.zeros(0, dtype=torch.int64)
+            if keep is not None:
+                left = torch.where(weight > 0, residual / weight.clamp(min=1e-300), 0.0)
+                keep.append(
+                    LinearFrame(
+                        left.cpu(), weight.cpu(), rendered.float().cpu(), rows, drift, modes
+                    )
+                )
+            whitened = rendered.mul_(weight).flatten(1).cpu()
+            product, pulled = _self_product(whitened), whitened @ residual.flatten().cpu()
+            if len(state.points) == 1:
+                curvature, gradient = product, pulled
+                continue
+            own = slice(modes, modes + len(drift))
+            for to, which in ((rows, slice(None)), (drift, own)):
+                gradient.index_add_(0, to, pulled[which])
+                for onto, other in ((rows, slice(None)), (drift, own)):
+                    curvature[to[:, None], onto] += product[which, other]
+        return _Linearised(curvature, gradient + curvature @ current, current)
 
     def solve(
         self,
-        unknowns: Unknowns,
+        joint: Joint,
         equations: _Linearised,
         *,
         damping: float = 0.0,
@@ -219,9 +273,9 @@ class _GaussNewton:
     ) -> EvidenceUpdate:
         """Most probable unknowns, as distances from their starts, for the linearised model."""
         curvature = equations.curvature
-        before = unknowns.where("modes").start
-        with_modes = len(curvature) > unknowns.where("companions").stop
-        fixed = unknowns.prior_deviation()
+        before = joint.where("modes").start
+        with_modes = len(curvature) > joint.where("companions").stop
+        fixed = joint.prior_deviation()
         if with_modes:
             fixed = torch.cat([fixed, self.amplitude_deviation])
         # Columns differ by many powers of ten (flux against nm): solve in their own units.
@@ -243,31 +297,38 @@ class _GaussNewton:
         )
         return update.in_units(own)
 
-    def descend(self, point: Point, sigma: Tensor, with_modes: bool) -> tuple[Point, float]:
-        """One damped step; returns the new point and by how much chi2 per pixel fell."""
-        unknowns = point.unknowns
-        equations = self.linearised(point, sigma, with_modes)
-        fit_scales = with_modes and self.options.prior.fit_scales
-        if fit_scales:
-            self.scales = self.solve(unknowns, equations, fit_scales=True).scales
-        before = self.cost(point, sigma)
+    def descend(self, state: State, kappa: float, with_modes: bool) -> tuple[State, float]:
+        """One damped step; returns the new state and by how much chi2 per pixel fell."""
+        joint = state.joint
+        equations = self.linearised(state, kappa, with_modes)
+        sigmas = [self.misfit.sigma(k, point, kappa) for k, point in enumerate(state.points)]
+        update = None
+        if with_modes and self.fits_scales:
+            update = self.solve(joint, equations, fit_scales=True)
+            self.scales = update.scales
+        before = self.cost(state, sigmas)
         for _ in range(_TRIES):
-            update = self.solve(unknowns, equations, damping=self.damping)
-            vector = point.vector.clone()
+            # The solution with the scales' last values is the undamped step already.
+            if update is None or self.damping:
+                update = self.solve(joint, equations, damping=self.damping)
+            vector = state.vector.clone()
             vector[: len(update.step)] += update.step - equations.current
-            trial = self.forward.at(unknowns, unknowns.clamped(vector))
-            after = self.cost(trial, sigma)
+            trial = self.misfit.at(joint, joint.clamped(vector))
+            after = self.cost(trial, sigmas)
             if after < before:
-                self._relax(
-                    (before - after) / self.predicted_gain(unknowns, equations, update.step)
-                )
-                return trial, (before - after) / self.problem.pixels
+                self._relax((before - after) / self.predicted_gain(joint, equations, update.step))
+                return trial, (before - after) / self.misfit.pixels
             self.damping = max(6 * self.damping, 0.05)
-        return point, 0.0
+        return state, 0.0
 
-    def predicted_gain(self, unknowns: Unknowns, equations: _Linearised, step: Tensor) -> float:
+    @property
+    def fits_scales(self) -> bool:
+        """Whether the prior's scales are free."""
+        return self.options.prior.fit_scales
+
+    def predicted_gain(self, joint: Joint, equations: _Linearised, step: Tensor) -> float:
         """By how much the penalised chi2 would fall if the model were linear."""
-        precision = self.deviation(unknowns)[: len(step)] ** -2
+        precision = self.deviation(joint)[: len(step)] ** -2
         curvature, current = equations.curvature, equations.current
 
         def quadratic(x: Tensor) -> float:
@@ -282,40 +343,48 @@ class _GaussNewton:
         elif ratio < 0.3:
             self.damping = max(2.5 * self.damping, 0.05)
 
-    def add_companions(self, point: Point, kappa: float) -> Point:
-        """Give companions that stand out parameters of their own."""
-        unknowns = point.unknowns
-        sigma = self.sigma(point, kappa)
-        residual = torch.where(self.problem.valid, self.problem.data - point.total, 0.0)
+    def add_companions(self, state: State, kappa: float) -> State:
+        """Give companions that stand out of the first science frame parameters of their own."""
+        joint = state.joint
+        shown = [u.shows_companions for u in joint.frames]
+        if True not in shown:
+            return state
+        k = shown.index(True)
+        point, forward = state.points[k], self.misfit.forwards[k]
+        problem = forward.problem
+        sigma = self.misfit.sigma(k, point, kappa)
+        residual = torch.where(problem.valid, problem.data - point.total, 0.0)
         found = bright_companions(
-            self.forward.coarse,
-            self.forward.coarse_opd(point),
-            unknowns.values(point.vector),
+            forward.coarse,
+            forward.coarse_opd(point),
+            point.unknowns.values(point.vector),
             residual.cpu().numpy(),
-            torch.where(self.problem.valid, sigma, math.inf).cpu().numpy(),
-            unknowns.level("flux", point.vector),
-            most=self.options.companions - len(unknowns.companions),
+            torch.where(problem.valid, sigma, math.inf).cpu().numpy(),
+            point.unknowns.level("flux", point.vector),
+            most=self.options.companions - len(point.unknowns.companions),
             threshold=self.options.companion_threshold,
         )
         if not found:
-            return point
+            return state
         _log.info("companions given parameters of their own: %s", found)
-        return self.forward.at(*unknowns.with_companions(found, point.vector))
+        turn = joint.frames[k].roll
+        there = [Planet(p.contrast, p.separation, p.position_angle - turn) for p in found]
+        return self.misfit.at(*joint.with_companions(there, state.vector))
 
-    def run(self, seed: int) -> Refinement:
+    def run(self, seed: int) -> list[Refinement]:
         """Anneal kappa; fit alignment, then alignment and wavefront; return the best iterate."""
         began = time.perf_counter()
-        options, point = self.options, self.point
-        kappa = max(self.model_error(point), options.kappa_floor)
-        best, best_error = point, (math.inf, math.inf)
+        options, state = self.options, self.state
+        kappa = max(self.misfit.model_error(state), options.kappa_floor)
+        best, best_error = state, (math.inf, math.inf)
         status = Status.ITERATION_LIMIT
         with_modes = not options.free
         bar = tqdm(total=options.max_iterations, desc="refine", disable=not self.progress)
         for iteration in range(options.max_iterations):
-            point, gain = self.descend(point, self.sigma(point, kappa), with_modes)
-            needed, chi2 = self.model_error(point), self.chi2_per_pixel(point)
+            state, gain = self.descend(state, kappa, with_modes)
+            needed, chi2 = self.misfit.model_error(state), self.misfit.chi2_per_pixel(state)
             if (needed, chi2) < best_error:
-                best, best_error = point, (needed, chi2)
+                best, best_error = state, (needed, chi2)
             record = {
                 "iteration": iteration,
                 "wavefront": with_modes,
@@ -332,13 +401,14 @@ class _GaussNewton:
             settled = gain < options.tolerance
             if not with_modes:
                 kappa = max(options.kappa_floor, min(kappa, needed))
-                if gain < 0.05 and len(point.unknowns.companions) < options.companions:
-                    known = len(point.unknowns.companions)
-                    point = self.add_companions(point, kappa)
-                    if len(point.unknowns.companions) > known:
+                known = len(state.joint.frames[0].companions)
+                if gain < 0.05 and known < options.companions:
+                    state = self.add_companions(state, kappa)
+                    if len(state.joint.frames[0].companions) > known:
                         continue
                 if gain < 0.05 and options.wavefront:
-                    with_modes = True
+                    # What the alignment alone could not follow says nothing about these steps.
+                    with_modes, self.damping = True, 0.0
                 elif settled:
                     status = self.status_of(chi2)
                     break
@@ -350,58 +420,72 @@ class _GaussNewton:
             if kappa < max(_NEGLIGIBLE, options.kappa_floor):
                 kappa = options.kappa_floor
         bar.close()
-        if best.unknowns.level("flux", best.vector) <= 0:
+        if best.flux <= 0:
             status = Status.DIVERGED
-        return self.result(best, status, began, seed)
+        return self.results(best, status, began, seed)
 
     def status_of(self, chi2: float) -> Status:
         """How a fit that has settled ended."""
         return Status.CONVERGED if chi2 < _EXPLAINED else Status.MODEL_MISMATCH
 
-    def result(self, point: Point, status: Status, began: float, seed: int) -> Refinement:
+    def results(self, state: State, status: Status, began: float, seed: int) -> list[Refinement]:
         """Errors at the end, and everything in the form that users see."""
-        chi2 = self.chi2_per_pixel(point)
-        kappa = 0.0 if chi2 < _EXPLAINED else self.model_error(point)
-        sigma = self.sigma(point, kappa)
-        unknowns = point.unknowns
-        equations = self.linearised(point, sigma, self.options.wavefront)
-        update = self.solve(unknowns, equations, covariance=True)
+        joint, chi2 = state.joint, self.misfit.chi2_per_pixel(state)
+        kappa = 0.0 if chi2 < _EXPLAINED else self.misfit.model_error(state)
+        frames: list[LinearFrame] = []
+        equations = self.linearised(state, kappa, self.options.wavefront, keep=frames)
+        update = self.solve(joint, equations, covariance=True)
         assert update.covariance is not None
         deviation = torch.sqrt(update.covariance.diagonal())
-        values = {n: v.cpu().numpy() for n, v in unknowns.values(point.vector).items()}
-        for name in ("flux", "background"):
-            values[name] = np.array([unknowns.level(name, point.vector)])
-        errors = {name: np.full(len(value), np.nan) for name, value in values.items()}
-        for name in unknowns.ordered:
-            errors[name] = deviation[unknowns.where(name)].numpy()
-        return Refinement(
-            model=self.problem.model,
-            observation=self.problem.observation,
-            initial=self.problem.initial,
-            opd=self.forward.opd(unknowns, point.vector).cpu().numpy(),
-            star_image=point.star.cpu().numpy(),
-            values=values,
-            errors=errors,
-            status=status,
-            method="gauss-newton",
-            chi2_per_pixel=chi2,
-            model_error=kappa,
-            history=self.history,
-            seconds=time.perf_counter() - began,
-            seed=seed,
-            companions=unknowns.sources(point.vector).numpy(),
-            companion_errors=deviation[unknowns.where("companions")].reshape(-1, 3).numpy(),
-            companion_image=(point.total - point.star).cpu().numpy(),
-            scales=dict(zip(self.basis.groups, self.scales.tolist(), strict=True)),
-            effective_parameters=update.effective,
-            coefficients=point.vector[unknowns.where("modes")],
-            covariance=update.covariance,
-            response=self.forward.jacobian(point, self.options.wavefront),
+        count = len(deviation)
+        linear = LinearModel(
+            names=joint.names()[:count],
+            frames=tuple(frames),
+            vector=state.vector[:count],
+            mean=joint.initial()[:count],
+            deviation=self.deviation(joint)[:count],
+            curvature=equations.curvature,
         )
+        found = []
+        for k, (forward, point) in enumerate(zip(self.misfit.forwards, state.points, strict=True)):
+            unknowns, own = point.unknowns, deviation[joint.rows(k)[: len(frames[k].rows)]]
+            values = {n: v.cpu().numpy() for n, v in unknowns.values(point.vector).items()}
+            for name in ("flux", "background"):
+                values[name] = np.array([unknowns.level(name, point.vector)])
+            errors = {name: np.full(len(value), np.nan) for name, value in values.items()}
+            for name in unknowns.ordered:
+                errors[name] = own[unknowns.where(name)].numpy()
+            refinement = Refinement(
+                model=forward.problem.model,
+                observation=forward.problem.observation,
+                initial=forward.problem.initial,
+                opd=forward.opd(unknowns, point.vector).cpu().numpy(),
+                star_image=point.star.cpu().numpy(),
+                values=values,
+                errors=errors,
+                status=status,
+                method="gauss-newton",
+                chi2_per_pixel=chi2,
+                model_error=kappa,
+                history=self.history,
+                seconds=time.perf_counter() - began,
+                seed=seed,
+                companions=unknowns.sources(point.vector).numpy(),
+                companion_errors=own[unknowns.where("companions")].reshape(-1, 3).numpy(),
+                companion_image=(point.total - point.star).cpu().numpy(),
+                scales=dict(zip(self.scale_names, self.scales.tolist(), strict=True)),
+                effective_parameters=update.effective,
+                log_evidence=update.log_evidence,
+                coefficients=point.vector[unknowns.where("modes")],
+                linear=linear,
+                frame=k,
+            )
+            found.append(refinement)
+        return found
 
 
 def gauss_newton(
-    problem: Problem, options: GaussNewtonOptions, *, seed: int, progress: bool
-) -> Refinement:
+    problems: Sequence[Problem], options: GaussNewtonOptions, *, seed: int, progress: bool
+) -> list[Refinement]:
     """Refine by damped Gauss-Newton; see the module's text and `GaussNewtonOptions`."""
-    return _GaussNewton(problem, options, progress).run(seed)
+    return _GaussNewton(problems, options, progress).run(seed)

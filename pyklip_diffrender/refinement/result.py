@@ -13,6 +13,7 @@ from astropy.table import QTable, Table
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pyklip_diffrender.linear_model import LinearModel
 from pyklip_diffrender.observation import Observation
 from pyklip_diffrender.opd import OPDMap
 from pyklip_diffrender.optics import OpticalSystem
@@ -81,10 +82,15 @@ class Refinement:
         Prior scales at the end, nm.
     effective_parameters : float
         Number of wavefront parameters that the data determine.
-    coefficients, covariance, response
-        What the marginalised detection needs (None for methods without them): basis
-        coefficients in nm, covariance of all parameters, Jacobian (parameters, ny, nx) in the
-        observation's unit, other parameters before the modes.
+    log_evidence : float
+        Of the linearised model, up to a constant of the data: differences compare priors.
+    coefficients : Tensor or None
+        Of the basis, nm.
+    linear : LinearModel or None
+        All unknowns' effect on all pixels, for detection (None for methods without one). Frames
+        that were refined together share it.
+    frame : int
+        Which of its frames this is.
     """
 
     model: OpticalSystem
@@ -106,9 +112,10 @@ class Refinement:
     companion_image: NDArray[np.float64] | float = 0.0
     scales: dict[str, float] = field(default_factory=dict)
     effective_parameters: float = float("nan")
+    log_evidence: float = float("nan")
     coefficients: Tensor | None = None
-    covariance: Tensor | None = None
-    response: Tensor | None = None
+    linear: LinearModel | None = None
+    frame: int = 0
 
     def __repr__(self) -> str:
         return (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -39,6 +40,10 @@ class Unknowns:
         Amplitude modes of the pupil.
     companions : list of Planet
         Where companions start.
+    roll : float
+        Degrees by which the sky is turned, counter-clockwise, relative to the first frame.
+    shows_companions : bool
+        False for a reference star.
     """
 
     names: tuple[str, ...]
@@ -46,6 +51,8 @@ class Unknowns:
     modes: int
     amplitude_modes: int = 0
     companions: list[Planet] = field(default_factory=list)
+    roll: float = 0.0
+    shows_companions: bool = True
 
     @property
     def optical(self) -> tuple[str, ...]:
@@ -102,8 +109,14 @@ class Unknowns:
         return float(value[0])
 
     def sources(self, vector: Tensor) -> Tensor:
-        """Companions, (companions, 3)."""
+        """Companions, (companions, 3), as the first frame has them."""
         return vector[self.where("companions")].reshape(-1, 3)
+
+    @property
+    def turn(self) -> Tensor:
+        """Matrix from positions in the first frame to positions in this one, (2, 2)."""
+        cosine, sine = math.cos(math.radians(self.roll)), math.sin(math.radians(self.roll))
+        return torch.tensor([[cosine, -sine], [sine, cosine]], dtype=torch.float64)
 
     def prior_deviation(self) -> Tensor:
         """Prior deviations of everything before the amplitude and the modes."""
@@ -114,19 +127,6 @@ class Unknowns:
         planets = torch.tensor(COMPANION_PRIOR, dtype=torch.float64).repeat(len(self.companions))
         return torch.cat([*named, planets])
 
-    def clamped(self, vector: Tensor) -> Tensor:
-        """The vector with every parameter inside its bounds."""
-        vector = vector.clone()
-        for name in self.ordered:
-            entry = parameter(name)
-            vector[self.where(name)] = vector[self.where(name)].clamp(entry.lower, entry.upper)
-        return vector
-
-    def with_companions(self, found: Sequence[Planet], vector: Tensor) -> tuple[Unknowns, Tensor]:
-        """A layout with more companions, and the same point in it."""
-        grown = replace(self, companions=[*self.companions, *found])
-        moved = grown.initial()
-        before, after = self.where("companions").stop, grown.where("companions").stop
-        moved[:before] = vector[:before]
-        moved[after:] = vector[before:]
-        return grown, moved
+    def with_companions(self, found: Sequence[Planet]) -> Unknowns:
+        """A layout with more companions."""
+        return replace(self, companions=[*self.companions, *found])

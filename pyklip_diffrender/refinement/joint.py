@@ -1,0 +1,148 @@
+"""The unknowns of several frames in one vector: which are shared, which every frame has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.parameters import parameter
+from pyklip_diffrender.refinement.unknowns import Unknowns
+from pyklip_diffrender.scene import Planet
+
+__all__ = ["Joint"]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Layout of the joint vector.
+
+    First what each frame has of its own, frame by frame; then what all share, in the order of
+    `Unknowns`, wavefront modes last; then how each frame's first modes differ from those.
+
+    Attributes
+    ----------
+    frames : tuple of Unknowns
+        Alike but for where they start.
+    own : tuple of str
+        Names of which every frame has its own value.
+    drift : int
+        How many modes, the first of the basis, may differ between frames.
+    """
+
+    frames: tuple[Unknowns, ...]
+    own: tuple[str, ...] = ()
+    drift: int = 0
+
+    @property
+    def _own(self) -> tuple[str, ...]:
+        return tuple(name for name in self.frames[0].ordered if name in self.own)
+
+    @property
+    def _shared(self) -> tuple[str, ...]:
+        named = tuple(name for name in self.frames[0].ordered if name not in self.own)
+        return (*named, "companions", "amplitude", "modes")
+
+    def _size(self, name: str) -> int:
+        where = self.frames[0].where(name)
+        return where.stop - where.start
+
+    def _begin(self, name: str) -> int:
+        """Place of a shared entry."""
+        begin = len(self.frames) * sum(self._size(own) for own in self._own)
+        for each in self._shared:
+            if each == name:
+                return begin
+            begin += self._size(each)
+        raise KeyError(name)
+
+    def where(self, name: str) -> slice:
+        """Place of what is shared under a name, or of "drift"."""
+        if name == "drift":
+            begin = self._begin("modes") + self._size("modes")
+            return slice(begin, begin + len(self.frames) * self.drift)
+        begin = self._begin(name)
+        return slice(begin, begin + self._size(name))
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.where("drift").stop
+
+    def rows(self, frame: int) -> Tensor:
+        """For every entry of a frame's vector its place in the joint one, (entries,), int64."""
+        unknowns = self.frames[frame]
+        rows = torch.empty(unknowns.where("modes").stop, dtype=torch.int64)
+        begin = frame * sum(self._size(own) for own in self._own)
+        for name in self._own:
+            rows[unknowns.where(name)] = torch.arange(begin, begin + self._size(name))
+            begin += self._size(name)
+        for name in self._shared:
+            there = self.where(name)
+            rows[unknowns.where(name)] = torch.arange(there.start, there.stop)
+        return rows
+
+    def drift_rows(self, frame: int) -> Tensor:
+        """Places of a frame's own part of its first modes, (drift,), int64."""
+        begin = self.where("drift").start + frame * self.drift
+        return torch.arange(begin, begin + self.drift)
+
+    def of_frame(self, frame: int, vector: Tensor) -> Tensor:
+        """A frame's vector from the joint one."""
+        values = vector[self.rows(frame)]
+        first = self.frames[frame].where("modes").start
+        values[first : first + self.drift] += vector[self.drift_rows(frame)]
+        return values
+
+    def joined(self, vectors: Sequence[Tensor]) -> Tensor:
+        """The joint vector of frames that agree on what they share (the first one decides)."""
+        joint = torch.zeros(self.size, dtype=torch.float64)
+        for frame in reversed(range(len(self.frames))):
+            joint[self.rows(frame)] = vectors[frame]
+        return joint
+
+    def initial(self) -> Tensor:
+        """The starting vector: the mean of the prior."""
+        return self.joined([unknowns.initial() for unknowns in self.frames])
+
+    def prior_deviation(self) -> Tensor:
+        """Prior deviations of everything before the amplitude and the modes."""
+        every = self.frames[0].prior_deviation()
+        joint = torch.empty(self.where("amplitude").start, dtype=torch.float64)
+        for frame in range(len(self.frames)):
+            joint[self.rows(frame)[: len(every)]] = every
+        return joint
+
+    def clamped(self, vector: Tensor) -> Tensor:
+        """The vector with every parameter inside its bounds."""
+        vector = vector.clone()
+        for frame, unknowns in enumerate(self.frames):
+            rows = self.rows(frame)
+            for name in unknowns.ordered:
+                entry, places = parameter(name), rows[unknowns.where(name)]
+                vector[places] = vector[places].clamp(entry.lower, entry.upper)
+        return vector
+
+    def with_companions(self, found: Sequence[Planet], vector: Tensor) -> tuple[Joint, Tensor]:
+        """A layout with more companions, and the same point in it."""
+        grown = replace(self, frames=tuple(u.with_companions(found) for u in self.frames))
+        moved = grown.initial()
+        before, after = self.where("companions").stop, grown.where("companions").stop
+        moved[:before] = vector[:before]
+        moved[after:] = vector[before:]
+        return grown, moved
+
+    def names(self) -> tuple[str, ...]:
+        """Of all unknowns, in order."""
+        labels = [""] * self.size
+        for frame, unknowns in reversed(list(enumerate(self.frames))):
+            rows = self.rows(frame)
+            for name in (*unknowns.ordered, "companions", "amplitude", "modes"):
+                suffix = f" of frame {frame}" if name in self.own else ""
+                for k, place in enumerate(rows[unknowns.where(name)].tolist()):
+                    labels[place] = f"{name}[{k}]{suffix}"
+            for k, place in enumerate(self.drift_rows(frame).tolist()):
+                labels[place] = f"drift[{k}] of frame {frame}"
+        return tuple(labels)

@@ -1,0 +1,118 @@
+"""Points of a fit to one or several frames, and how far they are from the data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.refinement.forward import Forward, Point
+from pyklip_diffrender.refinement.joint import Joint
+
+__all__ = ["Misfit", "State"]
+
+
+@dataclass(frozen=True)
+class State:
+    """Unknowns of all frames and what each frame renders.
+
+    Attributes
+    ----------
+    joint : Joint
+    vector : Tensor, (joint unknowns,)
+    points : tuple of Point
+        One a frame.
+    """
+
+    joint: Joint
+    vector: Tensor
+    points: tuple[Point, ...]
+
+    @property
+    def flux(self) -> float:
+        """Of the star in the first frame."""
+        return self.points[0].unknowns.level("flux", self.points[0].vector)
+
+
+class Misfit:
+    """Compares states with the data of all frames.
+
+    Parameters
+    ----------
+    forwards : sequence of Forward
+        One a frame.
+    robust : float
+        Residuals of this many sigma count half (Cauchy's weights); inf for least squares.
+    """
+
+    def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
+        self.forwards = tuple(forwards)
+        self.robust = robust
+        self.pixels = sum(forward.problem.pixels for forward in self.forwards)
+
+    def at(self, joint: Joint, vector: Tensor) -> State:
+        """Render all frames."""
+        points = tuple(
+            forward.at(unknowns, joint.of_frame(k, vector))
+            for k, (forward, unknowns) in enumerate(zip(self.forwards, joint.frames, strict=True))
+        )
+        return State(joint, vector, points)
+
+    def sigma(self, frame: int, point: Point, kappa: float) -> Tensor:
+        """Noise and, in quadrature, the share of the star that the model may miss."""
+        return torch.sqrt(self.forwards[frame].problem.sigma ** 2 + (kappa * point.total) ** 2)
+
+    def whitened(self, frame: int, point: Point, sigma: Tensor) -> Tensor:
+        """Residual over `sigma`; 0 where masked."""
+        problem = self.forwards[frame].problem
+        return torch.where(problem.valid, (problem.data - point.total) / sigma, 0.0)
+
+    def weighted(self, frame: int, point: Point, kappa: float) -> tuple[Tensor, Tensor]:
+        """Residual and weight of every pixel, whitened and made robust; 0 where masked."""
+        sigma = self.sigma(frame, point, kappa)
+        residual = self.whitened(frame, point, sigma)
+        weight = torch.where(self.forwards[frame].problem.valid, 1 / sigma, 0.0)
+        if math.isfinite(self.robust):
+            halving = torch.rsqrt(1 + (residual / self.robust) ** 2)
+            residual, weight = residual * halving, weight * halving
+        return residual, weight
+
+    def chi2_per_pixel(self, state: State) -> float:
+        """With the observation's own errors."""
+        total = sum(
+            float((self.whitened(k, point, self.forwards[k].problem.sigma) ** 2).sum())
+            for k, point in enumerate(state.points)
+        )
+        return total / self.pixels
+
+    def model_error(self, state: State) -> float:
+        """The share kappa of the star that brings chi2 per pixel to 1; 0 if it is there."""
+        residuals, noises, stars = [], [], []
+        for forward, point in zip(self.forwards, state.points, strict=True):
+            valid = forward.problem.valid
+            residuals.append((forward.problem.data - point.total)[valid] ** 2)
+            noises.append(forward.problem.sigma[valid] ** 2)
+            stars.append(point.total[valid] ** 2)
+        residual, noise, star = torch.cat(residuals), torch.cat(noises), torch.cat(stars)
+        if float((residual / noise).mean()) <= 1:
+            return 0.0
+        low, high = 0.0, 10.0
+        for _ in range(50):
+            middle = (low + high) / 2
+            excess = float((residual / (noise + middle**2 * star)).mean()) > 1
+            low, high = (middle, high) if excess else (low, middle)
+        return high
+
+    def loss(self, state: State, sigmas: Sequence[Tensor]) -> float:
+        """Chi2 of all frames for given deviations (Cauchy's loss where robust)."""
+        total = 0.0
+        for k, (point, sigma) in enumerate(zip(state.points, sigmas, strict=True)):
+            squared = self.whitened(k, point, sigma) ** 2
+            if math.isfinite(self.robust):
+                limit = self.robust**2
+                squared = limit * torch.log1p(squared / limit)
+            total += float(squared.sum())
+        return total
