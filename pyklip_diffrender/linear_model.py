@@ -15,19 +15,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from astropy.io import fits
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import CorruptFileError, ShapeError
 from pyklip_diffrender.files import open_fits, write_fits
 from pyklip_diffrender.units import native_float64
 
-__all__ = ["LinearFrame", "LinearModel"]
+__all__ = ["LinearFrame", "LinearModel", "Weighed"]
 
 _BATCH = 512
 
@@ -72,6 +74,24 @@ class LinearFrame:
         rows = values[self.rows]
         rows[self.modes : self.modes + len(self.drift)] += values[self.drift]
         return rows
+
+
+class Weighed(NamedTuple):
+    """Inner products of templates p, (k,) each.
+
+    Attributes
+    ----------
+    numerator : Tensor
+        p . Sigma^-1 r.
+    information : Tensor
+        p . Sigma^-1 p.
+    photon : Tensor
+        p . p, whitened: the information if everything but the template's amplitude were known.
+    """
+
+    numerator: Tensor
+    information: Tensor
+    photon: Tensor
 
 
 @dataclass(frozen=True)
@@ -170,7 +190,7 @@ class LinearModel:
             self._factor, total * self._scale[:, None], upper=False
         )
 
-    def weigh(self, templates: Mapping[int, Tensor]) -> tuple[Tensor, Tensor]:
+    def weigh(self, templates: Mapping[int, Tensor]) -> Weighed:
         """Amplitudes of templates, one at a time, with all unknowns integrated out.
 
         Parameters
@@ -180,24 +200,42 @@ class LinearModel:
 
         Returns
         -------
-        numerator, information : Tensor, (k,)
-            p . Sigma^-1 r and p . Sigma^-1 p: the amplitude is their ratio, its standard
-            deviation 1 / sqrt(information).
+        Weighed
+            The amplitude is numerator / information, its standard deviation
+            1 / sqrt(information), or 1 / sqrt(photon) if all unknowns were known.
         """
-        numerators, informations = [], []
+        parts = []
         total = len(next(iter(templates.values())))
         for start in range(0, total, _BATCH):
             part = {k: images[start : start + _BATCH] for k, images in templates.items()}
-            known = (self.projected(part) ** 2).sum(dim=0)
-            numerator = torch.zeros(len(known), dtype=torch.float64)
-            information = -known
+            imitated = (self.projected(part) ** 2).sum(dim=0)
+            numerator, photon = torch.zeros_like(imitated), torch.zeros_like(imitated)
             for k, images in part.items():
-                whitened = images * self.frames[k].weight.to(images.dtype)
-                numerator += torch.tensordot(whitened.double(), self.cleaned[k], dims=2)
-                information += (whitened.double() ** 2).sum(dim=(1, 2))
-            numerators.append(numerator)
-            informations.append(information)
-        return torch.cat(numerators), torch.cat(informations)
+                whitened = (images * self.frames[k].weight.to(images.dtype)).double()
+                numerator += torch.tensordot(whitened, self.cleaned[k], dims=2)
+                photon += (whitened**2).sum(dim=(1, 2))
+            parts.append(Weighed(numerator, photon - imitated, photon))
+        return Weighed(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+    def clean(self, templates: Mapping[int, Tensor]) -> dict[int, Tensor]:
+        """Sigma^-1 p, whitened, of templates (k, ny, nx) by frame; for every frame of the model.
+
+        What of the templates the unknowns cannot imitate.
+        """
+        solved = torch.linalg.solve_triangular(
+            self._factor.T, self.projected(templates), upper=True
+        )
+        solved = solved * self._scale[:, None]
+        found = {}
+        for k, frame in enumerate(self.frames):
+            explained = torch.tensordot(
+                frame.of_unknowns(solved).float(), frame.jacobian, dims=([0], [0])
+            )
+            left = -explained.double()
+            if k in templates:
+                left += templates[k].double()
+            found[k] = frame.weight * left
+        return found
 
     def normal_equations(self, templates: Mapping[int, Tensor]) -> tuple[Tensor, Tensor]:
         """p_i . Sigma^-1 p_j and p_i . Sigma^-1 r for a few templates fitted together."""
@@ -209,6 +247,43 @@ class LinearModel:
             matrix += whitened @ whitened.T
             vector += whitened @ self.cleaned[k].flatten()
         return matrix, vector
+
+    def without(self, name: str, light: Mapping[int, Tensor | NDArray[np.float64] | float]) -> LinearModel:
+        """The model with some unknowns gone and their light back in the data.
+
+        Parameters
+        ----------
+        name : str
+            Of the unknowns, up to the bracket.
+        light : mapping of int to array, (ny, nx)
+            What those unknowns render in each frame.
+        """
+        keeps = torch.tensor([not label.startswith(f"{name}[") for label in self.names])
+        place = torch.cumsum(keeps, 0) - 1
+        frames = []
+        for k, frame in enumerate(self.frames):
+            rows = keeps[frame.rows]
+            counts = frame.weight > 0
+            back = torch.as_tensor(light.get(k, 0.0), dtype=torch.float64)
+            frames.append(
+                replace(
+                    frame,
+                    residual=torch.where(counts, frame.residual + back, 0.0),
+                    jacobian=frame.jacobian[rows],
+                    rows=place[frame.rows[rows]],
+                    drift=place[frame.drift],
+                    modes=frame.modes - int((~rows[: frame.modes]).sum()),
+                )
+            )
+        kept = torch.nonzero(keeps).flatten()
+        return LinearModel(
+            tuple(self.names[k] for k in kept.tolist()),
+            tuple(frames),
+            self.vector[kept],
+            self.mean[kept],
+            self.deviation[kept],
+            self.curvature[kept][:, kept],
+        )
 
     def left_out(self, size: int = 5, frame: int = 0) -> tuple[Tensor, Tensor]:
         """Residual of every patch of pixels as predicted from all pixels but its own.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, overload
 
 import numpy as np
@@ -30,6 +30,7 @@ __all__ = [
     "Refinement",
     "Status",
     "refine",
+    "refine_again",
 ]
 
 METHODS = {
@@ -157,6 +158,33 @@ def refine(
     if isinstance(chosen, AdamOptions):
         return adam(problems[0], chosen, seed=seed, progress=progress)
     return lbfgs(problems[0], chosen, seed=seed, progress=progress)
+
+
+def refine_again(
+    fits: Sequence[Refinement], *, progress: bool = False, **changes: Any
+) -> list[Refinement]:
+    """Go on from frames that were refined together, with other settings.
+
+    Parameters
+    ----------
+    fits : sequence of Refinement
+        All that one call of `refine` gave, in order.
+    progress : bool
+    **changes
+        Fields of `GaussNewtonOptions`, such as `planets`.
+
+    Returns
+    -------
+    list of Refinement
+    """
+    first = fits[0]
+    if first.linear is None or not isinstance(first.settings, GaussNewtonOptions):
+        raise IncompatibleSetupError("refine_again: only fits by Gauss-Newton can be gone on with")
+    groups = first.settings.prior.scales
+    prior = replace(first.settings.prior, scales={name: first.scales[name] for name in groups})
+    settings = replace(first.settings, **{"prior": prior, "resume": first.linear.vector, **changes})
+    problems = [Problem(f.model, f.observation, f.initial, f.start) for f in fits]
+    return gauss_newton(problems, settings, seed=first.seed, progress=progress)
 
 
 def _one_by_one(

@@ -75,6 +75,9 @@ class GaussNewtonOptions:
         Highest spatial frequency of such differences.
     planets : tuple of Planet
         Companions with parameters of their own from the start; positions relative to the star.
+    resume : Tensor, optional
+        The `vector` of an earlier fit's linear model, to go on from; its companions are not
+        taken over.
     companions : int
         Most companions that may get parameters of their own, if they stand out of what the
         alignment fit leaves.
@@ -102,6 +105,7 @@ class GaussNewtonOptions:
     drift: WavefrontPrior | None = None
     drift_cycles: float = 8.0
     planets: tuple[Planet, ...] = ()
+    resume: Tensor | None = None
     companions: int = 0
     companion_threshold: float = 4.0
     response_npix: int = 128
@@ -189,7 +193,10 @@ class _GaussNewton:
             frames.append(self._begin_frame(problem, forward, roll=-turned))
         several = len(frames) > 1
         joint = Joint(tuple(frames), self.options.own if several else (), self.drift)
-        return self.misfit.at(joint, joint.initial())
+        vector = joint.initial()
+        if self.options.resume is not None:
+            vector = joint.resumed(self.options.resume)
+        return self.misfit.at(joint, vector)
 
     def _begin_frame(self, problem: Problem, forward: Forward, roll: float) -> Unknowns:
         free = self.options.free
@@ -378,7 +385,7 @@ class _GaussNewton:
         kappa = max(self.misfit.model_error(state), options.kappa_floor)
         best, best_error = state, (math.inf, math.inf)
         status = Status.ITERATION_LIMIT
-        with_modes = not options.free
+        with_modes = options.wavefront and (not options.free or options.resume is not None)
         bar = tqdm(total=options.max_iterations, desc="refine", disable=not self.progress)
         for iteration in range(options.max_iterations):
             state, gain = self.descend(state, kappa, with_modes)
@@ -479,6 +486,8 @@ class _GaussNewton:
                 coefficients=point.vector[unknowns.where("modes")],
                 linear=linear,
                 frame=k,
+                settings=self.options,
+                start=forward.problem.start,
             )
             found.append(refinement)
         return found

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement.unknowns import Unknowns
 from pyklip_diffrender.scene import Planet
@@ -106,6 +107,26 @@ class Joint:
     def initial(self) -> Tensor:
         """The starting vector: the mean of the prior."""
         return self.joined([unknowns.initial() for unknowns in self.frames])
+
+    def resumed(self, vector: Tensor) -> Tensor:
+        """An earlier vector of the same layout but for its companions, with the present ones.
+
+        Raises
+        ------
+        ShapeError
+            If its length does not fit.
+        """
+        joint, companions = self.initial(), self.where("companions")
+        after = self.size - companions.stop
+        extra = len(vector) - companions.start - after
+        if extra < 0 or extra % 3:
+            raise ShapeError(
+                f"resume: got {len(vector)} unknowns, expected {companions.start + after} and "
+                "three a companion. The basis, the free parameters and the frames must be the same"
+            )
+        joint[: companions.start] = vector[: companions.start]
+        joint[companions.stop :] = vector[len(vector) - after :]
+        return joint
 
     def prior_deviation(self) -> Tensor:
         """Prior deviations of everything before the amplitude and the modes."""

@@ -91,6 +91,10 @@ class Refinement:
         that were refined together share it.
     frame : int
         Which of its frames this is.
+    settings : GaussNewtonOptions, AdamOptions or LBFGSOptions
+        How it was made.
+    start : dict
+        Starting values that were given.
     """
 
     model: OpticalSystem
@@ -116,6 +120,8 @@ class Refinement:
     coefficients: Tensor | None = None
     linear: LinearModel | None = None
     frame: int = 0
+    settings: Any = None
+    start: dict[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return (

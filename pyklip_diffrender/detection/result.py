@@ -1,0 +1,213 @@
+"""What a detection gives back: maps, candidates, contrast curve, and how they are written."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import QTable
+from numpy.typing import ArrayLike, NDArray
+
+from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.files import replacing, write_fits
+from pyklip_diffrender.linear_model import LinearModel
+from pyklip_diffrender.refinement import Refinement
+
+__all__ = ["Detection"]
+
+Image = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Detection:
+    """Where there may be planets, how bright they are, and how bright they would have to be.
+
+    Everything is for point sources with wavefront, alignment, flux and background of the star
+    integrated out. Images have the first frame's pixels; positions are x, y from the star.
+
+    Attributes
+    ----------
+    fits : tuple of Refinement
+        What was searched, after the last refinement.
+    groups : tuple of (LinearModel, Templates)
+    contrast : ndarray, (ny, nx)
+        Of a point source at every pixel, relative to the star's light before the coronagraph.
+    error : ndarray, (ny, nx)
+        Its standard deviation, `scatter` included.
+    photon_error : ndarray, (ny, nx)
+        What it would be if the star were known.
+    snr : ndarray, (ny, nx)
+        contrast / error.
+    residual_snr : ndarray, (ny, nx)
+        The same once the candidates are taken out of the data.
+    scatter : float
+        Factor by which all errors were made larger, so that S/N away from sources scatters by 1;
+        exactly 1 where the fit explains its data.
+    candidates : Candidates
+    threshold : float
+        S/N above which something is a candidate.
+    contrast_curve : QTable
+        See `contrast.contrast_table`.
+    grid : ndarray, (ny, nx, 2)
+        x, y of the pixels from the star, arcsec.
+    """
+
+    fits: tuple[Refinement, ...]
+    groups: tuple[tuple[LinearModel, Templates], ...]
+    contrast: Image
+    error: Image
+    photon_error: Image
+    snr: Image
+    residual_snr: Image
+    scatter: float
+    candidates: Candidates
+    threshold: float
+    contrast_curve: QTable
+    grid: Image
+
+    def __repr__(self) -> str:
+        return (
+            f"<Detection: {len(self.candidates)} candidates above {self.threshold:g} sigma, "
+            f"errors scaled by {self.scatter:.3g}>"
+        )
+
+    @property
+    def table(self) -> QTable:
+        """The candidates, brightest in S/N first.
+
+        x, y, separation and position angle (counter-clockwise from +y of the image), contrast,
+        their errors, and S/N.
+        """
+        found = self.candidates
+        x, y = found.offsets.T.numpy()
+        contrast = found.contrasts.numpy()
+        errors = self.scatter * found.errors.numpy().reshape(-1, 3)
+        count = len(found)
+        places = (
+            found.covariance.numpy().reshape(3, count, 3, count)
+            if count
+            else np.zeros((3, 0, 3, 0))
+        )
+        separation = np.hypot(x, y)
+        radial, angular = np.empty(count), np.empty(count)
+        for k in range(count):
+            own = places[1:, k, 1:, k]
+            along = np.array([x[k], y[k]]) / separation[k]
+            across = np.array([-along[1], along[0]])
+            radial[k] = self.scatter * np.sqrt(along @ own @ along)
+            angular[k] = self.scatter * np.sqrt(across @ own @ across) / separation[k]
+        table = QTable(
+            {
+                "x": x * u.arcsec,
+                "y": y * u.arcsec,
+                "x_error": errors[:, 1] * u.arcsec,
+                "y_error": errors[:, 2] * u.arcsec,
+                "separation": separation * u.arcsec,
+                "separation_error": radial * u.arcsec,
+                "position_angle": np.rad2deg(np.arctan2(-x, y)) % 360 * u.deg,
+                "position_angle_error": np.rad2deg(angular) * u.deg,
+                "contrast": contrast,
+                "contrast_error": errors[:, 0],
+                "snr": contrast / errors[:, 0] if count else np.zeros(0),
+            }
+        )
+        order = np.argsort(-table["snr"])
+        table = table[order]
+        table.meta = self._provenance()
+        return table
+
+    def measure(self, offsets: ArrayLike) -> QTable:
+        """Contrast of a point source at given positions, one at a time.
+
+        Parameters
+        ----------
+        offsets : (k, 2)
+            x, y from the star, arcsec, image orientation of the first frame.
+
+        Returns
+        -------
+        QTable
+            x, y, contrast, contrast_error, snr. The other candidates stay in the data.
+        """
+        places = torch.as_tensor(np.atleast_2d(np.asarray(offsets, dtype=float)))
+        if places.ndim != 2 or places.shape[1] != 2:
+            raise ShapeError(f"offsets: got shape {tuple(places.shape)}, expected (k, 2)")
+        numerator = torch.zeros(len(places), dtype=torch.float64)
+        information = torch.zeros_like(numerator)
+        for linear, templates in self.groups:
+            weighed = linear.weigh(templates.at(places))
+            numerator += weighed.numerator
+            information += weighed.information
+        error = self.scatter / information.sqrt().numpy()
+        contrast = (numerator / information).numpy()
+        return QTable(
+            {
+                "x": places[:, 0].numpy() * u.arcsec,
+                "y": places[:, 1].numpy() * u.arcsec,
+                "contrast": contrast,
+                "contrast_error": error,
+                "snr": contrast / error,
+            }
+        )
+
+    @cached_property
+    def left_out(self) -> tuple[Image, Image]:
+        """Residual of every 5 x 5 patch of the first frame as a fit that never saw it leaves it.
+
+        And its standard deviation (without `scatter`), both (ny, nx) in the data's unit.
+        """
+        residual, deviation = self.groups[0][0].left_out(5, self.fits[0].frame)
+        return residual.numpy(), deviation.numpy()
+
+    def _provenance(self) -> dict[str, object]:
+        from pyklip_diffrender import __version__
+
+        return {
+            "software": f"pyklip_diffrender {__version__}",
+            "frames": [fit.observation.name for fit in self.fits],
+            **{key: value for key, value in self.fits[0].summary().items()},
+            "scatter": self.scatter,
+            "threshold": self.threshold,
+            "orientation": "position angles counter-clockwise from +y of the first frame",
+        }
+
+    def write(self, folder: str | os.PathLike[str]) -> list[Path]:
+        """Write maps (FITS), candidates and contrast curve (ECSV); returns the paths."""
+        folder = Path(folder)
+        primary = fits.PrimaryHDU()
+        for key, value in self._provenance().items():
+            text = ", ".join(value) if isinstance(value, list) else value
+            primary.header[f"HIERARCH {key}"] = text
+        unit = str(self.fits[0].observation.unit)
+        hdus = fits.HDUList([primary])
+        for name, image, image_unit in (
+            ("SNR", self.snr, ""),
+            ("RESIDUAL_SNR", self.residual_snr, ""),
+            ("CONTRAST", self.contrast, ""),
+            ("CONTRAST_ERROR", self.error, ""),
+            ("PHOTON_ERROR", self.photon_error, ""),
+            ("LEFT_OUT", self.left_out[0], unit),
+            ("LEFT_OUT_ERROR", self.left_out[1], unit),
+            ("OFFSET_X", self.grid[..., 0], "arcsec"),
+            ("OFFSET_Y", self.grid[..., 1], "arcsec"),
+        ):
+            hdu = fits.ImageHDU(image.astype(np.float32), name=name)
+            hdu.header["BUNIT"] = image_unit
+            hdus.append(hdu)
+        maps = folder / "detection.fits"
+        write_fits(hdus, maps)
+        written = [maps]
+        for name, table in (("candidates", self.table), ("contrast", self.contrast_curve)):
+            path = folder / f"{name}.ecsv"
+            with replacing(path) as temporary:
+                table.write(temporary, format="ascii.ecsv", overwrite=True)
+            written.append(path)
+        return written
