@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pyklip_diffrender.bridges import from_poppy, from_webbpsf
+    from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
+    from pyklip_diffrender.linear_model import LinearModel
     from pyklip_diffrender.nircam import nircam_coronagraph
     from pyklip_diffrender.observation import Observation
     from pyklip_diffrender.opd import drift, random_opd, read_opd
@@ -28,7 +30,9 @@ if TYPE_CHECKING:
     from pyklip_diffrender.simulation import simulate
 
 __all__ = [
+    "Detection",
     "DiffrenderSettings",
+    "LinearModel",
     "Observation",
     "OpticalSystem",
     "Planet",
@@ -38,9 +42,12 @@ __all__ = [
     "Status",
     "__version__",
     "backend",
+    "contrast_curve",
+    "detect",
     "drift",
     "from_poppy",
     "from_webbpsf",
+    "measure",
     "nircam_coronagraph",
     "observation_from_dataset",
     "random_opd",
@@ -52,7 +59,9 @@ __all__ = [
 ]
 
 _MODULE_OF = {
+    "Detection": "detection",
     "DiffrenderSettings": "pyklip_backend",
+    "LinearModel": "linear_model",
     "Observation": "observation",
     "OpticalSystem": "optics",
     "Planet": "scene",
@@ -61,9 +70,12 @@ _MODULE_OF = {
     "Star": "scene",
     "Status": "refinement",
     "backend": "pyklip_backend",
+    "contrast_curve": "detection",
+    "detect": "detection",
     "drift": "opd",
     "from_poppy": "bridges",
     "from_webbpsf": "bridges",
+    "measure": "detection",
     "nircam_coronagraph": "nircam",
     "observation_from_dataset": "pyklip_backend",
     "random_opd": "opd",

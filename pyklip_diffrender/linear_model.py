@@ -248,7 +248,9 @@ class LinearModel:
             vector += whitened @ self.cleaned[k].flatten()
         return matrix, vector
 
-    def without(self, name: str, light: Mapping[int, Tensor | NDArray[np.float64] | float]) -> LinearModel:
+    def without(
+        self, name: str, light: Mapping[int, Tensor | NDArray[np.float64] | float]
+    ) -> LinearModel:
         """The model with some unknowns gone and their light back in the data.
 
         Parameters

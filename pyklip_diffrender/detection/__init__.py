@@ -24,13 +24,20 @@ from pyklip_diffrender.detection.contrast import (
 )
 from pyklip_diffrender.detection.maps import Group, Maps
 from pyklip_diffrender.detection.relinearise import star_only, with_companions
-from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.result import Detection, amplitudes
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import Refinement, Status
 from pyklip_diffrender.units import ARCSEC
 
-__all__ = ["Candidates", "Detection", "contrast_curve", "detect", "small_sample_factor"]
+__all__ = [
+    "Candidates",
+    "Detection",
+    "contrast_curve",
+    "detect",
+    "measure",
+    "small_sample_factor",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -111,6 +118,45 @@ def detect(
         contrast_curve=_curve(given[0], grid, error, photon, separations),
         grid=grid,
     )
+
+
+def measure(
+    fits: Refinement | Sequence[Refinement],
+    offsets: ArrayLike,
+    *,
+    scatter: float = 1.0,
+    relinearise: float = 25.0,
+) -> QTable:
+    """Contrast of a point source at given positions, each as if it were the only one.
+
+    Parameters
+    ----------
+    fits : Refinement or sequence of Refinement
+    offsets : (k, 2)
+        x, y from the star, arcsec, image orientation of the first frame.
+    scatter : float
+        Factor for the errors.
+    relinearise : float
+        See `detect`.
+
+    Returns
+    -------
+    QTable
+        x, y, contrast, contrast_error, snr.
+
+    Raises
+    ------
+    IncompatibleSetupError, ShapeError
+    """
+    given = [fits] if isinstance(fits, Refinement) else list(fits)
+    table = amplitudes(_groups(given), offsets, scatter)
+    bright = table[table["snr"] > relinearise]
+    if len(bright):
+        places = torch.from_numpy(np.stack([bright["x"].value, bright["y"].value], axis=1))
+        contrasts = torch.from_numpy(np.asarray(bright["contrast"]))
+        known = Candidates(places, contrasts, torch.zeros(3 * len(bright), 3 * len(bright)))
+        table = amplitudes(_groups(with_companions(given, known)), offsets, scatter)
+    return table
 
 
 def contrast_curve(

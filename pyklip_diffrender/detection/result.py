@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,9 +22,35 @@ from pyklip_diffrender.files import replacing, write_fits
 from pyklip_diffrender.linear_model import LinearModel
 from pyklip_diffrender.refinement import Refinement
 
-__all__ = ["Detection"]
+__all__ = ["Detection", "amplitudes"]
 
 Image = NDArray[np.float64]
+
+
+def amplitudes(
+    groups: Sequence[tuple[LinearModel, Templates]], offsets: ArrayLike, scatter: float
+) -> QTable:
+    """Contrasts of point sources at some positions, one at a time; see `Detection.measure`."""
+    places = torch.as_tensor(np.atleast_2d(np.asarray(offsets, dtype=float)))
+    if places.ndim != 2 or places.shape[1] != 2:
+        raise ShapeError(f"offsets: got shape {tuple(places.shape)}, expected (k, 2)")
+    numerator = torch.zeros(len(places), dtype=torch.float64)
+    information = torch.zeros_like(numerator)
+    for linear, templates in groups:
+        weighed = linear.weigh(templates.at(places))
+        numerator += weighed.numerator
+        information += weighed.information
+    error = scatter / information.sqrt().numpy()
+    contrast = (numerator / information).numpy()
+    return QTable(
+        {
+            "x": places[:, 0].numpy() * u.arcsec,
+            "y": places[:, 1].numpy() * u.arcsec,
+            "contrast": contrast,
+            "contrast_error": error,
+            "snr": contrast / error,
+        }
+    )
 
 
 @dataclass(frozen=True)
@@ -137,26 +164,7 @@ class Detection:
         QTable
             x, y, contrast, contrast_error, snr. The other candidates stay in the data.
         """
-        places = torch.as_tensor(np.atleast_2d(np.asarray(offsets, dtype=float)))
-        if places.ndim != 2 or places.shape[1] != 2:
-            raise ShapeError(f"offsets: got shape {tuple(places.shape)}, expected (k, 2)")
-        numerator = torch.zeros(len(places), dtype=torch.float64)
-        information = torch.zeros_like(numerator)
-        for linear, templates in self.groups:
-            weighed = linear.weigh(templates.at(places))
-            numerator += weighed.numerator
-            information += weighed.information
-        error = self.scatter / information.sqrt().numpy()
-        contrast = (numerator / information).numpy()
-        return QTable(
-            {
-                "x": places[:, 0].numpy() * u.arcsec,
-                "y": places[:, 1].numpy() * u.arcsec,
-                "contrast": contrast,
-                "contrast_error": error,
-                "snr": contrast / error,
-            }
-        )
+        return amplitudes(self.groups, offsets, self.scatter)
 
     @cached_property
     def left_out(self) -> tuple[Image, Image]:
@@ -186,7 +194,7 @@ class Detection:
         for key, value in self._provenance().items():
             text = ", ".join(value) if isinstance(value, list) else value
             primary.header[f"HIERARCH {key}"] = text
-        unit = str(self.fits[0].observation.unit)
+        unit = self.fits[0].observation.unit.to_string("fits")
         hdus = fits.HDUList([primary])
         for name, image, image_unit in (
             ("SNR", self.snr, ""),

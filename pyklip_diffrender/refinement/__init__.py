@@ -180,9 +180,15 @@ def refine_again(
     first = fits[0]
     if first.linear is None or not isinstance(first.settings, GaussNewtonOptions):
         raise IncompatibleSetupError("refine_again: only fits by Gauss-Newton can be gone on with")
-    groups = first.settings.prior.scales
-    prior = replace(first.settings.prior, scales={name: first.scales[name] for name in groups})
-    settings = replace(first.settings, **{"prior": prior, "resume": first.linear.vector, **changes})
+    old = first.settings
+    prior = replace(old.prior, scales={name: first.scales[name] for name in old.prior.scales})
+    drift = old.drift
+    if drift is not None and len(fits) > 1:
+        found = {name: first.scales[f"{name} drift"] for name in drift.scales}
+        drift = replace(drift, scales=found)
+    settings = replace(
+        old, **{"prior": prior, "drift": drift, "resume": first.linear.vector, **changes}
+    )
     problems = [Problem(f.model, f.observation, f.initial, f.start) for f in fits]
     return gauss_newton(problems, settings, seed=first.seed, progress=progress)
 

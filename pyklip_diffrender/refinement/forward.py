@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.bases import Basis
 from pyklip_diffrender.geometry import PupilGrid
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.unknowns import Unknowns
@@ -55,25 +54,14 @@ class Forward:
     Parameters
     ----------
     problem : Problem
-    basis : Basis
-    response_npix : int
-        Pupil samples of the coarse copy of the model, for derivatives and companions.
-    progress : bool
     responses : Responses
         Of the model to the basis; shared by frames.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        basis: Basis,
-        response_npix: int,
-        progress: bool,
-        responses: Responses,
-    ) -> None:
-        self.problem, self.basis, self.model = problem, basis, problem.model
-        self.response_npix, self.progress, self.responses = response_npix, progress, responses
-        self.coarse = coarse_copy(problem.model, response_npix)
+    def __init__(self, problem: Problem, responses: Responses) -> None:
+        self.problem, self.model = problem, problem.model
+        self.basis, self.responses = responses.basis, responses
+        self.coarse = coarse_copy(problem.model, responses.npix)
         self.grid = PupilGrid.full(problem.model.npix, problem.model.diameter)
 
     def opd(self, unknowns: Unknowns, vector: Tensor) -> Tensor:
@@ -159,4 +147,4 @@ class Forward:
         """The field's response to the wavefront, from where the wavefront was much the same."""
         opd = self.opd(point.unknowns, point.vector)
         values = point.unknowns.values(point.vector)
-        return self.responses.near(opd, values, self.response_npix, self.progress)
+        return self.responses.near(opd, values)

@@ -91,8 +91,8 @@ class GaussNewtonOptions:
     kappa_floor : float
         Smallest model error, as a share of the star.
     relinearise : float
-        Change of the pupil's phase (rms, radians) after which the response of the field to the
-        wavefront is computed anew.
+        Relative change of the field in the pupil (rms; radians for a phase) beyond which its
+        response to the wavefront is computed anew, see `response.Responses`.
     robust : float
         Residuals of this many sigma count half (Cauchy's weights); inf for plain least squares.
     """
@@ -112,7 +112,7 @@ class GaussNewtonOptions:
     max_iterations: int = 40
     tolerance: float = 1e-3
     kappa_floor: float = 0.0
-    relinearise: float = 0.3
+    relinearise: float = 0.05
     robust: float = math.inf
 
 
@@ -152,15 +152,18 @@ class _GaussNewton:
                 "flux is not free and start has no 'flux': how bright is the star? Add 'flux' to "
                 "free, or give start={'flux': light that the pupil collects}"
             )
-        model = problems[0].model
-        # Frames whose stars stand apart need responses of their own; more than a few would
-        # take too much memory.
-        responses = Responses(model, self.basis, options.relinearise, min(len(problems), 4))
-        self.misfit = Misfit(
-            [Forward(p, self.basis, options.response_npix, progress, responses) for p in problems],
-            options.robust,
+        responses = Responses(
+            problems[0].model,
+            self.basis,
+            npix=options.response_npix,
+            relinearise=options.relinearise,
+            progress=progress,
         )
-        self.drift = _first_modes(self.basis, options.drift_cycles) if options.drift else 0
+        forwards = [Forward(problem, responses) for problem in problems]
+        self.misfit = Misfit(forwards, options.robust)
+        several = len(problems) > 1
+        self.own_prior = options.drift if several else None
+        self.drift = _first_modes(self.basis, options.drift_cycles) if self.own_prior else 0
         self.amplitude_deviation = options.prior.amplitude_deviation(self.basis)
         self._prepare_priors(len(problems))
         self.history: list[dict[str, Any]] = []
@@ -174,14 +177,14 @@ class _GaussNewton:
         self.group = basis.group_index
         self.scale_names = list(groups)
         scales = [self.options.prior.scales[name] for name in groups]
-        if self.options.drift is not None:
-            own = self.options.drift.shape(basis)[: self.drift]
+        if self.own_prior is not None:
+            own = self.own_prior.shape(basis)[: self.drift]
             self.shape = torch.cat([self.shape, own.repeat(frames)])
             self.group = torch.cat(
                 [self.group, (basis.group_index[: self.drift] + len(groups)).repeat(frames)]
             )
             self.scale_names += [f"{name} drift" for name in groups]
-            scales += [self.options.drift.scales[name] for name in groups]
+            scales += [self.own_prior.scales[name] for name in groups]
         self.scales = torch.tensor(scales, dtype=torch.float64)
 
     def _begin(self, problems: Sequence[Problem]) -> State:

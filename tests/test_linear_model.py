@@ -1,0 +1,232 @@
+"""The marginalised algebra, against the same written out with full covariance matrices."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.errors import CorruptFileError, ShapeError
+from pyklip_diffrender.linear_model import LinearFrame, LinearModel
+
+NY, NX = 6, 7
+SHARED, DRIFT = 6, 2
+NONE = torch.zeros(0, dtype=torch.int64)
+
+
+def random(*shape: int, seed: int) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def frame(k: int, rows: list[int], drift: list[int], modes: int) -> LinearFrame:
+    weight = 0.5 + random(NY, NX, seed=10 + k).abs()
+    weight[1, 2] = 0.0
+    return LinearFrame(
+        residual=torch.where(weight > 0, random(NY, NX, seed=20 + k), 0.0),
+        weight=weight,
+        jacobian=random(len(rows), NY, NX, seed=30 + k).float(),
+        rows=torch.tensor(rows),
+        drift=torch.tensor(drift, dtype=torch.int64),
+        modes=modes,
+    )
+
+
+def dense(model: LinearModel) -> tuple[Tensor, Tensor, Tensor]:
+    """Whitened Jacobian (unknowns, pixels), data about the prior's mean, prior covariance."""
+    size = len(model.vector)
+    columns, data = [], []
+    for part in model.frames:
+        jacobian = torch.zeros(size, NY * NX, dtype=torch.float64)
+        white = (part.jacobian.double() * part.weight).flatten(1)
+        for row, unknown in enumerate(part.rows.tolist()):
+            jacobian[unknown] += white[row]
+        for k, unknown in enumerate(part.drift.tolist()):
+            jacobian[unknown] += white[part.modes + k]
+        columns.append(jacobian)
+        data.append((part.weight * part.residual).flatten())
+    jacobian = torch.cat(columns, dim=1)
+    return (
+        jacobian,
+        torch.cat(data) + jacobian.T @ (model.vector - model.mean),
+        torch.diag(model.deviation**2),
+    )
+
+
+def covariance(model: LinearModel) -> tuple[Tensor, Tensor]:
+    """Sigma of all whitened pixels, and the data."""
+    jacobian, data, prior = dense(model)
+    return torch.eye(len(data), dtype=torch.float64) + jacobian.T @ prior @ jacobian, data
+
+
+@pytest.fixture
+def single() -> LinearModel:
+    part = frame(0, list(range(SHARED)), [], 2)
+    white = (part.jacobian.double() * part.weight).flatten(1)
+    return LinearModel(
+        names=tuple(f"unknown[{k}]" for k in range(SHARED)),
+        frames=(part,),
+        vector=random(SHARED, seed=1),
+        mean=random(SHARED, seed=2),
+        deviation=0.2 + random(SHARED, seed=3).abs(),
+        curvature=white @ white.T,
+    )
+
+
+@pytest.fixture
+def pair() -> LinearModel:
+    """Two frames: one unknown each, four shared, two of these drift."""
+    frames = (frame(0, [0, 2, 3, 4, 5], [6, 7], 3), frame(1, [1, 2, 3, 4, 5], [8, 9], 3))
+    model = LinearModel(
+        names=(
+            "own[0] of frame 0",
+            "own[0] of frame 1",
+            "companions[0]",
+            "shared[0]",
+            *(f"modes[{k}]" for k in range(6)),
+        ),
+        frames=frames,
+        vector=random(10, seed=1),
+        mean=torch.zeros(10, dtype=torch.float64),
+        deviation=0.2 + random(10, seed=3).abs(),
+        curvature=torch.zeros(10, 10, dtype=torch.float64),
+    )
+    jacobian, _, _ = dense(model)
+    return replace(model, curvature=jacobian @ jacobian.T)
+
+
+def stacked(model: LinearModel, templates: dict[int, Tensor]) -> Tensor:
+    """Whitened templates over all frames, (k, pixels)."""
+    count = len(next(iter(templates.values())))
+    return torch.cat(
+        [
+            (templates.get(k, torch.zeros(count, NY, NX)) * part.weight).flatten(1)
+            for k, part in enumerate(model.frames)
+        ],
+        dim=1,
+    ).double()
+
+
+@pytest.mark.parametrize("name", ["single", "pair"])
+def test_amplitudes_are_those_of_the_full_covariance(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    model: LinearModel = request.getfixturevalue(name)
+    templates = {k: random(3, NY, NX, seed=50 + k) for k in range(len(model.frames))}
+    sigma, data = covariance(model)
+    white = stacked(model, templates)
+    inverse = torch.linalg.inv(sigma)
+    found = model.weigh(templates)
+    torch.testing.assert_close(found.numerator, white @ inverse @ data, rtol=1e-5, atol=1e-6)
+    wanted = (white @ inverse @ white.T).diagonal()
+    torch.testing.assert_close(found.information, wanted, rtol=1e-5, atol=0)
+    torch.testing.assert_close(found.photon, (white**2).sum(dim=1), rtol=1e-12, atol=0)
+    # The unknowns' freedom costs something, and how much is not the same for all templates.
+    lost = found.information / found.photon
+    assert float(lost.max()) < 0.99
+    assert float(lost.max() - lost.min()) > 0.01
+    matrix, vector = model.normal_equations(templates)
+    torch.testing.assert_close(matrix, white @ inverse @ white.T, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(vector, found.numerator, rtol=1e-5, atol=1e-6)
+
+
+def test_a_template_may_be_in_one_frame_only(pair: LinearModel) -> None:
+    templates = {1: random(2, NY, NX, seed=51)}
+    sigma, data = covariance(pair)
+    white = stacked(pair, templates)
+    found = pair.weigh(templates)
+    expected = white @ torch.linalg.solve(sigma, data)
+    torch.testing.assert_close(found.numerator, expected, rtol=1e-5, atol=1e-6)
+    cleaned = torch.cat([part.flatten(1) for part in pair.clean(templates).values()], dim=1)
+    expected = torch.linalg.solve(sigma, white.T).T
+    torch.testing.assert_close(cleaned, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_the_step_leads_to_the_most_probable_unknowns(pair: LinearModel) -> None:
+    jacobian, data, prior = dense(pair)
+    precision = torch.linalg.inv(prior) + jacobian @ jacobian.T
+    wanted = torch.linalg.solve(precision, jacobian @ data)
+    got = pair.vector + pair.step - pair.mean
+    torch.testing.assert_close(got, wanted, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(pair.covariance, torch.linalg.inv(precision), rtol=1e-8, atol=1e-10)
+
+
+def test_where_the_model_is_linearised_does_not_matter(single: LinearModel) -> None:
+    """The same data, described from another point: the residual moves by what the unknowns did."""
+    moved = single.vector + random(SHARED, seed=9)
+    part = single.frames[0]
+    change = torch.tensordot(moved - single.vector, part.jacobian.double(), dims=1)
+    residual = torch.where(part.weight > 0, part.residual - change, 0.0)
+    other = replace(single, frames=(replace(part, residual=residual),), vector=moved)
+    templates = {0: random(3, NY, NX, seed=50)}
+    torch.testing.assert_close(
+        other.weigh(templates).numerator, single.weigh(templates).numerator, rtol=1e-5, atol=1e-5
+    )
+
+
+def test_a_left_out_patch_is_predicted_by_all_other_pixels(single: LinearModel) -> None:
+    sigma, data = covariance(single)
+    residual, deviation = single.left_out(size=3)
+    weight = single.frames[0].weight
+    assert bool(torch.isnan(residual[1, 2]))
+    patch = torch.zeros(NY, NX, dtype=torch.bool)
+    patch[0:3, 3:6] = True
+    inside, outside = patch.flatten(), ~patch.flatten()
+    across = sigma[inside][:, outside]
+    solved = torch.linalg.solve(sigma[outside][:, outside], across.T)
+    expected = (data[inside] - solved.T @ data[outside]) / weight[patch]
+    spread = (sigma[inside][:, inside] - across @ solved).diagonal().sqrt() / weight[patch]
+    torch.testing.assert_close(residual[patch], expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(deviation[patch], spread, rtol=1e-5, atol=0)
+
+
+def test_unknowns_can_be_taken_out_and_their_light_put_back(pair: LinearModel) -> None:
+    light = {0: random(NY, NX, seed=70).numpy()}
+    less = pair.without("companions", light)
+    assert less.names == tuple(n for n in pair.names if not n.startswith("companions"))
+    first = less.frames[0]
+    assert first.rows.tolist() == [0, 2, 3, 4]
+    assert first.drift.tolist() == [5, 6]
+    assert first.modes == 2
+    seen = first.weight > 0
+    added = (first.residual - pair.frames[0].residual)[seen]
+    torch.testing.assert_close(added, torch.as_tensor(light[0])[seen])
+    assert float(first.residual[~seen].abs().max()) == 0.0
+    jacobian, _, _ = dense(less)
+    torch.testing.assert_close(less.curvature, jacobian @ jacobian.T)
+
+
+def test_a_model_survives_the_file(pair: LinearModel, tmp_path: Path) -> None:
+    path = tmp_path / "linear.fits"
+    pair.save(path)
+    again = LinearModel.load(path)
+    assert again.names == pair.names
+    for name in ("vector", "mean", "deviation", "curvature"):
+        assert torch.equal(getattr(again, name), getattr(pair, name))
+    for got, wanted in zip(again.frames, pair.frames, strict=True):
+        for name in ("residual", "weight", "jacobian", "rows", "drift"):
+            assert torch.equal(getattr(got, name), getattr(wanted, name)), name
+        assert got.modes == wanted.modes
+
+
+def test_unbounded_priors_survive_the_file(single: LinearModel, tmp_path: Path) -> None:
+    deviation = single.deviation.clone()
+    deviation[0] = torch.inf
+    replace(single, deviation=deviation).save(tmp_path / "linear.fits")
+    assert torch.equal(LinearModel.load(tmp_path / "linear.fits").deviation, deviation)
+
+
+def test_another_file_is_no_linear_model(tmp_path: Path) -> None:
+    from astropy.io import fits
+
+    path = tmp_path / "other.fits"
+    fits.PrimaryHDU([[1.0]]).writeto(path)
+    with pytest.raises(CorruptFileError, match="not a linear model"):
+        LinearModel.load(path)
+
+
+def test_frames_must_agree_on_the_number_of_templates(pair: LinearModel) -> None:
+    with pytest.raises(ShapeError, match="one number"):
+        pair.weigh({0: random(2, NY, NX, seed=1), 1: random(3, NY, NX, seed=2)})
