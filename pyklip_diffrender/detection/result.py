@@ -166,6 +166,25 @@ class Detection:
         """
         return amplitudes(self.groups, offsets, self.scatter)
 
+    def measure_shape(self, image: ArrayLike) -> tuple[float, float]:
+        """Amplitude of an extended source of known shape in the first frame, such as a ring.
+
+        Parameters
+        ----------
+        image : (ny, nx)
+            What it looks like at amplitude 1, in the data's unit, behind the coronagraph.
+
+        Returns
+        -------
+        amplitude, error : float
+        """
+        shape = torch.as_tensor(np.asarray(image, dtype=float))
+        if shape.shape != self.snr.shape:
+            raise ShapeError(f"image: got {tuple(shape.shape)}, expected {self.snr.shape}")
+        weighed = self.groups[0][0].weigh({self.fits[0].frame: shape[None]})
+        information = float(weighed.information[0])
+        return float(weighed.numerator[0]) / information, self.scatter * information**-0.5
+
     @cached_property
     def left_out(self) -> tuple[Image, Image]:
         """Residual of every 5 x 5 patch of the first frame as a fit that never saw it leaves it.

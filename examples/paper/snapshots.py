@@ -1,0 +1,86 @@
+"""Several frames: N = 1, 2, 4, 8 snapshots of a planet while the wavefront drifts.
+
+    python examples/paper/snapshots.py --opd BEFORE AFTER --seeds 20
+
+The snapshots are three hours apart, beginning 40 h after the map. Fitted one by one (their
+information adds), and together with a wavefront that may drift (linked).
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.priors import WavefrontPrior
+
+sys.path.insert(0, str(Path(__file__).parent))
+from scene import Planet, Setting, frame, mapped, options, setting, timed_table
+
+PLANET = Planet(5e-7, 0.6, 54.0)
+COUNTS = (1, 2, 4, 8)
+BEGIN, APART = 40.0, 3.0
+DRIFT = WavefrontPrior(scales={"segment": 0.2, "texture": 0.01})
+
+
+def one_seed(here: Setting, counts: tuple[int, ...], linked: int, seed: int) -> Table:
+    """One row a number of snapshots."""
+    shots = [
+        frame(here, BEGIN + APART * k, 100 * seed + k, [PLANET]).observation
+        for k in range(max(counts))
+    ]
+    fits = [dr.refine(here.model, shot, here.measured) for shot in shots]
+    rows = []
+    for count in counts:
+        apart = dr.measure(fits[:count], [PLANET.offset])
+        row = {
+            "snapshots": count,
+            "seed": seed,
+            "measured": float(apart["contrast"][0]),
+            "error": float(apart["contrast_error"][0]),
+            "linked": math.nan,
+            "linked_error": math.nan,
+        }
+        if 1 < count <= linked:
+            joint = dr.refine(here.model, shots[:count], here.measured, drift=DRIFT)
+            together = dr.measure(joint, [PLANET.offset])
+            row["linked"] = float(together["contrast"][0])
+            row["linked_error"] = float(together["contrast_error"][0])
+        rows.append(row)
+    return Table(rows=rows)
+
+
+def main() -> None:
+    """Run the study."""
+    parser = options(__doc__.splitlines()[0])
+    parser.add_argument("--linked", type=int, default=4, help="most snapshots fitted together")
+    given = parser.parse_args()
+    changes = {"npix": 256, "fov_pixels": 48} if given.quick else {}
+    here = setting(tuple(given.opd) if given.opd else None, **changes)
+    counts = COUNTS[:2] if given.quick else COUNTS
+    jobs = [
+        (here, counts, given.linked, seed)
+        for seed in range(1 if given.quick else max(1, given.seeds // 4))
+    ]
+    name = "snapshots_measured" if given.opd else "snapshots_generator"
+    table = timed_table(
+        lambda: mapped(one_seed, jobs, given.processes), given.output / f"{name}.ecsv"
+    )
+    single = table[table["snapshots"] == 1]
+    for count in counts:
+        part = table[table["snapshots"] == count]
+        gain = single["error"].mean() / part["error"].mean() / math.sqrt(count)
+        pull = (part["measured"] - PLANET.contrast) / part["error"]
+        text = f"N = {count}: gain over sqrt(N) {gain:.3f}, pull {pull.mean():.2f}"
+        if np.isfinite(part["linked_error"]).any():
+            linked = single["error"].mean() / np.nanmean(part["linked_error"]) / math.sqrt(count)
+            text += f", linked {linked:.3f}"
+        print(text)
+
+
+if __name__ == "__main__":
+    main()
