@@ -76,11 +76,12 @@ class OrientedPupil(EntrancePupil):
             device=device,
         )
 
-    def field(self, opd: Tensor, wavelength: float, star_offset: Tensor) -> Wavefront:
+    def field(self, opd: Tensor, wavelength: float, star_offset: Tensor | None) -> Wavefront:
         """See `EntrancePupil.field`; `opd` has the frame of the entrance pupil."""
         if wavelength in self.chromatic:
             opd = opd + self.chromatic[wavelength]
-        offset = (star_offset + self.pointing) @ self._tilt
+        offset = self.pointing if star_offset is None else star_offset + self.pointing
+        offset = offset @ self._tilt
         return super().field(self.orientation.apply(opd), wavelength, offset)
 
 
@@ -213,10 +214,13 @@ class AberrationOptic(PupilOptic):
 
     def _basis(self, count: int, wavefront: Wavefront) -> Tensor:
         grid = wavefront.grid
-        if self._known is None or self._known[0] != grid or len(self._known[1]) != count:
+        # Looked at once, for another thread may put its own there at any moment.
+        known = self._known
+        if known is None or known[0] != grid or len(known[1]) != count:
             basis = zernike_basis(count, grid.x, grid.y, grid.diameter / 2)
-            self._known = (grid, basis.to(wavefront.field.device))
-        return self._known[1]
+            known = (grid, basis.to(wavefront.field.device))
+            self._known = known
+        return known[1]
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Multiply by the phasor, and by that of the Zernikes."""

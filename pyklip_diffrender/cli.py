@@ -7,8 +7,12 @@ import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pyklip_diffrender.errors import DiffrenderError
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["main"]
 
@@ -47,6 +51,29 @@ def _parser() -> argparse.ArgumentParser:
     refine.add_argument("-o", "--output", type=Path, required=True, help="FITS file to write")
     refine.add_argument("--fov-pixels", type=int, default=80)
     refine.set_defaults(run=_refine)
+
+    detect = commands.add_parser(
+        "detect", help="look for companions in a calints file, the wavefront integrated out"
+    )
+    detect.add_argument("frames", type=Path, help="calints FITS")
+    detect.add_argument("opd", type=Path, help="OPD map (FITS)")
+    detect.add_argument("-o", "--output", type=Path, required=True, help="folder to write into")
+    detect.add_argument("--fov-pixels", type=int, default=80)
+    detect.add_argument("--threshold", type=float, default=5.0, help="S/N of a candidate")
+    detect.set_defaults(run=_detect)
+
+    bench = commands.add_parser("bench", help="error beside time, for this package and others")
+    bench.add_argument("-o", "--output", type=Path, default=Path("diffrender-bench"))
+    bench.add_argument("--rows", nargs="+", metavar="ROW", help="beginnings of rows' names")
+    bench.add_argument("--quick", action="store_true", help="small arrays, seconds")
+    bench.add_argument("--device", default="cpu", help="of the package, such as cuda")
+    bench.add_argument("--stpsf-path", default="", help="stpsf's data; default STPSF_PATH")
+    bench.add_argument("--no-memory", action="store_true", help="leave the memory out")
+    bench.add_argument(
+        "--page", type=Path, metavar="TABLE",
+        help="measure nothing; write performance.md from this table into the output folder",
+    )  # fmt: skip
+    bench.set_defaults(run=_bench)
     return parser
 
 
@@ -110,11 +137,7 @@ def _psf(options: argparse.Namespace) -> None:
     print(f"wrote {options.output}")
 
 
-def _refine(options: argparse.Namespace) -> None:
-    import numpy as np
-    from astropy.io import fits
-
-    from pyklip_diffrender.files import write_fits
+def _fitted(options: argparse.Namespace) -> Refinement:
     from pyklip_diffrender.nircam import nircam_coronagraph
     from pyklip_diffrender.observation import Observation
     from pyklip_diffrender.refinement import refine
@@ -124,7 +147,53 @@ def _refine(options: argparse.Namespace) -> None:
     model = nircam_coronagraph(
         observation.filter or "", fov_pixels=options.fov_pixels, **NIRCAM_MODEL
     )
-    fit = refine(model, observation, options.opd, progress=True, **NIRCAM_FIT)
+    return refine(model, observation, options.opd, progress=True, **NIRCAM_FIT)
+
+
+def _detect(options: argparse.Namespace) -> None:
+    from pyklip_diffrender.detection import detect
+    from pyklip_diffrender.report import draw_detection, save
+
+    fit = _fitted(options)
+    found = detect(fit, threshold=options.threshold, progress=True)
+    written = found.write(options.output)
+    figure = options.output / "detection.png"
+    save(draw_detection(found), figure)
+    print(found.table["separation", "position_angle", "contrast", "contrast_error", "snr"])
+    print(f"{fit.status.message}; errors scaled by {found.scatter:.3g}")
+    for path in (*written, figure):
+        print(f"wrote {path}")
+
+
+def _bench(options: argparse.Namespace) -> None:
+    from pyklip_diffrender.bench import Setting, run_bench, write_page, write_table
+    from pyklip_diffrender.report import draw_bench, save
+
+    if options.page:
+        print(f"wrote {write_page(options.page, options.output)}")
+        return
+    shown = ["--quick"] * options.quick + (["--rows", *options.rows] if options.rows else [])
+    table = run_bench(
+        Setting(options.quick, options.device, options.stpsf_path),
+        options.rows,
+        budget=0.1 if options.quick else 2.0,
+        memory=not options.no_memory,
+        command=" ".join(["pyklip-diffrender bench", *shown]),
+    )
+    table["row", "column", "precision", "seconds", "ratio", "error", "sigma"].pprint_all()
+    figure = options.output / "performance.png"
+    save(draw_bench(table), figure)
+    for path in (write_table(table, options.output), figure):
+        print(f"wrote {path}")
+
+
+def _refine(options: argparse.Namespace) -> None:
+    import numpy as np
+    from astropy.io import fits
+
+    from pyklip_diffrender.files import write_fits
+
+    fit = _fitted(options)
     primary = fits.PrimaryHDU()
     for key, value in fit.summary().items():
         primary.header[f"HIERARCH {key}"] = value

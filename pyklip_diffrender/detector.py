@@ -71,8 +71,12 @@ class Detector:
             )
             if "detector_shift" not in values:
                 self._transforms[key] = transform
-        area = self.pixelscale[0] * self.pixelscale[1] * (ARCSEC / self.oversample) ** 2
-        return math.sqrt(area) * transform.forward(wavefront.field)
+        return self.per_sample * transform.forward(wavefront.field)
+
+    @property
+    def per_sample(self) -> float:
+        """Square root of a sample's solid angle, radians: from field per radian to sample."""
+        return math.sqrt(self.pixelscale[0] * self.pixelscale[1]) * ARCSEC / self.oversample
 
     def image(self, intensity: Tensor, values: Values) -> Tensor:
         """Pixel values (..., ny, nx) from the intensity on the samples: blur, then binning."""

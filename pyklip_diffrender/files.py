@@ -13,12 +13,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from astropy.io import fits
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
 
-from pyklip_diffrender.errors import CorruptFileError
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning
 
 __all__ = ["embedded_table", "open_fits", "replacing", "sha256", "write_fits"]
 
@@ -32,7 +33,14 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
     Raises
     ------
     CorruptFileError
-        If the file is missing, truncated, or not FITS.
+        If the file is missing, truncated, or not FITS, if a card cannot be read, or if data do
+        not have the sum that DATASUM promises.
+
+    Warns
+    -----
+    DiffrenderWarning
+        If only a header differs from its CHECKSUM: that is what many an editor of headers leaves
+        behind, and the data are whole.
     """
     path = Path(path)
     if not path.is_file():
@@ -48,16 +56,50 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
                 "error", message="(?s).*(truncated|corrupt)", category=AstropyUserWarning
             )
             hdus = fits.open(io.BytesIO(content), lazy_load_hdus=False)
-            for hdu in hdus:
-                _ = hdu.data
+            for number, hdu in enumerate(hdus):
+                _require_sound(hdu, number, path)
+    except CorruptFileError:
+        raise
     except (
-        OSError, EOFError, ValueError, TypeError, KeyError, zlib.error, AstropyUserWarning
+        OSError, EOFError, ValueError, TypeError, KeyError, zlib.error, AstropyUserWarning,
+        fits.VerifyError,
     ) as error:  # fmt: skip
         raise CorruptFileError(
             f"{path} ({path.stat().st_size} bytes): not a complete FITS file ({error}). "
             "Fetch it again"
         ) from error
     yield hdus
+
+
+def _require_sound(hdu: Any, number: int, path: Path) -> None:
+    """Look at all of an HDU once: its cards, its sums, its data."""
+    # What astropy takes for a damaged or foreign HDU has no data, or no sums.
+    if not (hasattr(type(hdu), "data") and hasattr(hdu, "verify_datasum")):
+        raise CorruptFileError(
+            f"{path}: extension {number} does not start as one (XTENSION, SIMPLE). Fetch it again"
+        )
+    for card in hdu.header.cards:
+        try:
+            _ = card.value
+        except fits.VerifyError as error:
+            raise CorruptFileError(
+                f"{path}: extension {number} has a card that cannot be read: "
+                f"{card.image.strip()!r}. Correct it, or fetch the file again"
+            ) from error
+    # Before the data are scaled: the sums are of the bytes.
+    if hdu.verify_datasum() == 0:
+        raise CorruptFileError(
+            f"{path}: the data of extension {number} do not have the checksum in its header "
+            "(DATASUM). Fetch it again, or delete the card if somebody changed them on purpose"
+        )
+    if hdu.verify_checksum() == 0:
+        warnings.warn(
+            f"{path}: the header of extension {number} was changed after its checksum was made "
+            "(CHECKSUM); the data were not",
+            DiffrenderWarning,
+            stacklevel=5,
+        )
+    _ = hdu.data
 
 
 @contextmanager

@@ -6,6 +6,7 @@ Orientation: all pupil planes are in OTE entrance-pupil orientation, x along +V2
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.files import embedded_table
+from pyklip_diffrender.units import ARCSEC
 
 __all__ = [
     "JWST_DIAMETER",
@@ -23,6 +25,7 @@ __all__ = [
     "jwst_segments",
     "maskrnd_openings",
     "polygon_coverage",
+    "samples_for_field",
     "transform_polygons",
     "widen_polygon",
 ]
@@ -122,6 +125,19 @@ class PupilGrid:
         if min(top, bottom, left, right) < 0:
             return torch.nn.functional.pad(array, (-left, -right, -top, -bottom))
         return array[..., top : top + to.shape[0], left : left + to.shape[1]]
+
+
+def samples_for_field(field: float, wavelength: float, diameter: float = JWST_DIAMETER) -> int:
+    """Fewest samples across a pupil whose image does not repeat itself inside a field.
+
+    Parameters
+    ----------
+    field : float
+        Width, arcsec.
+    wavelength, diameter : float
+        m; the shortest wavelength, and the side of the pupil array.
+    """
+    return math.ceil(field * ARCSEC * diameter / wavelength)
 
 
 def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:

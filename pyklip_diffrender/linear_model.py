@@ -25,9 +25,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pyklip_diffrender.errors import CorruptFileError, ShapeError
-from pyklip_diffrender.files import open_fits, write_fits
-from pyklip_diffrender.units import native_float64
+from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.files import write_fits
+from pyklip_diffrender.linear_file import read_linear
 
 __all__ = ["LinearFrame", "LinearModel", "Weighed"]
 
@@ -358,40 +358,7 @@ class LinearModel:
         Raises
         ------
         CorruptFileError
+            If it is another file, or its parts do not go together.
         """
-        with open_fits(path) as hdus:
-            try:
-                table = hdus["UNKNOWNS"].data
-                frames = []
-                for hdu in hdus:
-                    if hdu.name == "RESIDUAL":
-                        frames.append(_read_frame(hdus, hdu.ver))
-                vector, mean, deviation = (
-                    torch.from_numpy(native_float64(table[name]))
-                    for name in ("VECTOR", "MEAN", "DEVIATION")
-                )
-                curvature = torch.from_numpy(native_float64(hdus["CURVATURE"].data))
-                names = tuple(str(name) for name in table["NAME"])
-                return cls(names, tuple(frames), vector, mean, deviation, curvature)
-            except KeyError as error:
-                raise CorruptFileError(
-                    f"{path}: not a linear model ({error}); expected a file that "
-                    "LinearModel.save wrote"
-                ) from error
-
-
-def _read_frame(hdus: fits.HDUList, version: int) -> LinearFrame:
-    def tensor(name: str, dtype: torch.dtype) -> Tensor:
-        data = hdus[name, version].data
-        if data is None:
-            return torch.zeros(0, dtype=dtype)
-        return torch.from_numpy(native_float64(data)).to(dtype)
-
-    return LinearFrame(
-        tensor("RESIDUAL", torch.float64),
-        tensor("WEIGHT", torch.float64),
-        tensor("JACOBIAN", torch.float32),
-        tensor("ROWS", torch.int64),
-        tensor("DRIFT", torch.int64),
-        int(hdus["RESIDUAL", version].header["FIRSTMOD"]),
-    )
+        model, frames = read_linear(path)
+        return cls(frames=tuple(LinearFrame(**frame) for frame in frames), **model)

@@ -61,7 +61,7 @@ class BoxPart:
     def __init__(self, complement: Callable[[Tensor, Tensor, float], Tensor], box: Box) -> None:
         self.complement, self.box = complement, box
         self._cells: dict[tuple[float, float, float], tuple[Tensor, Tensor, Tensor]] = {}
-        self._transforms: dict[tuple[float, float, PupilGrid], MatrixFourier] = {}
+        self._transforms: dict[tuple[float, float, PupilGrid, torch.dtype], MatrixFourier] = {}
 
     def cells(self, wavefront: Wavefront, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
         """Positions x (columns,), y (rows,) in radians, and ``1 - t`` (rows, columns)."""
@@ -77,10 +77,10 @@ class BoxPart:
         return self._cells[key]
 
     def _transform(self, wavefront: Wavefront, spacing: float, grid: PupilGrid) -> MatrixFourier:
-        key = (wavefront.wavelength, spacing, grid)
+        device, dtype = wavefront.field.device, wavefront.field.dtype
+        key = (wavefront.wavelength, spacing, grid, dtype)
         if key not in self._transforms:
             x, y, _ = self.cells(wavefront, spacing)
-            device, dtype = wavefront.field.device, wavefront.field.dtype
             self._transforms[key] = MatrixFourier(
                 grid, x.to(device), y.to(device), wavefront.wavelength, dtype
             )
@@ -117,11 +117,11 @@ class SeparablePart:
         sampling: float,
     ) -> None:
         self.along_x, self.along_y, self.sampling = along_x, along_y, sampling
-        self._spectra: dict[tuple[str, float, PupilGrid, PupilGrid], Tensor] = {}
+        self._spectra: dict[tuple[str, float, PupilGrid, PupilGrid, torch.dtype], Tensor] = {}
 
     def _spectrum(self, axis: str, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
         """Transform of the kernel that takes the window in front to the one behind, one axis."""
-        key = (axis, wavefront.wavelength, wavefront.grid, onto)
+        key = (axis, wavefront.wavelength, wavefront.grid, onto, wavefront.field.dtype)
         if key not in self._spectra:
             grid = wavefront.grid
             factor = self.along_x if axis == "x" else self.along_y
@@ -248,18 +248,22 @@ class FourierMask:
         first = -((npix * (padding - 1)) // 2)
         limits = (first, first + npix * padding)
         self.grid = PupilGrid(npix, diameter, limits, limits)
-        self._latest: tuple[float, Tensor] | None = None
+        self._latest: tuple[float, torch.dtype, Tensor] | None = None
 
     def window(self, values: Values) -> PupilGrid:
         """All of the padded pupil: light beside the pupil reaches the next mask."""
         return self.grid
 
     def _lattice_transmission(self, wavefront: Wavefront) -> Tensor:
-        # One wavelength at a time: at eight points per lambda/D one is a gigabyte.
-        if self._latest is None or self._latest[0] != wavefront.wavelength:
+        # One wavelength at a time: at eight points per lambda/D one is a gigabyte. Looked at once,
+        # for another thread may put its own there at any moment.
+        latest = self._latest
+        wanted = (wavefront.wavelength, wavefront.field.dtype)
+        if latest is None or latest[:2] != wanted:
             lattice = torch.fft.ifftshift(self.transmission(wavefront.wavelength))
-            self._latest = (wavefront.wavelength, lattice.to(wavefront.field))
-        return self._latest[1]
+            latest = (*wanted, lattice.to(wavefront.field))
+            self._latest = latest
+        return latest[2]
 
     def focal_sample(self, wavefront: Wavefront) -> tuple[Tensor, float]:
         """The field behind the mask on all of the lattice, and its spacing (radians)."""

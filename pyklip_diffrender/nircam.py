@@ -14,7 +14,12 @@ from torch import Tensor
 from pyklip_diffrender.detector import Detector
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.files import embedded_table
-from pyklip_diffrender.geometry import JWST_DIAMETER, jwst_pupil, maskrnd_openings
+from pyklip_diffrender.geometry import (
+    JWST_DIAMETER,
+    jwst_pupil,
+    maskrnd_openings,
+    samples_for_field,
+)
 from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.planes import (
     CompactOcculter,
@@ -152,7 +157,8 @@ def nircam_coronagraph(
     chromatic_reference: float | None = None,
     segment_gap: float | None = None,
     npix: int = 1024,
-    occulter_sampling: float = 4.0,
+    occulter_sampling: float | None = None,
+    route: str = "auto",
     dtype: torch.dtype = torch.float64,
     device: str | torch.device = "cpu",
 ) -> OpticalSystem:
@@ -193,8 +199,11 @@ def nircam_coronagraph(
         Width of the gaps between mirror segments, m; default that of the embedded outlines.
     npix : int
         Samples across the pupil.
-    occulter_sampling : float
-        Cells per lambda/D in the occulter's disc.
+    occulter_sampling : float, optional
+        Cells per lambda/D in the occulter's disc: at least so many by the route "lattice" (2
+        unless given), just so many by the route "planes" (4 unless given).
+    route : "auto", "lattice" or "planes"
+        See `OpticalSystem`.
     dtype : torch.dtype
         float64 or float32.
     device : str or torch.device
@@ -206,7 +215,8 @@ def nircam_coronagraph(
     Raises
     ------
     IncompatibleSetupError
-        For a filter, mask or wavelength that does not go with this coronagraph.
+        For a filter, mask or wavelength that does not go with this coronagraph, or a field so wide
+        that the image of a pupil of `npix` samples repeats inside it.
     """
     recipe: dict[str, Any] = {k: v for k, v in locals().items() if k != "recipe"}
     if image_mask not in ("MASK335R", None) or pupil_mask not in ("MASKRND", None):
@@ -230,6 +240,13 @@ def nircam_coronagraph(
 
     scale = (pixelscale, pixelscale) if isinstance(pixelscale, int | float) else pixelscale
     shape = _field_of_view(fov_pixels, fov_arcsec, scale)
+    field = max(shape[1] * scale[0], shape[0] * scale[1])
+    needed = samples_for_field(field, min(bandpass.wavelengths))
+    if npix < needed:
+        raise IncompatibleSetupError(
+            f"npix: got {npix} samples across the pupil, whose image repeats inside the field of "
+            f"{field:.3g} arcsec; expected npix at least {needed}, or a smaller field"
+        )
     where = torch.device(device)
     planes: list[Plane] = []
     if image_mask is not None:
@@ -266,6 +283,7 @@ def nircam_coronagraph(
         bandpass,
         recipe=recipe,
         remake=nircam_coronagraph,
+        route=route,
     )
 
 

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
+    IncompatibleSetupError,
     NoValidPixelsError,
     ShapeError,
     UnitError,
 )
 from pyklip_diffrender.files import open_fits
+from pyklip_diffrender.headers import header_date, header_number, header_text, merged_header
 from pyklip_diffrender.units import (
     native_float64,
     require_finite,
@@ -123,45 +125,55 @@ class Observation:
             A unit that is not known, or does not convert.
         NonFiniteError
             A star position that is not a number.
+        IncompatibleSetupError
+            A pixel scale that is not a positive number.
         NoValidPixelsError
             A frame in which nothing is left.
         """
+        name = details.get("name", "observation")
         try:
             unit = u.Unit(unit)
         except (ValueError, TypeError) as reason:
             raise UnitError(
-                f"{details.get('name', 'observation')}: got the unit {unit!r}, expected one that "
-                "astropy knows, such as 'MJy/sr'"
+                f"{name}: got the unit {unit!r}, expected one that astropy knows, such as 'MJy/sr'"
             ) from reason
-        values = to_unit(data, unit, "data")
+        values = to_unit(data, unit, f"{name}: data")
         values = values[None] if values.ndim == 2 else values
         if values.ndim != 3 or values.size == 0:
-            raise ShapeError(f"data: got shape {np.shape(data)}, expected ([frames,] ny, nx)")
-        sigma = to_unit(error, unit, "error")
+            raise ShapeError(
+                f"{name}: data: got shape {np.shape(data)}, expected ([frames,] ny, nx)"
+            )
+        sigma = to_unit(error, unit, f"{name}: error")
         sigma = sigma[None] if sigma.ndim == 2 else sigma
-        require_shape(sigma, values.shape, "error", "Give one error for every pixel")
+        require_shape(sigma, values.shape, f"{name}: error", "Give one error for every pixel")
         good = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
         if valid is not None:
             given = np.asarray(valid, dtype=bool)
-            require_shape(given[None] if given.ndim == 2 else given, values.shape, "valid", "")
+            given = given[None] if given.ndim == 2 else given
+            require_shape(given, values.shape, f"{name}: valid", "Say it for every pixel")
             good &= given
         empty = np.flatnonzero(~good.any(axis=(1, 2)))
         if len(empty):
             raise NoValidPixelsError(
-                f"{details.get('name', 'observation')}: all {values[0].size} pixels of frame "
-                f"{int(empty[0])} are masked, not finite or without an error. Look at its DQ"
+                f"{name}: all {values[0].size} pixels of frame {int(empty[0])} are masked, not "
+                "finite or without an error. Look at its DQ"
             )
         frames, ny, nx = values.shape
         where = native_float64([(nx - 1) / 2, (ny - 1) / 2] if center is None else center)
-        require_finite(where, "center")
-        scale = _spread(to_arcsec(pixelscale, "pixelscale"), (2,), "pixelscale")
+        require_finite(where, f"{name}: center")
+        scale = _spread(to_arcsec(pixelscale, "pixelscale"), (2,), f"{name}: pixelscale")
+        if not (np.isfinite(scale) & (scale > 0)).all():
+            raise IncompatibleSetupError(
+                f"{name}: pixelscale: got {pixelscale}, expected a positive number of arcsec per "
+                "pixel, such as 0.0624"
+            )
         return cls(
             np.where(good, values, 0.0),
             np.where(good, sigma, 1.0),
             good,
             unit,
             (float(scale[0]), float(scale[1])),
-            _spread(where, (frames, 2), "center"),
+            _spread(where, (frames, 2), f"{name}: center"),
             **details,
         )
 
@@ -175,7 +187,8 @@ class Observation:
         Raises
         ------
         CorruptFileError
-            No such file, truncated, or without data in SCI, ERR or DQ.
+            No such file, truncated, without an image in SCI, ERR or DQ, or with a card that does
+            not hold what it should.
         UnitError
             SCI has no unit.
         ShapeError, NoValidPixelsError
@@ -189,9 +202,10 @@ class Observation:
                     "JWST calints file"
                 )
             science = hdus["SCI"]
-            header = hdus[0].header.copy()
-            header.update(science.header)
+            header = merged_header(hdus[0].header, science.header, path.name)
             for hdu in hdus:
+                if hdu.name in ("SCI", "ERR", "DQ") and not hdu.is_image:
+                    raise CorruptFileError(f"{path.name}: {hdu.name} is a table, not an image")
                 if hdu.name in ("SCI", "ERR", "DQ") and hdu.data is None:
                     raise CorruptFileError(f"{path.name}: {hdu.name} has no data, so no frames")
             data = native_float64(science.data)
@@ -199,7 +213,11 @@ class Observation:
                 raise CorruptFileError(f"{path.name}: no ERR extension; the fit needs errors")
             error = native_float64(hdus["ERR"].data)
             if "DQ" in hdus:
-                quality = np.asarray(hdus["DQ"].data).astype(np.uint32)
+                quality = np.asarray(hdus["DQ"].data)
+                if quality.dtype.kind not in "iu":
+                    raise CorruptFileError(
+                        f"{path.name}: DQ holds {quality.dtype.name}, expected integers (flags)"
+                    )
             else:
                 warnings.warn(
                     f"{path.name}: no DQ extension; only NaN pixels are masked",
@@ -219,31 +237,38 @@ class Observation:
         name: str,
     ) -> Observation:
         """Make an observation of JWST arrays and their merged header; see `from_fits`."""
-        if not header.get("BUNIT"):
+
+        def number(key: str, default: float) -> float:
+            found = header_number(header, key, name)
+            return default if found is None else found
+
+        unit = header_text(header, "BUNIT", name)
+        if unit is None:
             raise UnitError(f"{name}: SCI has no BUNIT; expected one such as 'MJy/sr'")
         frames = 1 if np.ndim(data) == 2 else len(data)
         star = [
-            header.get(key, header.get(fallback)) for key, fallback in
+            number(key, number(fallback, np.nan)) for key, fallback in
             (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
         ]  # fmt: skip
-        center = None if None in star else np.array(star, dtype=float) - 1
-        angle = header.get("ROLL_REF", 0.0) - header.get("V3I_YANG", 0.0) * header.get(
-            "VPARITY", -1
-        )
-        date = header.get("DATE-BEG") or header.get("DATE-OBS")
-        area = header.get("PIXAR_A2")
-        if not area:
+        angle = number("ROLL_REF", 0.0) - number("V3I_YANG", 0.0) * number("VPARITY", -1)
+        area = number("PIXAR_A2", 0.0)
+        if area == 0:
             raise UnitError(f"{name}: the header has no PIXAR_A2 (pixel area, arcsec^2)")
+        if area < 0:
+            raise CorruptFileError(
+                f"{name}: PIXAR_A2 is {area}, expected a pixel area in arcsec^2, such as 0.0039. "
+                "Correct the header, or fetch the file again"
+            )
         return cls.from_arrays(
             data,
             error,
             valid=(np.asarray(quality).astype(np.uint32) & BAD_PIXEL_BITS) == 0,
-            unit=header["BUNIT"],
-            pixelscale=float(area) ** 0.5,
-            center=center,
-            filter=header.get("FILTER"),
-            date=Time(date, scale="utc") if date else None,
-            position_angles=np.full(frames, float(angle)),
+            unit=unit,
+            pixelscale=area**0.5,
+            center=None if np.isnan(star).any() else np.array(star) - 1,
+            filter=header_text(header, "FILTER", name),
+            date=header_date(header, ("DATE-BEG", "DATE-OBS"), name),
+            position_angles=np.full(frames, angle),
             name=name,
             header=header,
         )
@@ -291,13 +316,15 @@ class Observation:
 
         Only for frames that see the star at the same place under the same wavefront.
         """
-        weight = np.where(self.valid, self.error**-2, 0.0)
+        # What is masked may be anything where somebody has replaced data, NaN too.
+        weight = np.where(self.valid, np.where(self.valid, self.error, 1.0) ** -2, 0.0)
         total = weight.sum(axis=0)
         seen = total > 0
         safe = np.where(seen, total, 1.0)
+        light = np.where(self.valid, self.data, 0.0)
         return replace(
             self,
-            data=((weight * self.data).sum(axis=0) / safe)[None],
+            data=((weight * light).sum(axis=0) / safe)[None],
             error=np.where(seen, safe**-0.5, 1.0)[None],
             valid=seen[None],
             center=self.center.mean(axis=0, keepdims=True),

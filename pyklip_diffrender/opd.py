@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +20,16 @@ from numpy.typing import NDArray
 from pyklip_diffrender.bases import FourierModes, SegmentMotions
 from pyklip_diffrender.errors import (
     CorruptFileError,
-    DiffrenderWarning,
     NonFiniteError,
     ShapeError,
     UnitError,
 )
 from pyklip_diffrender.files import open_fits, sha256
 from pyklip_diffrender.geometry import PupilGrid, jwst_pupil
-from pyklip_diffrender.units import native_float64, to_metres
+from pyklip_diffrender.headers import header_date, header_text, merged_header
+from pyklip_diffrender.units import native_float64, to_metres, warn_of_rms
 
 __all__ = ["OPDMap", "as_opd_map", "drift", "random_drift", "random_opd", "read_opd", "resample"]
-
-_PLAUSIBLE_RMS = (1e-9, 2e-6)
 
 
 @dataclass(frozen=True)
@@ -100,9 +98,8 @@ def read_opd(
     with open_fits(path) as hdus:
         hdu = _image(hdus, extension, path)
         raw = native_float64(hdu.data)
-        header = hdus[0].header.copy()
-        header.update(hdu.header)
-    unit = unit or header.get("BUNIT")
+        header = merged_header(hdus[0].header, hdu.header, path.name)
+    unit = unit or header_text(header, "BUNIT", path.name)
     if not unit:
         raise UnitError(
             f"{path.name}: the header has no BUNIT. Say it: read_opd(path, unit='m') "
@@ -114,9 +111,8 @@ def read_opd(
         data = raw * u.Unit(spelled).to(u.m)
     except (ValueError, u.UnitConversionError) as error:
         raise UnitError(f"{path.name}: BUNIT is {unit!r}, expected a unit of length") from error
-    if data.shape[0] != data.shape[1]:
-        raise ShapeError(f"{path.name}: got shape {data.shape}, expected a square map")
-    return OPDMap(_check(data, path.name), _date(header), path.name, sha256(path))
+    date = header_date(header, ("DATE-OBS", "DATE-BEG"), path.name)
+    return OPDMap(_check(data, path.name), date, path.name, sha256(path))
 
 
 def as_opd_map(opd: Any, name: str = "array") -> OPDMap:
@@ -132,8 +128,6 @@ def as_opd_map(opd: Any, name: str = "array") -> OPDMap:
     if isinstance(opd, str | os.PathLike):
         return read_opd(opd)
     data = to_metres(opd, "opd")
-    if data.ndim != 2 or data.shape[0] != data.shape[1]:
-        raise ShapeError(f"opd: got shape {data.shape}, expected a square map")
     return OPDMap(_check(data, name), None, name, hashlib.sha256(data.tobytes()).hexdigest())
 
 
@@ -151,16 +145,19 @@ def _image(hdus: fits.HDUList, extension: str | int | None, path: Path) -> Any:
     raise CorruptFileError(f"{path}: no two-dimensional image in it; expected an OPD map")
 
 
-def _date(header: fits.Header) -> Time | None:
-    for key in ("DATE-OBS", "DATE-BEG"):
-        if header.get(key):
-            return Time(header[key], scale="utc")
-    return None
+@lru_cache(maxsize=8)
+def _inside(npix: int) -> NDArray[np.bool_]:
+    """Which samples are inside the pupil; made in as much time as a map is read in."""
+    inside: NDArray[np.bool_] = jwst_pupil(npix).numpy() > 0.5
+    inside.setflags(write=False)
+    return inside
 
 
 def _check(data: NDArray[np.float64], name: str) -> NDArray[np.float64]:
-    """NaN only outside the pupil, and an rms that a telescope could have."""
-    pupil = jwst_pupil(data.shape[0]).numpy() > 0.5
+    """Square, NaN only outside the pupil, and an rms that a telescope could have."""
+    if data.ndim != 2 or data.shape[0] != data.shape[1] or not data.size:
+        raise ShapeError(f"{name}: got shape {data.shape}, expected a square map")
+    pupil = _inside(data.shape[0])
     bad = ~np.isfinite(data)
     if (bad & pupil).any():
         first = tuple(int(i) for i in np.argwhere(bad & pupil)[0])
@@ -169,19 +166,7 @@ def _check(data: NDArray[np.float64], name: str) -> NDArray[np.float64]:
             f"first at [y, x] = {first}. Interpolate them or use another map"
         )
     data = np.where(bad, 0.0, data)
-    rms = float(data[pupil].std())
-    if rms > 0 and not _PLAUSIBLE_RMS[0] < rms < _PLAUSIBLE_RMS[1]:
-        likely = [
-            unit
-            for unit in ("um", "nm", "mm")
-            if _PLAUSIBLE_RMS[0] < rms * u.Unit(unit).to(u.m) < _PLAUSIBLE_RMS[1]
-        ]
-        hint = f"; in {' or '.join(likely)} it would be plausible" if likely else ""
-        warnings.warn(
-            f"{name}: an rms of {rms:.3g} m inside the pupil is not plausible for JWST{hint}",
-            DiffrenderWarning,
-            stacklevel=3,
-        )
+    warn_of_rms(float(data[pupil].std()), name, stacklevel=4)
     return data
 
 

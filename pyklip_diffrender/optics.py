@@ -8,11 +8,12 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from pyklip_diffrender.cells import LatticeRoute
 from pyklip_diffrender.detector import Detector
-from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.geometry import PupilGrid
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.planes import (
@@ -24,11 +25,19 @@ from pyklip_diffrender.planes import (
 )
 from pyklip_diffrender.psf_file import recipe_psf
 from pyklip_diffrender.spectrum import Bandpass
-from pyklip_diffrender.units import require_finite, require_shape, to_metres, to_unit
+from pyklip_diffrender.units import (
+    require_finite,
+    require_shape,
+    to_metres,
+    to_unit,
+    warn_of_rms,
+)
 
 __all__ = ["OpticalSystem"]
 
 Value = Tensor | ArrayLike | float
+
+_ON_AXIS = (0.0, 0.0)
 
 
 class OpticalSystem:
@@ -48,6 +57,15 @@ class OpticalSystem:
         What the system was made from, for provenance and for `with_fidelity`.
     remake : callable, optional
         Makes the same system from a changed recipe.
+    route : "auto", "lattice" or "planes"
+        How light gets to the detector: by convolution on cells that fit the detector (`cells`),
+        which is for one round occulter between pupils, or plane by plane, which is for all.
+        "auto" takes the first where it can be had and the detector is not very fine.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For the route "lattice" through planes that it does not take.
     """
 
     def __init__(
@@ -58,6 +76,7 @@ class OpticalSystem:
         bandpass: Bandpass,
         recipe: dict[str, Any] | None = None,
         remake: Callable[..., OpticalSystem] | None = None,
+        route: str = "auto",
     ) -> None:
         self.entrance = entrance
         self.planes = tuple(planes)
@@ -65,6 +84,20 @@ class OpticalSystem:
         self.bandpass = bandpass
         self.recipe = dict(recipe or {})
         self._remake = remake
+        if route not in ("auto", "lattice", "planes"):
+            raise IncompatibleSetupError(
+                f"route: got {route!r}, expected 'auto', 'lattice' or 'planes'"
+            )
+        self._lattice: LatticeRoute | None = None
+        if route != "planes" and LatticeRoute.serves(self.planes):
+            lattice = LatticeRoute(self.planes, detector)
+            if route == "lattice" or lattice.pays(bandpass.wavelengths):
+                self._lattice = lattice
+        if route == "lattice" and self._lattice is None:
+            raise IncompatibleSetupError(
+                "route 'lattice': the planes are not one round occulter between factors in "
+                "pupils; use 'auto' or 'planes'"
+            )
 
     def __repr__(self) -> str:
         names = ", ".join(
@@ -76,6 +109,11 @@ class OpticalSystem:
             f"{'s' if waves > 1 else ''} about {self.bandpass.mean_wavelength * 1e6:.2f} um, "
             f"{self.detector.shape[1]} x {self.detector.shape[0]} px>"
         )
+
+    @property
+    def route(self) -> str:
+        """How light gets to the detector: "lattice" or "planes"."""
+        return "planes" if self._lattice is None else "lattice"
 
     @property
     def npix(self) -> int:
@@ -123,6 +161,11 @@ class OpticalSystem:
 
         None is the system's own wavefront, flat unless it came with one. Tensors pass through
         unchanged in value, so that gradients flow; everything else goes through the unit gate.
+
+        Warns
+        -----
+        DiffrenderWarning
+            For an array whose rms inside the pupil is that of a wavefront in another unit.
         """
         if opd is None and self.entrance.opd is not None:
             return self.entrance.opd
@@ -133,6 +176,7 @@ class OpticalSystem:
             if array.ndim < 2:
                 raise ShapeError(f"opd: got shape {array.shape}, expected (..., npix, npix)")
             require_finite(array, "opd (NaN is only allowed outside the pupil; set it to 0)")
+            self._warn_of_unit(opd, array)
             opd = torch.from_numpy(array)
         if opd.shape[-2:] != (self.npix, self.npix):
             require_shape(
@@ -143,6 +187,14 @@ class OpticalSystem:
                 f"npix={opd.shape[-1]}, or resample the map with opd.resample",
             )
         return opd.to(self.device)
+
+    def _warn_of_unit(self, given: Any, array: NDArray[np.float64]) -> None:
+        """Of bare nanometres: arrays only, for tensors are what fits move, and maps know theirs."""
+        lit = self.entrance.lit.cpu().numpy()
+        if isinstance(given, np.ndarray) and array.shape[-2:] == lit.shape and lit.any():
+            # Small ones are fair: what a mode of 1 pm does is a thing to ask a model.
+            rms = float(array[..., lit].std(axis=-1).max())
+            warn_of_rms(rms, "opd", stacklevel=6, small=False)
 
     def values(self, given: Mapping[str, Value | None]) -> dict[str, Tensor]:
         """Check named parameter values and make them float64 tensors, (components,) each.
@@ -177,10 +229,7 @@ class OpticalSystem:
 
     def pupil_field(self, opd: Tensor, wavelength: float, values: Values) -> Wavefront:
         """The field behind the entrance pupil, the only step that is not linear."""
-        offset = values.get("star_offset")
-        if offset is None:
-            offset = torch.zeros(2, dtype=torch.float64, device=self.device)
-        return self.entrance.field(opd, wavelength, offset)
+        return self.entrance.field(opd, wavelength, values.get("star_offset"))
 
     def windows(self, values: Values) -> list[PupilGrid]:
         """For every plane, the pupil window that it should hand on, given what follows it."""
@@ -193,22 +242,31 @@ class OpticalSystem:
 
     def propagate(self, wavefront: Wavefront, values: Values) -> Tensor:
         """Field on the detector's samples from the field behind the entrance pupil; linear."""
-        for plane, onto in zip(self.planes, self.windows(values), strict=True):
+        windows = self.windows(values)
+        if self._lattice is not None:
+            return self._lattice.field(wavefront, values, windows)
+        for plane, onto in zip(self.planes, windows, strict=True):
             wavefront = plane.apply(wavefront, values, onto)
         return self.detector.field(wavefront, values)
+
+    def _field(self, opd: Tensor, wavelength: float, values: Values) -> Tensor:
+        found = None
+        if self._lattice is not None:
+            windows = self.windows(values)
+            found = self._lattice.star(self.entrance, opd, wavelength, values, windows)
+        if found is None:
+            found = self.propagate(self.pupil_field(opd, wavelength, values), values)
+        return found
 
     def fields(self, opd: Value | None = None, **parameters: Value) -> list[Tensor]:
         """Complex field on the detector's samples at each wavelength, each (..., ny, nx)."""
         tensor, values = self.opd(opd), self.values(parameters)
-        return [
-            self.propagate(self.pupil_field(tensor, wavelength, values), values)
-            for wavelength in self.bandpass.wavelengths
-        ]
+        return [self._field(tensor, wavelength, values) for wavelength in self.bandpass.wavelengths]
 
     def __call__(
         self,
         opd: Value | None = None,
-        star_offset: Value = (0.0, 0.0),
+        star_offset: Value = _ON_AXIS,
         *,
         weights: Tensor | None = None,
         **parameters: Value,
@@ -231,7 +289,9 @@ class OpticalSystem:
         Tensor, (..., ny, nx)
             Light per detector pixel as a fraction of what the entrance pupil collects.
         """
-        given = {"star_offset": star_offset, **parameters}
+        given = dict(parameters)
+        if star_offset is not _ON_AXIS:  # Who passes zeros may want their derivative.
+            given["star_offset"] = star_offset
         return self.image_of(self.fields(opd, **given), self.values(given), weights)
 
     def image_of(
@@ -345,5 +405,6 @@ class OpticalSystem:
                 found[f"{plane.name} focus"] = plane.focal_field(wavefront)
             wavefront = plane.apply(wavefront, values, onto)
             found[plane.name] = wavefront.field
-        found[self.detector.name] = self.detector.field(wavefront, values)
+        # As in a call, which may take another route than the planes above.
+        found[self.detector.name] = self._field(tensor, wavelength, values)
         return found

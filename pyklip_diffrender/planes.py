@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.geometry import PupilGrid, polygon_coverage, transform_polygons
-from pyklip_diffrender.propagation import MatrixFourier, tilt_phases
+from pyklip_diffrender.propagation import MatrixFourier, centred, tilt_phases
 from pyklip_diffrender.units import ARCSEC
 from pyklip_diffrender.zernike import zernike_basis
 
@@ -97,7 +97,7 @@ class EntrancePupil:
         self.lit = amplitude > 0
         """Where light passes, (npix, npix)."""
 
-    def field(self, opd: Tensor, wavelength: float, star_offset: Tensor) -> Wavefront:
+    def field(self, opd: Tensor, wavelength: float, star_offset: Tensor | None) -> Wavefront:
         """The field behind the pupil.
 
         Parameters
@@ -106,8 +106,8 @@ class EntrancePupil:
             m. An imaginary part is absorption: the amplitude is exp(-2 pi Im / wavelength).
         wavelength : float
             m.
-        star_offset : Tensor, (..., 2)
-            arcsec, image orientation.
+        star_offset : Tensor, (..., 2), or None
+            arcsec, image orientation; None on the axis.
         """
         opd = self.full.crop(opd, self.grid)
         wavenumber = 2 * math.pi / wavelength
@@ -116,8 +116,9 @@ class EntrancePupil:
             amplitude = amplitude * torch.exp(-wavenumber * opd.imag).to(self.dtype)
             opd = opd.real
         phase = wavenumber * opd.to(self.dtype)
-        x, y = tilt_phases(star_offset * ARCSEC, self.grid, wavelength)
-        phase = phase + (x[..., None, :] + y[..., :, None]).to(self.dtype)
+        if star_offset is not None:
+            x, y = tilt_phases(star_offset * ARCSEC, self.grid, wavelength)
+            phase = phase + (x[..., None, :] + y[..., :, None]).to(self.dtype)
         # torch.polar does the same in 1.6 times the time (1024 x 1024, two cores).
         field = torch.complex(amplitude * torch.cos(phase), amplitude * torch.sin(phase))
         return Wavefront(field, wavelength, self.grid)
@@ -191,7 +192,8 @@ class LyotStop:
         self.dtype, self.device = dtype, device
         self._full = PupilGrid.full(npix, diameter)
         coverage = polygon_coverage(openings, self._full)
-        self._tight = self._full.around(coverage)
+        # Symmetric about the axis, for then transforms are half as large.
+        self._tight = centred(self._full.around(coverage))
         self._wide = self._tight.widened(self.margin * diameter)
         self._fixed = self._full.crop(coverage, self._tight).to(device, dtype)
 
@@ -293,8 +295,8 @@ class CompactOcculter:
         as a constant: 1 - t must be computed without forming t, which would cancel.
     radius : float
         arcsec; `complement` vanishes beyond.
-    sampling : float
-        Cells per lambda / `diameter`.
+    sampling : float, optional
+        Cells per lambda / `diameter`; 4 unless given.
     """
 
     parameters: tuple[str, ...] = ()
@@ -303,13 +305,13 @@ class CompactOcculter:
         self,
         complement: Callable[[Tensor, Tensor], Tensor],
         radius: float,
-        sampling: float,
+        sampling: float | None,
         diameter: float,
         dtype: torch.dtype,
         device: torch.device,
         name: str = "occulter",
     ) -> None:
-        if sampling < 1:
+        if sampling is not None and sampling < 1:
             raise IncompatibleSetupError(
                 f"occulter_sampling: got {sampling} cells per lambda/D, expected at least 1 "
                 "(below that the cells alias the pupil onto itself; 2 to 4 is usual)"
@@ -327,7 +329,7 @@ class CompactOcculter:
     def cells(self, wavelength: float) -> tuple[Tensor, Tensor]:
         """Cell positions along one axis (radians) and 1 - t on the cells."""
         if wavelength not in self._cells:
-            spacing = wavelength / self.diameter / self.sampling
+            spacing = wavelength / self.diameter / (self.sampling or 4.0)
             half = math.ceil(self.radius * ARCSEC / spacing)
             axis = torch.arange(-half, half + 1, dtype=torch.float64) * spacing
             angle = axis / ARCSEC

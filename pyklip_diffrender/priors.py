@@ -76,26 +76,26 @@ class EvidenceUpdate:
     ----------
     step : Tensor, (parameters,)
         Most probable values.
-    covariance : Tensor, (parameters, parameters), or None if it was not asked for
+    variance : Tensor, (parameters,), or None if it was not asked for
+        Diagonal of the covariance.
     scales : Tensor, (groups,)
     effective : float
-        Number of wavefront parameters that the data determine.
+        Number of wavefront parameters that the data determine (with the scales before the last
+        update, where no errors were asked for).
     log_evidence : float
         Up to a constant that does not depend on the scales.
     """
 
     step: Tensor
-    covariance: Tensor | None
+    variance: Tensor | None
     scales: Tensor
     effective: float
     log_evidence: float
 
     def in_units(self, unit: Tensor) -> EvidenceUpdate:
         """The same for unknowns measured in other units, `unit` of the new ones to the old."""
-        covariance = self.covariance
-        if covariance is not None:
-            covariance = covariance * unit[:, None] * unit
-        return replace(self, step=self.step * unit, covariance=covariance)
+        variance = None if self.variance is None else self.variance * unit**2
+        return replace(self, step=self.step * unit, variance=variance)
 
 
 def _inverse_of_lower(factor: Tensor) -> Tensor:
@@ -117,7 +117,7 @@ def solve_with_evidence(
     iterations: int,
     damping: float = 0.0,
     current: Tensor | None = None,
-    covariance: bool = False,
+    errors: bool = False,
     floor: float = 1e-4,
 ) -> EvidenceUpdate:
     """Solve a whitened linear least-squares problem with Gaussian priors about zero.
@@ -142,26 +142,24 @@ def solve_with_evidence(
         Levenberg-Marquardt: steps away from `current` cost this much of the prior's penalty.
     current : Tensor, (n,), optional
         Where the unknowns are now.
-    covariance : bool
-        Also compute the covariance.
+    errors : bool
+        Also compute the variances.
     floor : float
         Smallest scale, so that an absent group does not end in a division by zero.
     """
     others = len(fixed_deviation)
-    diagonal = torch.arange(len(curvature))
-    inverse, effective = curvature, float("nan")
+    effective = float("nan")
     for k in range(iterations + 1):
         deviation = torch.cat([fixed_deviation, scales[group] * shape])
         precision = deviation**-2
         system = curvature.clone()
-        system[diagonal, diagonal] += (1 + damping) * precision
+        system.diagonal().add_((1 + damping) * precision)
         factor = torch.linalg.cholesky(system)
         pulled = gradient if current is None else gradient + damping * precision * current
         step = torch.cholesky_solve(pulled[:, None], factor)[:, 0]
-        if not iterations and not covariance:
+        if k == iterations and not errors:
             break
-        inverse = _inverse_of_lower(factor)
-        variance = (inverse**2).sum(dim=0)
+        variance = _inverse_of_lower(factor).square_().sum(dim=0)
         # How many of a group's modes the data determine, and the scale that they have.
         determined = 1 - precision[others:] * variance[others:]
         effective = float(determined.sum())
@@ -175,6 +173,4 @@ def solve_with_evidence(
     log_evidence = float(
         0.5 * gradient @ step - factor.diagonal().log().sum() - deviation[known].log().sum()
     )
-    return EvidenceUpdate(
-        step, inverse.T @ inverse if covariance else None, scales, effective, log_evidence
-    )
+    return EvidenceUpdate(step, variance if errors else None, scales, effective, log_evidence)

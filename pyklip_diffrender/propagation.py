@@ -13,16 +13,23 @@ at (x0, y0) has the pupil phase -2 pi (x0 xi - y0 eta) / lambda.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from pyklip_diffrender.geometry import PupilGrid
 
-__all__ = ["MatrixFourier", "tilt_phases"]
+__all__ = ["MatrixFourier", "RowTransform", "centred", "kernel", "symmetric", "tilt_phases"]
 
 
-def _kernel(image: Tensor, pupil: Tensor, wavelength: float, sign: int) -> Tensor:
+def centred(grid: PupilGrid) -> PupilGrid:
+    """The window with rows and columns added so that it is symmetric about the axis."""
+    row, column = (max(stop, grid.npix - start) for start, stop in (grid.rows, grid.columns))
+    return replace(grid, rows=(grid.npix - row, row), columns=(grid.npix - column, column))
+
+
+def kernel(image: Tensor, pupil: Tensor, wavelength: float, sign: int) -> Tensor:
     """``exp(sign 2 pi i image pupil / wavelength)``, (image, pupil), in double precision."""
     turns = image[:, None] * pupil[None, :] / wavelength
     # Whole turns are dropped before the cosine: the phase stays small, whatever the field.
@@ -51,7 +58,7 @@ def tilt_phases(offset: Tensor, grid: PupilGrid, wavelength: float) -> tuple[Ten
     return tuple(2 * math.pi * (t - torch.round(t.detach())) for t in (x_turns, y_turns))  # type: ignore[return-value]
 
 
-class _Transform:
+class RowTransform:
     """The kernel ``exp(sign 2 pi i q p / lambda)`` between positions q and p, along axis -2.
 
     Where the positions lie symmetrically about zero, as cells and centred pixels do, the kernel
@@ -70,17 +77,17 @@ class _Transform:
     ) -> None:
         self.sign = sign
         self.sizes = len(image), len(pupil)
-        self._image_folds = fold and _symmetric(image)
-        self._pupil_folds = self._image_folds and _symmetric(pupil)
+        self._image_folds = fold and symmetric(image)
+        self._pupil_folds = self._image_folds and symmetric(pupil)
         if self._image_folds:
             image = image[len(image) // 2 :]
             pupil = pupil[len(pupil) // 2 :] if self._pupil_folds else pupil
-        kernel = _kernel(image, pupil, wavelength, sign)
+        values = kernel(image, pupil, wavelength, sign)
         if self._image_folds:
-            self._cosine = kernel.real.contiguous().to(dtype.to_real())
-            self._sine = (sign * kernel.imag).contiguous().to(dtype.to_real())
+            self._cosine = values.real.contiguous().to(dtype.to_real())
+            self._sine = (sign * values.imag).contiguous().to(dtype.to_real())
         else:
-            self._matrix = kernel.to(dtype)
+            self._matrix = values.to(dtype)
 
     def forward(self, field: Tensor) -> Tensor:
         """(..., pupil, k) to (..., image, k)."""
@@ -103,7 +110,7 @@ class _Transform:
         return _unfold(cosine, sine, self.sizes[1]) if self._pupil_folds else cosine + 1j * sine
 
 
-def _symmetric(positions: Tensor) -> bool:
+def symmetric(positions: Tensor) -> bool:
     """Whether positions lie symmetrically about zero."""
     if len(positions) < 2:
         return False
@@ -175,10 +182,10 @@ class MatrixFourier:
     ) -> None:
         self.grid = grid
         pupil_x, pupil_y = grid.x.to(x.device), grid.y.to(x.device)
-        self._columns = _kernel(x, pupil_x, wavelength, +1).T.contiguous().to(dtype)
-        self._rows = _Transform(y, pupil_y, wavelength, -1, dtype, fold)
+        self._columns = RowTransform(x, pupil_x, wavelength, +1, dtype, fold)
+        self._rows = RowTransform(y, pupil_y, wavelength, -1, dtype, fold)
         self._shear = (
-            _kernel(shear * x, pupil_y, wavelength, -1).T.contiguous().to(dtype) if shear else None
+            kernel(shear * x, pupil_y, wavelength, -1).T.contiguous().to(dtype) if shear else None
         )
         self._scale = grid.spacing**2 / wavelength
         self._inverse_scale = 1 / wavelength
@@ -186,13 +193,14 @@ class MatrixFourier:
     def forward(self, field: Tensor) -> Tensor:
         """Pupil field (..., rows, columns), per m, to image field (..., y, x), per radian."""
         if self._shear is None:
-            return self._scale * (self._rows.forward(field) @ self._columns)
+            return self._scale * self._columns.forward(self._rows.forward(field).mT).mT
         # Along x first: only then does every column have its own shift in y.
-        return self._scale * self._rows.forward((field @ self._columns) * self._shear)
+        return self._scale * self._rows.forward(self._columns.forward(field.mT).mT * self._shear)
 
     def inverse(self, field: Tensor, cell: float) -> Tensor:
         """Image field (..., y, x) on cells of solid angle `cell` (sr), back to the pupil."""
         scale = cell * self._inverse_scale
         if self._shear is None:
-            return scale * self._rows.adjoint(field @ self._columns.conj().T)
-        return scale * ((self._rows.adjoint(field) * self._shear.conj()) @ self._columns.conj().T)
+            return scale * self._rows.adjoint(self._columns.adjoint(field.mT).mT)
+        turned = self._rows.adjoint(field) * self._shear.conj()
+        return scale * self._columns.adjoint(turned.mT).mT

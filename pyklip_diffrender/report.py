@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.demo import DemoResult
+from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.files import replacing
 from pyklip_diffrender.geometry import PupilGrid, maskrnd_openings, polygon_coverage
 from pyklip_diffrender.refinement import Refinement
 
 if TYPE_CHECKING:
+    from astropy.table import Table
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_demo", "draw_image", "draw_subtraction", "save"]
+__all__ = ["draw_bench", "draw_demo", "draw_detection", "draw_image", "draw_subtraction", "save"]
 
 _INK = "#1b1f24"
 
@@ -170,4 +172,85 @@ def draw_subtraction(fit: Refinement) -> Figure:
         ax.set_xlabel("arcsec from the middle of the array", fontsize=8)
         for _, x, y in fit.companions:
             ax.plot(star[0] + x, star[1] + y, "o", mfc="none", mec="#2f9e44", ms=16, mew=1.4)
+    return figure
+
+
+def draw_detection(found: Detection) -> Figure:
+    """S/N map, the same without the candidates, and the contrast curve."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(14.5, 4.6), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    (x0, y0), (x1, y1) = found.grid[0, 0], found.grid[-1, -1]
+    pixel = found.fits[0].model.detector.pixelscale
+    extent = (x0 - pixel[0] / 2, x1 + pixel[0] / 2, y0 - pixel[1] / 2, y1 + pixel[1] / 2)
+    table = found.table
+    for ax, image, title in (
+        (left, found.snr, f"S/N of a point source, {len(table)} above {found.threshold:g}"),
+        (middle, found.residual_snr, "S/N once those are taken out"),
+    ):
+        shown = ax.imshow(image, origin="lower", extent=extent, cmap="RdBu_r", vmin=-8, vmax=8)
+        figure.colorbar(shown, ax=ax, shrink=0.85, label="S/N")
+        ax.plot(0, 0, "+", color=_INK, ms=9)
+        ax.plot(table["x"].value, table["y"].value, "o", mfc="none", mec="#2f9e44", ms=15, mew=1.4)
+        ax.set_title(title, fontsize=10, color=_INK, loc="left")
+        ax.set_xlabel("arcsec from the star", fontsize=8)
+    curve = found.contrast_curve
+    separation = curve["separation"].value
+    right.fill_between(
+        separation, curve["lowest"], curve["highest"], color="#5b3f95", alpha=0.15, lw=0
+    )
+    right.semilogy(separation, curve["contrast"], color="#5b3f95", label="wavefront free")
+    if found.scatter > 1:
+        right.semilogy(
+            separation, curve["small_sample"], ":", color="#5b3f95", label="with few elements"
+        )
+    right.semilogy(separation, curve["known_star"], "--", color=_INK, label="star known")
+    right.semilogy(
+        table["separation"].value, table["contrast"], "o", mfc="none", mec="#2f9e44", ms=9
+    )
+    right.set_xlabel("arcsec", fontsize=9)
+    right.set_title("5 sigma contrast, median and range of angles", fontsize=10, loc="left")
+    right.set_box_aspect(0.85)
+    right.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def draw_bench(table: Table) -> Figure:
+    """Error against time of every way to make an image, without and with its derivative.
+
+    Parameters
+    ----------
+    table : Table
+        What `bench.run_bench` gave.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 5.2), layout="constrained")
+    for ax, row in zip(figure.subplots(1, 2), ("forward", "forward + backward"), strict=True):
+        measured = np.isfinite(table["seconds"]) & (table["error"] > 0)
+        chosen = table[(table["row"] == row) & measured]
+        for line in chosen:
+            ours = str(line["column"]).startswith(("this package", "multi-fidelity", "coarse"))
+            colour = "#5b3f95" if ours else "#c0631a"
+            filled = colour if line["precision"] == "float64" else "none"
+            ax.loglog(line["seconds"], line["error"], "o", color=colour, mfc=filled, ms=7)
+            ax.annotate(
+                str(line["column"]), (line["seconds"], line["error"]), xytext=(6, 4),
+                textcoords="offset points", fontsize=7, color=_INK,
+            )  # fmt: skip
+        # Nothing is both faster and better than these.
+        order = np.argsort(chosen["seconds"])
+        best = np.minimum.accumulate(np.asarray(chosen["error"])[order])
+        front = np.asarray(chosen["seconds"])[order]
+        ax.step(front, best, where="post", color="0.75", lw=1, zorder=0)
+        ax.margins(0.15)
+        ax.set_xlabel("seconds", fontsize=9)
+        ax.set_title(f"{row[0].upper()}{row[1:]}", fontsize=10, color=_INK, loc="left")
+        ax.tick_params(labelsize=8, colors=_INK)
+        if row == "forward":
+            ax.set_ylabel("largest error / peak", fontsize=9)
+            ax.plot([], [], "o", color=_INK, label="float64")
+            ax.plot([], [], "o", color=_INK, mfc="none", label="float32")
+            ax.legend(frameon=False, fontsize=8)
     return figure

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from pyklip_diffrender.bases import Basis
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.geometry import PupilGrid
+from pyklip_diffrender.geometry import PupilGrid, samples_for_field
 from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.units import ARCSEC
 
@@ -37,14 +37,22 @@ _log = logging.getLogger(__name__)
 NANOMETRE = 1e-9
 """Wavefront coefficients are in nm inside a fit, so that all its numbers are of order 1."""
 
+IMAGE_PARAMETERS = ("blur",)
+"""Parameters that act on the image; all others act on the field."""
+
 _BATCH_BYTES = 2.5e7
 
 
 def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     """A cheaper copy of a model for derivatives: 2 cells per lambda/D, single precision.
 
-    A model without a recipe, or one that is already as coarse, serves itself.
+    A model without a recipe, or one that is already as coarse, serves itself. A wide field takes
+    more samples, by powers of two, so that the image does not repeat inside it.
     """
+    detector = model.detector
+    field = max(n * s for n, s in zip(detector.shape[::-1], detector.pixelscale, strict=True))
+    while npix < samples_for_field(field, min(model.bandpass.wavelengths), model.diameter):
+        npix *= 2
     if not model.recipe or model.npix <= npix or model.npix % npix:
         return model
     return model.with_fidelity(npix=npix, occulter_sampling=2.0, dtype=torch.float32)
@@ -74,6 +82,8 @@ class WavefrontResponse:
         About which to linearise, m.
     values : dict of Tensor
         Values of the model's other parameters.
+    names : tuple of str
+        Other parameters whose derivatives are kept as well.
     npix : int
         Pupil samples of the coarse copy that does the propagations.
     memory_limit : float
@@ -94,11 +104,12 @@ class WavefrontResponse:
         opd: Tensor,
         values: dict[str, Tensor],
         *,
+        names: tuple[str, ...] = (),
         npix: int = 128,
         memory_limit: float = 4e9,
         progress: bool = False,
     ) -> None:
-        self.model = model
+        self.model, self.names = model, names
         coarse = coarse_copy(model, npix)
         self.coarse = coarse
         ny, nx = (n * model.detector.oversample for n in model.detector.shape)
@@ -135,6 +146,7 @@ class WavefrontResponse:
                     wavenumber = 2 * math.pi / wavefront.wavelength * NANOMETRE
                     moved = replace(wavefront, field=modes * (1j * wavenumber * wavefront.field))
                     kept[start:stop] = coarse.propagate(moved, values)
+        self._slopes = field_derivatives(coarse, downsample(opd, coarse.npix), values, names)
         _log.debug("response of %d modes at %d pupil samples", len(basis), coarse.npix)
 
     def image(
@@ -170,6 +182,10 @@ class WavefrontResponse:
             total[:modes] += product.real
             total[modes:] += product[:amplitude_modes].imag
         return self.coarse.detector.image(total, values)
+
+    def parameters(self, fields: Sequence[Tensor], values: dict[str, Tensor]) -> Tensor:
+        """Derivative of the image with respect to the other parameters, (components, ny, nx)."""
+        return image_derivatives(self.model, fields, values, self.names, self._slopes)
 
 
 _OPENINGS = 20.0
@@ -209,7 +225,9 @@ class Responses:
         self.relinearise, self.memory_limit, self.progress = relinearise, memory_limit, progress
         self._kept: list[tuple[Tensor, dict[str, Tensor], WavefrontResponse]] = []
 
-    def near(self, opd: Tensor, values: dict[str, Tensor]) -> WavefrontResponse:
+    def near(
+        self, opd: Tensor, values: dict[str, Tensor], names: tuple[str, ...] = ()
+    ) -> WavefrontResponse:
         """The response where the field differs little from that of `opd` and `values`."""
         inside = opd[self.model.entrance.lit]
         for there, then, response in reversed(self._kept):
@@ -224,6 +242,7 @@ class Responses:
             self.basis,
             opd,
             values,
+            names=names,
             npix=self.npix,
             memory_limit=self.memory_limit,
             progress=self.progress,
@@ -258,14 +277,10 @@ class Responses:
         return float(total.sqrt())
 
 
-def parameter_jacobian(
-    model: OpticalSystem,
-    opd: Tensor,
-    values: dict[str, Tensor],
-    names: tuple[str, ...],
-    fields: Sequence[Tensor] | None = None,
-) -> Tensor:
-    """Derivative of the image with respect to the components of named parameters.
+def field_derivatives(
+    model: OpticalSystem, opd: Tensor, values: dict[str, Tensor], names: tuple[str, ...]
+) -> dict[str, list[Tensor]]:
+    """Derivatives of the complex field on the detector with respect to named parameters.
 
     Forward-mode derivatives of the model itself.
 
@@ -278,32 +293,96 @@ def parameter_jacobian(
     values : dict of Tensor
         Where to differentiate; must hold every name.
     names : tuple of str
-    fields : sequence of Tensor, optional
-        The finer model's fields there, at each wavelength. Then only the fields' derivatives are
-        the coarse model's: E = E_fine + (E_coarse - E_coarse at `values`).
+        Those that act on the image only (`IMAGE_PARAMETERS`) are left out.
 
     Returns
     -------
-    Tensor, (components, ny, nx)
-        Light per pixel per unit of the parameter table.
+    dict of str to list of Tensor
+        For every wavelength (components, ny, nx), per unit of the parameter table.
     """
     # Constants are built and kept at the first call; that must not happen inside a transform.
     with torch.no_grad():
-        here = model.fields(opd, **values)
-    if fields is None:
-        missing = [torch.zeros_like(field) for field in here]
-    else:
-        missing = [
-            fine.to(coarse.dtype) - coarse for fine, coarse in zip(fields, here, strict=True)
-        ]
+        model(opd, **values)
+    found = {}
+    for name in names:
+        if name in IMAGE_PARAMETERS:
+            continue
+
+        def fields(value: Tensor, name: str = name) -> list[Tensor]:
+            # Complex outputs of jacfwd would need complex inputs.
+            return [
+                torch.view_as_real(field) for field in model.fields(opd, **{**values, name: value})
+            ]
+
+        slopes = torch.func.jacfwd(fields)(values[name])
+        found[name] = [torch.view_as_complex(s.movedim(-1, 0).contiguous()) for s in slopes]
+    return found
+
+
+def image_derivatives(
+    model: OpticalSystem,
+    fields: Sequence[Tensor],
+    values: dict[str, Tensor],
+    names: tuple[str, ...],
+    slopes: dict[str, list[Tensor]],
+) -> Tensor:
+    """Derivatives of the image from those of the field, for a star with the given fields.
+
+    Parameters
+    ----------
+    model : OpticalSystem
+    fields : sequence of Tensor
+        The star's field at each wavelength; of a finer model, if there is one.
+    values : dict of Tensor
+    names : tuple of str
+    slopes : dict of str to list of Tensor
+        What `field_derivatives` gave.
+
+    Returns
+    -------
+    Tensor, (components of all names in order, ny, nx)
+        Light per pixel per unit of the parameter table.
+    """
     rows = []
     for name in names:
+        if name in IMAGE_PARAMETERS:
 
-        def image(value: Tensor, name: str = name) -> Tensor:
-            there = {**values, name: value}
-            moved = model.fields(opd, **there)
-            corrected = [field + rest for field, rest in zip(moved, missing, strict=True)]
-            return model.image_of(corrected, there)
+            def image(value: Tensor, name: str = name) -> Tensor:
+                return model.image_of(fields, {**values, name: value})
 
-        rows.append(torch.func.jacfwd(image)(values[name]).movedim(-1, 0))
-    return torch.cat(rows)
+            rows.append(torch.func.jacfwd(image)(values[name]).movedim(-1, 0))
+            continue
+        total = torch.zeros((), dtype=fields[0].real.dtype, device=model.device)
+        for field, slope, weight in zip(fields, slopes[name], model.bandpass.weights, strict=True):
+            total = total + 2 * weight * (field.conj() * slope).real
+        rows.append(model.detector.image(total, values))
+    return torch.cat([row.double() for row in rows])
+
+
+def parameter_jacobian(
+    model: OpticalSystem,
+    opd: Tensor,
+    values: dict[str, Tensor],
+    names: tuple[str, ...],
+    fields: Sequence[Tensor] | None = None,
+) -> Tensor:
+    """Derivative of the image with respect to the components of named parameters.
+
+    Parameters
+    ----------
+    model, opd, values, names
+        See `field_derivatives`.
+    fields : sequence of Tensor, optional
+        The finer model's fields there, at each wavelength. Then only the fields' derivatives are
+        those of `model`.
+
+    Returns
+    -------
+    Tensor, (components, ny, nx), float64
+        Light per pixel per unit of the parameter table.
+    """
+    slopes = field_derivatives(model, opd, values, names)
+    if fields is None:
+        with torch.no_grad():
+            fields = model.fields(opd, **values)
+    return image_derivatives(model, fields, values, names, slopes)

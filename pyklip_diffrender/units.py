@@ -6,6 +6,7 @@ nothing from outside reaches torch but through these functions. Inputs are never
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from astropy import units as u
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pyklip_diffrender.errors import NonFiniteError, ShapeError, UnitError
+from pyklip_diffrender.errors import DiffrenderWarning, NonFiniteError, ShapeError, UnitError
 
 __all__ = [
     "ARCSEC",
@@ -23,7 +24,11 @@ __all__ = [
     "to_arcsec",
     "to_metres",
     "to_unit",
+    "warn_of_rms",
 ]
+
+_PLAUSIBLE_RMS = (1e-9, 2e-6)
+"""Of a wavefront of JWST, m."""
 
 ARCSEC = float((1 * u.arcsec).to_value(u.rad))
 """One arcsecond in radians."""
@@ -108,3 +113,28 @@ def require_finite(array: NDArray[Any], name: str, where: NDArray[np.bool_] | No
             f"{name}: {int(bad.sum())} values are NaN or infinite, the first at index {first}. "
             "Replace them, or mask them where a mask is taken"
         )
+
+
+def warn_of_rms(rms: float, name: str, stacklevel: int, *, small: bool = True) -> None:
+    """Warn of a wavefront whose rms, in m, looks like one in another unit.
+
+    Parameters
+    ----------
+    rms : float
+    name : str
+        What it is, for the message.
+    stacklevel : int
+        As of `warnings.warn`, counted from this function.
+    small : bool
+        Whether it may be too small, too; 0 never is.
+    """
+    low, high = _PLAUSIBLE_RMS
+    if rms == 0 or (low if small else 0.0) < rms < high:
+        return
+    likely = [unit for unit in ("um", "nm", "mm") if low < rms * u.Unit(unit).to(u.m) < high]
+    hint = f"; in {' or '.join(likely)} it would be plausible" if likely else ""
+    warnings.warn(
+        f"{name}: an rms of {rms:.3g} m inside the pupil is not plausible for JWST{hint}",
+        DiffrenderWarning,
+        stacklevel=stacklevel,
+    )

@@ -17,19 +17,21 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "pyklip_diffrender"
 
 LAYERS = (
-    ("errors", "units", "files"),
+    ("errors", "units", "files", "headers"),
     ("geometry", "zernike", "spectrum", "parameters", "orientation"),
-    ("propagation",),
-    ("planes", "detector", "masks", "arrays", "rotation", "detector_effects", "psf_file", "optics"),
+    ("propagation", "streaming"),
+    ("planes", "detector", "masks", "arrays", "rotation", "detector_effects", "cells"),
+    ("psf_file", "optics"),
+    ("lattice",),
     ("nircam",),
     ("bridges",),
     ("observation", "scene", "simulation"),
     ("bases", "priors", "opd"),
-    ("response",),
+    ("response", "multifidelity", "linear_file", "linear_model"),
     ("refinement",),
-    ("metrics",),
+    ("metrics", "detection"),
     ("pyklip_backend",),
-    ("demo", "report", "cli"),
+    ("demo", "report", "bench", "cli"),
 )
 """All modules, in order: a module imports only from those before it, in its own row as well."""
 

@@ -130,6 +130,11 @@ def test_files_that_are_something_else(wss: Path, tmp_path: Path) -> None:
         hdus["RESULT_PHASE"].data = values
         hdus["RESULT_PHASE"].header["BUNIT"] = "radian"
         hdus.writeto(tmp_path / "radians.fits")
+        hdus["RESULT_PHASE"].header["BUNIT"] = "micron"
+        date = hdus[0].header["DATE-OBS"]
+        hdus[0].header["DATE-OBS"] = "yesterday"
+        hdus.writeto(tmp_path / "undated.fits")
+        hdus[0].header["DATE-OBS"] = date
         del hdus["RESULT_PHASE"].header["BUNIT"]
         del hdus[0].header["APERNAME"], hdus[0].header["DATE-OBS"]
         hdus.writeto(tmp_path / "R2023010203-NRCA3_FP1-1.fits")
@@ -139,6 +144,8 @@ def test_files_that_are_something_else(wss: Path, tmp_path: Path) -> None:
         load_wss_opd(tmp_path / "upside_down.fits", npix=NPIX, backout_si_wfe=False)
     with pytest.raises(IncompatibleSetupError, match="'radian'"):
         load_wss_opd(tmp_path / "radians.fits", npix=NPIX, backout_si_wfe=False)
+    with pytest.raises(CorruptFileError, match=r"undated\.fits: DATE-OBS.*yesterday"):
+        load_wss_opd(tmp_path / "undated.fits", npix=NPIX, backout_si_wfe=False)
     bare = tmp_path / "R2023010203-NRCA3_FP1-1.fits"
     loaded = load_wss_opd(bare, npix=NPIX, backout_si_wfe=False)
     assert loaded.epoch == Time("2023-01-02")

@@ -90,6 +90,7 @@ def plain() -> np.ndarray:
     return np.arange(-24, 24, dtype=np.float64).reshape(6, 8) / 4
 
 
+@pytest.mark.hard
 @pytest.mark.parametrize(
     "dress",
     [
@@ -114,6 +115,7 @@ def test_every_kind_of_array_becomes_the_same_native_copy(dress: object, plain: 
     torch.from_numpy(got)
 
 
+@pytest.mark.hard
 def test_a_memory_mapped_read_only_file_is_copied(tmp_path: Path, plain: np.ndarray) -> None:
     path = tmp_path / "map.dat"
     plain.astype(">f8").tofile(path)
@@ -177,6 +179,7 @@ def test_a_whole_file_is_read_and_usable_afterwards(tmp_path: Path, suffix: str)
     assert kept[63, 63] == -4095.0
 
 
+@pytest.mark.hard
 @pytest.mark.parametrize("percent", [25, 50, 99])
 @pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
 def test_a_truncated_file_is_an_error_that_names_it(
@@ -192,6 +195,7 @@ def test_a_truncated_file_is_an_error_that_names_it(
     assert str(cut.stat().st_size) in str(caught.value)
 
 
+@pytest.mark.hard
 def test_damaged_compression_is_a_corrupt_file(tmp_path: Path) -> None:
     path = written(tmp_path / "damaged.fits.gz")
     whole = bytearray(path.read_bytes())

@@ -135,6 +135,7 @@ def test_a_single_frame_is_a_stack_of_one(tmp_path: Path, frames: np.ndarray) ->
     assert got.position_angles.shape == (1,)
 
 
+@pytest.mark.hard
 def test_scaled_integers_equal_their_values(tmp_path: Path, frames: np.ndarray) -> None:
     counts = np.round(frames * 100).astype(np.int16)
     path = calints(tmp_path / "int16.fits", counts, np.ones_like(frames))
@@ -147,6 +148,7 @@ def test_scaled_integers_equal_their_values(tmp_path: Path, frames: np.ndarray) 
 # -- files that will not do ------------------------------------------------------------------
 
 
+@pytest.mark.hard
 @pytest.mark.parametrize("percent", [25, 50, 99])
 @pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
 def test_a_truncated_file_is_an_error_that_names_it(
@@ -207,6 +209,7 @@ def test_a_file_without_frames_is_an_error(tmp_path: Path, frames: np.ndarray) -
 # -- arrays ----------------------------------------------------------------------------------
 
 
+@pytest.mark.hard
 def test_arrays_of_any_kind_equal_float64_copies_and_stay_as_they_are(
     tmp_path: Path, frames: np.ndarray
 ) -> None:
@@ -223,6 +226,7 @@ def test_arrays_of_any_kind_equal_float64_copies_and_stay_as_they_are(
         assert got.data.flags.writeable
 
 
+@pytest.mark.hard
 def test_bad_pixels_become_zero_in_the_copy_only(frames: np.ndarray) -> None:
     data, error = frames.astype(np.float64), np.ones(frames.shape)
     data[0, 0, 1], data[0, 0, 2] = np.nan, np.inf

@@ -74,6 +74,7 @@ def test_files_in_any_unit_give_the_same_metres(
     np.testing.assert_allclose(got.data, opd, rtol=1e-14, atol=1e-24)
 
 
+@pytest.mark.hard
 def test_quantities_in_any_unit_give_the_same_image(opd: np.ndarray) -> None:
     model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=12)
     expected = model(opd)
@@ -99,6 +100,7 @@ def test_a_unit_that_is_no_length_is_refused(tmp_path: Path, opd: np.ndarray, un
         as_opd_map(opd * u.s)
 
 
+@pytest.mark.hard
 @pytest.mark.parametrize(
     ("size", "likely"), [(1e9, "nm"), (1e6, "um"), (1e3, "mm"), (1e-3, None), (1e12, None)]
 )
@@ -125,6 +127,7 @@ def test_a_flat_wavefront_is_plausible() -> None:
 # -- holes -----------------------------------------------------------------------------------
 
 
+@pytest.mark.hard
 def test_nan_inside_the_pupil_is_counted_and_located(
     tmp_path: Path, opd: np.ndarray, pupil: np.ndarray
 ) -> None:
@@ -152,6 +155,7 @@ def test_nan_outside_the_pupil_becomes_zero(
 # -- files -----------------------------------------------------------------------------------
 
 
+@pytest.mark.hard
 @pytest.mark.parametrize("percent", [25, 50, 99])
 @pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
 def test_a_truncated_map_is_an_error_that_names_it(
@@ -209,6 +213,7 @@ def test_date_name_and_hash_are_kept(tmp_path: Path, opd: np.ndarray) -> None:
 # -- arrays of all kinds ---------------------------------------------------------------------
 
 
+@pytest.mark.hard
 def test_every_kind_of_array_equals_a_float64_copy(tmp_path: Path, opd: np.ndarray) -> None:
     steps = np.round(opd / 1e-11).astype(np.int16)
     scaled = fits.PrimaryHDU(steps)
@@ -320,6 +325,7 @@ def test_random_opd_has_the_rms_that_was_asked_for_and_no_piston(seed: int) -> N
     assert got == pytest.approx(4.5e-9, rel=1e-6)
 
 
+@pytest.mark.hard
 def test_the_same_seed_gives_the_same_bits_and_another_seed_another_wavefront() -> None:
     first, again = random_opd(5, npix=NPIX), random_opd(5, npix=NPIX)
     assert first.data.tobytes() == again.data.tobytes()

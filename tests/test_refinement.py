@@ -120,6 +120,7 @@ def test_gauss_newton_explains_the_data(fit: Refinement) -> None:
     assert fit.model_error == 0.0
 
 
+@pytest.mark.hard
 def test_gauss_newton_lowers_the_error_of_the_star_to_about_the_noise(
     bright: Case, fit: Refinement
 ) -> None:
@@ -282,6 +283,7 @@ def test_missing_pixels_cost_precision_not_truth(tiny: Case, share: float) -> No
     assert np.sqrt(np.mean(away**2)) < 1.0
 
 
+@pytest.mark.hard
 def test_the_same_seed_gives_the_same_bits(tiny: Case) -> None:
     first, again = (quick(tiny, seed=5) for _ in range(2))
     assert first.opd.tobytes() == again.opd.tobytes()
@@ -485,6 +487,7 @@ def test_unknown_methods_options_and_parameters_list_the_known(tiny: Case) -> No
         quick(tiny, free=("lyot_shfit",))
 
 
+@pytest.mark.hard
 def test_all_pixels_masked_is_an_error(tiny: Case) -> None:
     blind = replace(tiny.observation, valid=np.zeros_like(tiny.observation.valid))
     for method in METHODS:
@@ -492,6 +495,7 @@ def test_all_pixels_masked_is_an_error(tiny: Case) -> None:
             refine(tiny.model, blind, tiny.opd, method=method)
 
 
+@pytest.mark.hard
 def test_a_broken_wavefront_is_an_error(tiny: Case) -> None:
     bad = tiny.opd.copy()
     bad[20, 20] = np.nan

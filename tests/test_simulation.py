@@ -102,6 +102,7 @@ def test_a_planet_appears_where_it_was_put(
                       - (expected_y, expected_x))) < 1.0  # fmt: skip
 
 
+@pytest.mark.hard
 def test_planet_photons_are_linear_in_contrast(model: OpticalSystem, opd: np.ndarray) -> None:
     scene = Scene()
     one = planet_photons(model, scene, Planet(1e-6, 0.6, 54), opd)
@@ -180,6 +181,7 @@ def test_many_seeds_average_to_the_scene(model: OpticalSystem, opd: np.ndarray) 
     assert np.sqrt(np.mean(away**2)) == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.hard
 def test_the_same_seed_gives_the_same_frames(model: OpticalSystem, opd: np.ndarray) -> None:
     scene = Scene(planets=(Planet(1e-5, 0.6, 54),))
     first = simulate(model, scene, opd, seed=8, frames=2)

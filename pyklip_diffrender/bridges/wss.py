@@ -329,7 +329,14 @@ def _sensing_terms(aperture: str, opd: Array, npix: int) -> tuple[Array, Array, 
 def _epoch(header: Any, name: str) -> Time | None:
     """When it was measured: from the header, or to the day from the name."""
     if "DATE-OBS" in header:
-        return Time(f"{header['DATE-OBS']}T{header.get('TIME-OBS', '00:00:00')}", scale="utc")
+        epoch = f"{header['DATE-OBS']}T{header.get('TIME-OBS', '00:00:00')}"
+        try:
+            return Time(epoch, scale="utc")
+        except ValueError as error:
+            raise CorruptFileError(
+                f"{name}: DATE-OBS and TIME-OBS are {epoch!r}, expected such as "
+                "'2022-08-11T01:02:03'. Correct the header, or fetch the file again"
+            ) from error
     found = re.match(r"[A-Z](\d{4})(\d{2})(\d{2})\d{2}-", name)
     if found is None:
         _LOG.warning("%s: no DATE-OBS, and no date in its name", name)

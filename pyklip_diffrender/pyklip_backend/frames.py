@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 from astropy.io import fits
-from astropy.time import Time
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
+from pyklip_diffrender.headers import header_date
 from pyklip_diffrender.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.observation import Observation
 from pyklip_diffrender.pyklip_backend.capture import SourceFrames, source_frames_of
@@ -78,7 +78,6 @@ class Frames:
 
     def observation(self, usable: NDArray[np.bool_]) -> Observation:
         """The frames picked by `usable` (n,) bool as what the fit takes."""
-        date = self.header.get("DATE-BEG") or self.header.get("DATE-OBS")
         return Observation.from_arrays(
             self.data[usable],
             self.error[usable],
@@ -87,7 +86,7 @@ class Frames:
             pixelscale=self.pixelscale,
             center=self.centers[usable],
             filter=self.filter,
-            date=Time(date, scale="utc") if date else None,
+            date=header_date(self.header, ("DATE-BEG", "DATE-OBS"), self.name),
             position_angles=self.position_angles[usable],
             name=self.name,
             header=self.header,

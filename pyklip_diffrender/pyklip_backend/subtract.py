@@ -222,9 +222,16 @@ def model_for(observation: Observation, settings: DiffrenderSettings) -> Optical
         "pixelscale": observation.pixelscale,
     }
     if _is_nircam(observation) and settings.pixelscale is None:
+        from pyklip_diffrender.geometry import samples_for_field
         from pyklip_diffrender.refinement.presets import NIRCAM_MODEL
+        from pyklip_diffrender.spectrum import filter_throughput
 
         options |= NIRCAM_MODEL
+        # What is subtracted covers the whole frame.
+        (ny, nx), (x, y) = extent(observation).shape, options["pixelscale"]
+        shortest = float(filter_throughput(observation.filter)[0][0])
+        while options["npix"] < samples_for_field(max(nx * x, ny * y), shortest):
+            options["npix"] *= 2
     key = tuple(sorted({**options, **settings.model_options}.items()))
     try:
         return _build_once(observation.filter, key)

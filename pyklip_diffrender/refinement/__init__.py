@@ -17,8 +17,9 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.observation import Observation
 from pyklip_diffrender.opd import as_opd_map
 from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.refinement.gauss_newton import GaussNewtonOptions, gauss_newton
 from pyklip_diffrender.refinement.gradient import AdamOptions, LBFGSOptions, adam, lbfgs
+from pyklip_diffrender.refinement.growth import gauss_newton
+from pyklip_diffrender.refinement.options import GaussNewtonOptions
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement, Status
 
@@ -186,9 +187,7 @@ def refine_again(
     if drift is not None and len(fits) > 1:
         found = {name: first.scales[f"{name} drift"] for name in drift.scales}
         drift = replace(drift, scales=found)
-    settings = replace(
-        old, **{"prior": prior, "drift": drift, "resume": first.linear.vector, **changes}
-    )
+    settings = replace(old, **{"prior": prior, "drift": drift, "resume": first.linear, **changes})
     problems = [Problem(f.model, f.observation, f.initial, f.start) for f in fits]
     return gauss_newton(problems, settings, seed=first.seed, progress=progress)
 

@@ -12,30 +12,30 @@ import logging
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.linalg.blas import dsyrk
 from torch import Tensor
 from tqdm import tqdm
 
-from pyklip_diffrender.bases import Basis, default_basis
+from pyklip_diffrender.bases import Basis
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.linear_model import LinearFrame, LinearModel
-from pyklip_diffrender.priors import EvidenceUpdate, WavefrontPrior, solve_with_evidence
+from pyklip_diffrender.linear_model import LinearModel
+from pyklip_diffrender.priors import EvidenceUpdate, solve_with_evidence
 from pyklip_diffrender.refinement.companions import bright_companions
 from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.joint import Joint
+from pyklip_diffrender.refinement.linearised import Linearised, linearise
 from pyklip_diffrender.refinement.misfit import Misfit, State
+from pyklip_diffrender.refinement.options import GaussNewtonOptions
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement, Status
 from pyklip_diffrender.refinement.unknowns import Unknowns
 from pyklip_diffrender.response import Responses
 from pyklip_diffrender.scene import Planet
 
-__all__ = ["GaussNewtonOptions", "gauss_newton"]
+__all__ = ["GaussNewton"]
 
 _log = logging.getLogger(__name__)
 
@@ -52,97 +52,30 @@ _TRIES = 7
 """How often a step is tried again with more damping."""
 
 
-@dataclass(frozen=True)
-class GaussNewtonOptions:
-    """Settings of the Gauss-Newton refinement.
-
-    Attributes
-    ----------
-    free : tuple of str
-        Free parameters besides the wavefront.
-    wavefront : bool
-        Fit the wavefront; False fits the alignment only.
-    basis : Basis, optional
-        Default segment motions and Fourier modes to 24 cycles.
-    prior : WavefrontPrior
-    own : tuple of str
-        Of the free parameters, those of which every frame has its own value when several are
-        fitted together.
-    drift : WavefrontPrior, optional
-        How much the wavefronts of several frames may differ from the one they share; by default
-        not at all.
-    drift_cycles : float
-        Highest spatial frequency of such differences.
-    planets : tuple of Planet
-        Companions with parameters of their own from the start; positions relative to the star.
-    resume : Tensor, optional
-        The `vector` of an earlier fit's linear model, to go on from; its companions are not
-        taken over.
-    companions : int
-        Most companions that may get parameters of their own, if they stand out of what the
-        alignment fit leaves.
-    companion_threshold : float
-        How far they must stand out, in units of the matched filter's scatter.
-    response_npix : int
-        Pupil samples of the copy of the model that gives derivatives.
-    max_iterations : int
-    tolerance : float
-        Converged when a step lowers the penalised chi2 per pixel by less than this.
-    kappa_floor : float
-        Smallest model error, as a share of the star.
-    relinearise : float
-        Relative change of the field in the pupil (rms; radians for a phase) beyond which its
-        response to the wavefront is computed anew, see `response.Responses`.
-    robust : float
-        Residuals of this many sigma count half (Cauchy's weights); inf for plain least squares.
-    """
-
-    free: tuple[str, ...] = ("star_offset", "lyot_shift", "lyot_rotation", "flux", "background")
-    wavefront: bool = True
-    basis: Basis | None = None
-    prior: WavefrontPrior = field(default_factory=WavefrontPrior)
-    own: tuple[str, ...] = ("star_offset", "flux", "background")
-    drift: WavefrontPrior | None = None
-    drift_cycles: float = 8.0
-    planets: tuple[Planet, ...] = ()
-    resume: Tensor | None = None
-    companions: int = 0
-    companion_threshold: float = 4.0
-    response_npix: int = 128
-    max_iterations: int = 40
-    tolerance: float = 1e-3
-    kappa_floor: float = 0.0
-    relinearise: float = 0.05
-    robust: float = math.inf
-
-
-@dataclass(frozen=True)
-class _Linearised:
-    """Curvature G^T G, gradient G^T r at the unknowns' starts, and where they are now."""
-
-    curvature: Tensor
-    gradient: Tensor
-    current: Tensor
-
-
-def _self_product(rows: Tensor) -> Tensor:
-    """``rows @ rows.T`` at half the cost: only one triangle is computed, then mirrored."""
-    upper = torch.from_numpy(dsyrk(1.0, rows.numpy().T, trans=1))
-    return upper + upper.triu(1).T
-
-
 def _first_modes(basis: Basis, cycles: float) -> int:
     """How many modes, from the first one on, have at most a spatial frequency."""
     beyond = torch.nonzero(basis.frequencies > cycles).flatten()
     return int(beyond[0]) if len(beyond) else len(basis)
 
 
-class _GaussNewton:
+class GaussNewton:
+    """One fit with a given basis.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        The frames.
+    options : GaussNewtonOptions
+        With a basis.
+    progress : bool
+    """
+
     def __init__(
         self, problems: Sequence[Problem], options: GaussNewtonOptions, progress: bool
     ) -> None:
         self.options, self.progress = options, progress
-        self.basis = options.basis or default_basis()
+        assert options.basis is not None
+        self.basis = options.basis
         for problem in problems:
             problem.require_parameters(options.free)
         if not options.free and not options.wavefront:
@@ -168,6 +101,7 @@ class _GaussNewton:
         self._prepare_priors(len(problems))
         self.history: list[dict[str, Any]] = []
         self.damping = 0.0
+        self.equations: Linearised | None = None
         self.state = self._begin(problems)
 
     def _prepare_priors(self, frames: int) -> None:
@@ -235,51 +169,14 @@ class _GaussNewton:
 
     # -- steps -------------------------------------------------------------------------------
 
-    def linearised(
-        self, state: State, kappa: float, with_modes: bool, keep: list[LinearFrame] | None = None
-    ) -> _Linearised:
-        """Normal equations about a state, for the unknowns as distances from their starts.
-
-        `keep` collects what a `LinearModel` needs of every frame.
-        """
-        joint = state.joint
-        size = joint.size if with_modes else joint.where("companions").stop
-        current = (state.vector - joint.initial())[:size]
-        curvature = torch.zeros(size, size, dtype=torch.float64)
-        gradient = torch.zeros(size, dtype=torch.float64)
-        for k, (forward, point) in enumerate(zip(self.misfit.forwards, state.points, strict=True)):
-            residual, weight = self.misfit.weighted(k, point, kappa)
-            rendered = forward.jacobian(point, with_modes)
-            modes = point.unknowns.where("modes").start
-            rows = joint.rows(k)[: len(rendered)]
-            drift = joint.drift_rows(k) if with_modes else torch.zeros(0, dtype=torch.int64)
-            if keep is not None:
-                left = torch.where(weight > 0, residual / weight.clamp(min=1e-300), 0.0)
-                keep.append(
-                    LinearFrame(
-                        left.cpu(), weight.cpu(), rendered.float().cpu(), rows, drift, modes
-                    )
-                )
-            whitened = rendered.mul_(weight).flatten(1).cpu()
-            product, pulled = _self_product(whitened), whitened @ residual.flatten().cpu()
-            if len(state.points) == 1:
-                curvature, gradient = product, pulled
-                continue
-            own = slice(modes, modes + len(drift))
-            for to, which in ((rows, slice(None)), (drift, own)):
-                gradient.index_add_(0, to, pulled[which])
-                for onto, other in ((rows, slice(None)), (drift, own)):
-                    curvature[to[:, None], onto] += product[which, other]
-        return _Linearised(curvature, gradient + curvature @ current, current)
-
     def solve(
         self,
         joint: Joint,
-        equations: _Linearised,
+        equations: Linearised,
         *,
         damping: float = 0.0,
         fit_scales: bool = False,
-        covariance: bool = False,
+        errors: bool = False,
     ) -> EvidenceUpdate:
         """Most probable unknowns, as distances from their starts, for the linearised model."""
         curvature = equations.curvature
@@ -300,33 +197,35 @@ class _GaussNewton:
             self.group[modes],
             self.scales,
             fixed / own[: len(fixed)],
-            iterations=2 if fit_scales and with_modes else 0,
+            iterations=1 if fit_scales and with_modes else 0,
             damping=damping,
             current=equations.current / own,
-            covariance=covariance,
+            errors=errors,
         )
         return update.in_units(own)
 
     def descend(self, state: State, kappa: float, with_modes: bool) -> tuple[State, float]:
         """One damped step; returns the new state and by how much chi2 per pixel fell."""
         joint = state.joint
-        equations = self.linearised(state, kappa, with_modes)
+        equations = self.equations = linearise(self.misfit, state, kappa, with_modes)
         sigmas = [self.misfit.sigma(k, point, kappa) for k, point in enumerate(state.points)]
-        update = None
-        if with_modes and self.fits_scales:
-            update = self.solve(joint, equations, fit_scales=True)
-            self.scales = update.scales
+        update = self.solve(joint, equations, fit_scales=with_modes and self.fits_scales)
+        self.scales = update.scales
+        expected = self.predicted_gain(joint, equations, update.step)
+        if expected < self.options.tolerance * self.misfit.pixels:
+            # Not worth a step, after which all would have to be linearised again.
+            return state, expected / self.misfit.pixels
         before = self.cost(state, sigmas)
         for _ in range(_TRIES):
-            # The solution with the scales' last values is the undamped step already.
-            if update is None or self.damping:
+            if self.damping:
                 update = self.solve(joint, equations, damping=self.damping)
+                expected = self.predicted_gain(joint, equations, update.step)
             vector = state.vector.clone()
             vector[: len(update.step)] += update.step - equations.current
             trial = self.misfit.at(joint, joint.clamped(vector))
             after = self.cost(trial, sigmas)
             if after < before:
-                self._relax((before - after) / self.predicted_gain(joint, equations, update.step))
+                self._relax((before - after) / expected)
                 return trial, (before - after) / self.misfit.pixels
             self.damping = max(6 * self.damping, 0.05)
         return state, 0.0
@@ -336,7 +235,7 @@ class _GaussNewton:
         """Whether the prior's scales are free."""
         return self.options.prior.fit_scales
 
-    def predicted_gain(self, joint: Joint, equations: _Linearised, step: Tensor) -> float:
+    def predicted_gain(self, joint: Joint, equations: Linearised, step: Tensor) -> float:
         """By how much the penalised chi2 would fall if the model were linear."""
         precision = self.deviation(joint)[: len(step)] ** -2
         curvature, current = equations.curvature, equations.current
@@ -442,15 +341,22 @@ class _GaussNewton:
         """Errors at the end, and everything in the form that users see."""
         joint, chi2 = state.joint, self.misfit.chi2_per_pixel(state)
         kappa = 0.0 if chi2 < _EXPLAINED else self.misfit.model_error(state)
-        frames: list[LinearFrame] = []
-        equations = self.linearised(state, kappa, self.options.wavefront, keep=frames)
-        update = self.solve(joint, equations, covariance=True)
-        assert update.covariance is not None
-        deviation = torch.sqrt(update.covariance.diagonal())
-        count = len(deviation)
+        equations, wavefront = self.equations, self.options.wavefront
+        count = joint.size if wavefront else joint.where("companions").stop
+        if (
+            equations is None
+            or equations.state is not state
+            or equations.kappa != kappa
+            or len(equations.current) != count
+        ):
+            equations = linearise(self.misfit, state, kappa, wavefront)
+        frames = equations.frames
+        update = self.solve(joint, equations, errors=True)
+        assert update.variance is not None
+        deviation = torch.sqrt(update.variance)
         linear = LinearModel(
             names=joint.names()[:count],
-            frames=tuple(frames),
+            frames=frames,
             vector=state.vector[:count],
             mean=joint.initial()[:count],
             deviation=self.deviation(joint)[:count],
@@ -469,7 +375,7 @@ class _GaussNewton:
                 model=forward.problem.model,
                 observation=forward.problem.observation,
                 initial=forward.problem.initial,
-                opd=forward.opd(unknowns, point.vector).cpu().numpy(),
+                opd=point.opd.cpu().numpy(),
                 star_image=point.star.cpu().numpy(),
                 values=values,
                 errors=errors,
@@ -494,10 +400,3 @@ class _GaussNewton:
             )
             found.append(refinement)
         return found
-
-
-def gauss_newton(
-    problems: Sequence[Problem], options: GaussNewtonOptions, *, seed: int, progress: bool
-) -> list[Refinement]:
-    """Refine by damped Gauss-Newton; see the module's text and `GaussNewtonOptions`."""
-    return _GaussNewton(problems, options, progress).run(seed)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.linear_model import LinearModel
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement.unknowns import Unknowns
 from pyklip_diffrender.scene import Planet
@@ -108,24 +109,32 @@ class Joint:
         """The starting vector: the mean of the prior."""
         return self.joined([unknowns.initial() for unknowns in self.frames])
 
-    def resumed(self, vector: Tensor) -> Tensor:
-        """An earlier vector of the same layout but for its companions, with the present ones.
+    def resumed(self, earlier: LinearModel) -> Tensor:
+        """Where an earlier fit ended, with the present companions.
+
+        Parameters
+        ----------
+        earlier : LinearModel
+            Of the same frames and free parameters; where there is no drift, it may lack the last
+            wavefront modes.
 
         Raises
         ------
         ShapeError
-            If its length does not fit.
+            If it does not fit.
         """
         joint, companions = self.initial(), self.where("companions")
-        after = self.size - companions.stop
-        extra = len(vector) - companions.start - after
-        if extra < 0 or extra % 3:
+        old = sum(name.startswith("companions[") for name in earlier.names)
+        kept = earlier.vector[companions.start + old :]
+        room = self.size - companions.stop
+        if len(kept) > room or (len(kept) < room and self.drift):
             raise ShapeError(
-                f"resume: got {len(vector)} unknowns, expected {companions.start + after} and "
-                "three a companion. The basis, the free parameters and the frames must be the same"
+                f"resume: got {len(kept)} unknowns behind the companions, expected {room}. The "
+                "free parameters and the frames must be the same, and the basis must begin with "
+                "the same modes"
             )
-        joint[: companions.start] = vector[: companions.start]
-        joint[companions.stop :] = vector[len(vector) - after :]
+        joint[: companions.start] = earlier.vector[: companions.start]
+        joint[companions.stop : companions.stop + len(kept)] = kept
         return joint
 
     def prior_deviation(self) -> Tensor:

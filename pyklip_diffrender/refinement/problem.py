@@ -18,6 +18,9 @@ from pyklip_diffrender.parameters import parameter
 
 __all__ = ["Problem"]
 
+_SCALE_TOLERANCE = 0.02
+"""NIRCam's pixels differ by 1.3 % in x and y, and by 0.7 % from the square ones of stpsf."""
+
 
 @dataclass
 class Problem:
@@ -50,6 +53,7 @@ class Problem:
                 f"pixels, the model {ny} x {nx}. Cut with observation.cutout({ny}), or make the "
                 "model with fov_pixels to match"
             )
+        require_same_setup(self.model, self.observation)
         self.require_parameters(self.start, "start")
         combined = self.observation.combined()
         device = self.model.device
@@ -113,3 +117,39 @@ class Problem:
             flux = found[0] if "flux" in names else flux
             level = found[-1] if "background" in names else level
         return flux, level
+
+
+def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
+    """Compare filter, masks, module and pixel scale, where both sides say what theirs are.
+
+    Of the model, only what `nircam_coronagraph` made does: other systems have no such recipe.
+
+    Raises
+    ------
+    IncompatibleSetupError
+    """
+    recipe, header = model.recipe, observation.header
+    mask = recipe.get("image_mask")
+    stated = (
+        ("filter", recipe.get("filter"), observation.filter),
+        ("image mask", mask, header.get("CORONMSK")),
+        ("pupil mask", recipe.get("pupil_mask"), header.get("PUPIL")),
+        # The embedded tables are those of module A.
+        ("module", mask and "A", header.get("MODULE")),
+    )
+    for what, made, taken in stated:
+        if not isinstance(made, str) or not isinstance(taken, str):
+            continue
+        # Headers name the module with the mask.
+        if taken.strip().upper().replace("MASKA", "MASK") != made.upper():
+            raise IncompatibleSetupError(
+                f"{observation.name}: these frames have {what} {taken}, the model has {made}. Make "
+                "the model for the frames, with nircam_coronagraph or from_webbpsf"
+            )
+    ours, theirs = np.array(model.detector.pixelscale), np.array(observation.pixelscale)
+    if (np.abs(theirs / ours - 1) > _SCALE_TOLERANCE).any():
+        raise IncompatibleSetupError(
+            f"{observation.name}: these frames have {observation.pixelscale} arcsec per pixel in "
+            f"(x, y), the model {model.detector.pixelscale}. Make the model with "
+            "pixelscale=observation.pixelscale"
+        )

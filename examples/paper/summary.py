@@ -1,0 +1,340 @@
+"""Write docs/inference.md and its figure from the tables of the studies.
+
+    python examples/paper/summary.py
+
+Run it from the root of the project after the studies have written their tables to docs/results.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+sys.path.insert(0, str(Path(__file__).parent))
+import calibration
+import fluxes
+
+from pyklip_diffrender.files import replacing
+from pyklip_diffrender.report import save
+
+RESULTS = Path("docs/results")
+KINDS = {"measured": "measured maps", "generator": "embedded generator"}
+COLOURS = {"measured": "#5b3f95", "generator": "#c0631a"}
+
+
+def read(study: str, kind: str) -> Table | None:
+    """A study's table, if it has been run."""
+    path = RESULTS / f"{study}_{kind}.ecsv"
+    return Table.read(path, format="ascii.ecsv") if path.is_file() else None
+
+
+def tables(study: str) -> dict[str, Table]:
+    """Of all kinds of wavefront that the study was run on."""
+    found = {kind: read(study, kind) for kind in KINDS}
+    return {kind: table for kind, table in found.items() if table is not None}
+
+
+def markdown(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """A table."""
+    head = list(header)
+    return [
+        "| " + " | ".join(head) + " |",
+        "|" + "---|" * len(head),
+        *("| " + " | ".join(row) + " |" for row in rows),
+        "",
+    ]
+
+
+def origin(found: dict[str, Table]) -> list[str]:
+    """Where tables come from."""
+    return [
+        f"- {KINDS[kind]}: `{table.meta['command']}`, {table.meta['date']}, "
+        f"{table.meta['seconds'] / 60:.0f} min ({table.meta['machine']})."
+        for kind, table in found.items()
+    ] + [""]
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square over frames."""
+    return float(np.sqrt(np.nanmean(np.asarray(values) ** 2)))
+
+
+def about_calibration() -> list[str]:
+    """S/N where there is nothing, and the limit."""
+    found = tables("calibration")
+    rows = []
+    for kind, table in found.items():
+        for hours in sorted(set(table["hours"])):
+            part = table[table["hours"] == hours]
+            rings = [rms(part[f"null_{r:.1f}"]) for r in calibration.RINGS[:-1]]
+            expected = part["positions"].sum() * 2 * 3.167e-5
+            rows.append(
+                (
+                    KINDS[kind],
+                    f"{hours:g}",
+                    str(len(part)),
+                    f"{rms(part['null']):.3f}",
+                    f"{min(rings):.2f} to {max(rings):.2f}",
+                    f"{rms(part['known_star_null']):.3f}",
+                    f"{part['beyond_4'].sum()} ({expected:.1f})",
+                    f"{part['highest'].max():.1f}",
+                    f"{part['limit_mean'].mean():.3f}",
+                    f"{max(part[f'limit_{r:.1f}'].mean() for r in calibration.RINGS[:-1]):.3f}",
+                    f"{part['star_error'].mean():.2f}",
+                    f"{part['chi2'].mean():.3f}",
+                    ", ".join(sorted(set(part["status"]))),
+                )
+            )
+    header = (
+        "wavefronts", "drift, h", "frames", "S/N deviation", "in rings of 0.2 arcsec",
+        "the same, star known", "positions beyond 4 (Gaussian)", "highest",
+        "limit / photon limit, mean", "worst ring", "star error, sigma", "chi2 / pixel", "status",
+    )  # fmt: skip
+    return [
+        "## Is S/N calibrated?",
+        "",
+        "Frames without a planet. The standard deviation of S/N over all positions from 0.3 to 2.3 "
+        "arcsec must be 1. About a hundred positions of a frame are independent, so that twenty "
+        "frames know it to 2 %; the matched filter that knows the star shows what the noise "
+        "itself did in those frames. The limit is the closed-form 5-sigma contrast, the median "
+        "over a ring, relative to that of the matched filter that knows the star.",
+        "",
+        *markdown(header, rows),
+        *origin(found),
+    ]
+
+
+def about_fluxes() -> list[str]:
+    """Bias and coverage."""
+    found = tables("fluxes")
+    rows = []
+    for kind, table in found.items():
+        for row in fluxes.summary(table):
+            rows.append(
+                (
+                    KINDS[kind],
+                    str(row["contrast"]),
+                    str(row["frames"]),
+                    f"{row['flux_ratio']:.4f} ± {row['flux_ratio_error']:.4f}",
+                    f"{row['mean_pull']:+.2f} ± {row['frames'] ** -0.5:.2f}",
+                    f"{row['pull_deviation']:.2f}",
+                    f"{100 * row['coverage']:.0f} %",
+                    f"{row['mean_snr']:.2f}",
+                    f"{row['kept_by_subtraction']:.2f}",
+                )
+            )
+    header = (
+        "wavefronts", "contrast", "frames", "flux / true", "mean pull", "deviation of pulls",
+        "within 1 sigma", "mean S/N", "kept by mere subtraction",
+    )  # fmt: skip
+    return [
+        "## Are fluxes unbiased and their errors right?",
+        "",
+        "One planet a frame, at a known place from 0.3 to 2.3 arcsec, the wavefront map 40 h old. "
+        "A pull is (measured - true) / error. Planets at the closed-form 5-sigma limit of their "
+        "place must come out at S/N 5 on average: injection and recovery against the closed form. "
+        "The last column is the share of the planet's light that the subtracted frame still has.",
+        "",
+        *markdown(header, rows),
+        *origin(found),
+    ]
+
+
+def about_mismatch() -> list[str]:
+    """The instrument found from the frame."""
+    found = tables("mismatch")
+    names = {
+        "offset_error_mas": "star position, mas",
+        "lyot_error_percent": "Lyot stop's shift, % of the pupil",
+        "rotation_error_deg": "Lyot stop's rotation, deg",
+        "flux_error_percent": "star's flux, %",
+        "snr": "planet's S/N",
+        "snr_matched": "planet's S/N, alignment given",
+        "information_kept": "planet's error, alignment given / found",
+        "contrast": "planet's contrast (true 1e-6)",
+        "null": "deviation of S/N where there is nothing",
+        "iterations": "iterations",
+    }
+    rows = []
+    for name, label in names.items():
+        cells = [label]
+        for table in found.values():
+            values = np.asarray(table[name], dtype=float)
+            cells.append(f"{np.median(values):.4g} ({values.min():.4g} to {values.max():.4g})")
+        rows.append(cells)
+    frames = ", ".join(f"{len(table)} frames" for table in found.values())
+    return [
+        "## Nothing known about the instrument",
+        "",
+        "The star 50 mas off, the Lyot stop shifted by 2 % of the pupil and turned by 2 degrees, "
+        "flux 20 % higher, an unknown background; a planet of 1e-6 at 0.6 arcsec. Errors of what "
+        f"the fit found from the frame alone: median, smallest and largest of {frames}.",
+        "",
+        *markdown(("", *(KINDS[kind] for kind in found)), rows),
+        *origin(found),
+    ]
+
+
+def about_companions() -> list[str]:
+    """Several planets, a bright one, a ring."""
+    found = tables("companions")
+    rows = []
+    for kind, table in found.items():
+        for scene in dict.fromkeys(table["scene"]):
+            part = table[table["scene"] == scene]
+            seen = part[part["found"]]
+            ratio = np.asarray(seen["measured"] / seen["contrast"])
+            pull = np.asarray((seen["measured"] - seen["contrast"]) / seen["error"])
+            kept = ""
+            if scene == "ring":
+                kept = f"{np.nanmedian(np.asarray(seen['kept_by_subtraction'], dtype=float)):.2f}"
+            rows.append(
+                (
+                    KINDS[kind],
+                    scene,
+                    f"{len(seen)} of {len(part)}",
+                    str(int(np.max(part["false_candidates"] + (~part["found"]).astype(int)))),
+                    f"{np.mean(ratio):.3f} ({ratio.min():.3f} to {ratio.max():.3f})",
+                    f"{np.mean(pull):+.2f}",
+                    f"{np.std(pull):.2f}",
+                    kept,
+                )
+            )
+    header = (
+        "wavefronts", "scene", "found", "false", "flux / true", "mean pull",
+        "deviation of pulls", "kept by mere subtraction",
+    )  # fmt: skip
+    return [
+        "## Several planets, a bright one, a ring",
+        "",
+        "Two, three and four planets of 5e-7 to 2e-6; one of 1e-3 beside one of 1e-6; a ring from "
+        "0.9 to 1.2 arcsec with 3e-5 of the star's light, whose amplitude is measured with its "
+        "shape given. The fit is told nothing about how many there are.",
+        "",
+        *markdown(header, rows),
+        *origin(found),
+    ]
+
+
+def about_snapshots() -> list[str]:
+    """Several frames."""
+    found = tables("snapshots")
+    rows = []
+    for kind, table in found.items():
+        single = table[table["snapshots"] == 1]["error"].mean()
+        for count in sorted(set(table["snapshots"])):
+            part = table[table["snapshots"] == count]
+            root = math.sqrt(count)
+            linked = np.asarray(part["linked_error"], dtype=float)
+            pull = (part["measured"] - 5e-7) / part["error"]
+            rows.append(
+                (
+                    KINDS[kind],
+                    str(count),
+                    f"{(5e-7 / part['error']).mean():.1f}",
+                    f"{single / part['error'].mean() / root:.3f}",
+                    f"{single / np.nanmean(linked) / root:.3f}"
+                    if np.isfinite(linked).any()
+                    else "",
+                    f"{pull.mean():+.2f} ± {len(part) ** -0.5:.2f}",
+                )
+            )
+    header = (
+        "wavefronts", "snapshots N", "expected S/N", "gain / sqrt(N)",
+        "the same, fitted together", "mean pull",
+    )  # fmt: skip
+    return [
+        "## Several frames",
+        "",
+        "Snapshots three hours apart, the wavefront drifting on, a planet of 5e-7 at 0.6 arcsec. "
+        "Fitted one by one, their information adds; fitted together, wavefronts may differ by "
+        "what the prior allows.",
+        "",
+        *markdown(header, rows),
+        *origin(found),
+    ]
+
+
+def draw() -> Figure:
+    """S/N calibration, limit, fluxes."""
+    figure = Figure(figsize=(15, 4.4), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    middles = calibration.RINGS[:-1] + 0.1
+    for kind, table in tables("calibration").items():
+        for hours, style in ((3.0, ":"), (40.0, "-"), (86.0, "--"), (200.0, "-.")):
+            part = table[table["hours"] == hours]
+            if not len(part):
+                continue
+            label = f"{KINDS[kind]}, {hours:g} h"
+            nulls = [rms(part[f"null_{r:.1f}"]) for r in calibration.RINGS[:-1]]
+            limits = [part[f"limit_{r:.1f}"].mean() for r in calibration.RINGS[:-1]]
+            left.plot(middles, nulls, style, color=COLOURS[kind], label=label)
+            middle.plot(middles, limits, style, color=COLOURS[kind], label=label)
+    left.axhspan(0.85, 1.2, color="0.93", zorder=0)
+    left.axhline(1, color="0.5", lw=0.8)
+    left.set_ylim(0.6, 1.5)
+    titles = (
+        (left, "Deviation of S/N where there is nothing"),
+        (middle, "5-sigma limit / photon limit"),
+        (right, "Flux of injected planets / true"),
+    )
+    for ax, title in titles:
+        ax.set_title(title, fontsize=10, loc="left")
+        ax.set_xlabel("arcsec", fontsize=9)
+    middle.set_ylim(1.0, 1.5)
+    left.legend(frameon=False, fontsize=7)
+    _draw_fluxes(right)
+    return figure
+
+
+def _draw_fluxes(ax: Axes) -> None:
+    for kind, table in tables("fluxes").items():
+        part = table[table["contrast"] / table["error"] > 4]
+        # Set apart a little, so that they do not hide each other.
+        place = part["separation"] + np.linspace(-0.1, 0.1, len(part))
+        ratio, error = part["measured"] / part["contrast"], part["error"] / part["contrast"]
+        ax.errorbar(
+            place, ratio, error, fmt=".", ms=3, lw=0.6, color=COLOURS[kind], label=KINDS[kind]
+        )
+    ax.axhline(1, color="0.5", lw=0.8)
+    ax.set_ylim(0.4, 1.6)
+    ax.legend(frameon=False, fontsize=8)
+
+
+def main() -> None:
+    """Write page and figure."""
+    lines = [
+        "# Calibration of fluxes, S/N and contrast",
+        "",
+        "Written by `python examples/paper/summary.py` from the tables in `docs/results`. The "
+        "scene is the paper's (beta Pictoris, 2 h, 4.5 um, 80 x 80 pixels); *measured maps* are "
+        "two in-flight wavefront maps 86 h apart, *embedded generator* is `random_opd` and "
+        "`random_drift`.",
+        "",
+        "![S/N without a planet, contrast limit, fluxes](images/inference.png)",
+        "",
+        *about_calibration(),
+        *about_fluxes(),
+        *about_mismatch(),
+        *about_companions(),
+        *about_snapshots(),
+    ]
+    notes = RESULTS / "inference_notes.md"
+    if notes.is_file():
+        lines.append(notes.read_text(encoding="utf-8"))
+    page = Path("docs/inference.md")
+    with replacing(page) as temporary:
+        temporary.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+    save(draw(), Path("docs/images/inference.png"), dpi=110)
+    print(f"wrote {page}")
+
+
+if __name__ == "__main__":
+    main()

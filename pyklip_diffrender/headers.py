@@ -1,0 +1,110 @@
+"""Values of FITS headers, checked: a card is text that anybody may have typed."""
+
+from __future__ import annotations
+
+import math
+from numbers import Real
+from typing import Any
+
+from astropy.io import fits
+from astropy.time import Time
+
+from pyklip_diffrender.errors import CorruptFileError
+
+__all__ = ["header_date", "header_number", "header_text", "merged_header"]
+
+
+def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fits.Header:
+    """Cards of the primary header, and those of an extension, which win.
+
+    Parameters
+    ----------
+    primary, extension : Header
+    name : str
+        The file's, for the message.
+
+    Raises
+    ------
+    CorruptFileError
+        If a card cannot be read, or has characters that no card may have.
+    """
+    merged = primary.copy()
+    try:
+        merged.update(extension)
+    except (ValueError, fits.VerifyError) as error:
+        raise CorruptFileError(
+            f"{name}: a card of its headers cannot be read ({error}). Correct it, or fetch the "
+            "file again"
+        ) from error
+    return merged
+
+
+def _value(header: fits.Header, key: str) -> Any:
+    """None for a card that is not there, and for one without a value."""
+    value = header.get(key)
+    return None if isinstance(value, fits.card.Undefined) else value
+
+
+def header_number(header: fits.Header, key: str, name: str) -> float | None:
+    """Finite number on a card, None if there is none.
+
+    Parameters
+    ----------
+    header : Header
+    key : str
+    name : str
+        The file's, for the message.
+
+    Raises
+    ------
+    CorruptFileError
+        If something else is on the card.
+    """
+    value = _value(header, key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+        raise CorruptFileError(
+            f"{name}: {key} is {value!r}, expected a finite number. Correct the header, or fetch "
+            "the file again"
+        )
+    return float(value)
+
+
+def header_text(header: fits.Header, key: str, name: str) -> str | None:
+    """Word on a card, None if there is none or it is empty.
+
+    Raises
+    ------
+    CorruptFileError
+        If something else is on the card.
+    """
+    value = _value(header, key)
+    if value is not None and not isinstance(value, str):
+        raise CorruptFileError(
+            f"{name}: {key} is {value!r}, expected text. Correct the header, or fetch the file "
+            "again"
+        )
+    return value or None
+
+
+def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time | None:
+    """Date (UTC) on the first card of some that has one.
+
+    Raises
+    ------
+    CorruptFileError
+        If that is no date.
+    """
+    for key in keys:
+        text = header_text(header, key, name)
+        if text is None:
+            continue
+        try:
+            return Time(text, scale="utc")
+        except ValueError as error:
+            raise CorruptFileError(
+                f"{name}: {key} is {text!r}, expected a date such as '2022-08-11T01:02:03'. "
+                "Correct the header, or fetch the file again"
+            ) from error
+    return None

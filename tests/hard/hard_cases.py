@@ -1,0 +1,101 @@
+"""What the hard cases share: small systems, comparators, and the rows of the stability table.
+
+A row is measured by the tests, which hold it to its limits, and by
+``tests/benchmarks/stability.py``, which prints it into the documentation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pyklip_diffrender.bases import SegmentMotions
+from pyklip_diffrender.geometry import PupilGrid
+from pyklip_diffrender.nircam import nircam_coronagraph
+from pyklip_diffrender.opd import random_opd
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.spectrum import Bandpass
+
+DTYPES = (torch.float64, torch.float32)
+WAVELENGTH = 4.5e-6
+NPIX = 128
+
+FLOAT32_IMAGE = 2e-5
+"""Limit of a float32 image: 6e-8 a product, and what the coronagraph leaves is the small
+difference of fields 20 times as large; 1e-6 plane by plane, 8e-6 on the lattice were measured."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    Attributes
+    ----------
+    case, trouble, sees : str
+        What it is, what could go wrong, what the user sees.
+    limits : (float, float)
+        Largest error in float64 and in float32.
+    measure : callable
+        Real dtype to an error, relative, so that an answer of zeros has an error of 1 and one
+        scaled by 1 % an error of 0.01.
+    """
+
+    case: str
+    trouble: str
+    sees: str
+    limits: tuple[float, float]
+    measure: Callable[[torch.dtype], float]
+
+
+def small(**changes: object) -> OpticalSystem:
+    """The coronagraph on a small grid."""
+    settings = {"monochromatic": WAVELENGTH, "npix": NPIX, "fov_pixels": 32, **changes}
+    return nircam_coronagraph("F444W", **settings)  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=8)
+def system(dtype: torch.dtype, wavelength: float = WAVELENGTH) -> OpticalSystem:
+    """The same, made once; at any wavelength, also those that no filter has."""
+    model = small(dtype=dtype)
+    if wavelength == WAVELENGTH:
+        return model
+    band = Bandpass((wavelength,), (1.0,))
+    return OpticalSystem(model.entrance, model.planes, model.detector, band)
+
+
+@lru_cache(maxsize=8)
+def wavefront(seed: int = 5, rms: float = 66e-9) -> torch.Tensor:
+    """A wavefront as in flight, m."""
+    return torch.from_numpy(random_opd(seed, npix=NPIX, rms=rms).data)
+
+
+@lru_cache(maxsize=2)
+def segment(npix: int = NPIX) -> torch.Tensor:
+    """1 on one segment, 0 elsewhere."""
+    return (SegmentMotions().modes(PupilGrid.full(npix), 6, 7)[0] > 0.5).double()
+
+
+def array(image: torch.Tensor | NDArray[np.floating]) -> NDArray[np.float64]:
+    """Any image as a float64 array."""
+    if isinstance(image, torch.Tensor):
+        image = image.detach().numpy()
+    return np.asarray(image, dtype=np.float64)
+
+
+def worst(image: object, truth: object) -> float:
+    """Largest difference of two images as a fraction of the peak; NaN counts as infinite."""
+    got, true = array(image), array(truth)  # type: ignore[arg-type]
+    difference = np.abs(got - true).max() / np.abs(true).max()
+    return float(difference) if np.isfinite(difference) else float("inf")
+
+
+def distance(vector: object, truth: object) -> float:
+    """Length of a difference as a fraction of the length of the truth."""
+    got, true = array(vector), array(truth)  # type: ignore[arg-type]
+    difference = np.linalg.norm(got - true) / np.linalg.norm(true)
+    return float(difference) if np.isfinite(difference) else float("inf")

@@ -1,0 +1,281 @@
+"""Rows of the stability table: how fits of hard data end.
+
+One small star, known exactly, is spoilt in one way a row; the fit starts from an old wavefront.
+What counts is the rms error of the fitted star, in units of the noise, over all pixels, seen or
+not: a fit that reports success must be right, one that cannot be must say so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from hard_cases import WAVELENGTH, segment
+from numpy.typing import NDArray
+
+from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.geometry import PupilGrid
+from pyklip_diffrender.nircam import nircam_coronagraph
+from pyklip_diffrender.observation import Observation
+from pyklip_diffrender.opd import random_opd
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.priors import WavefrontPrior
+from pyklip_diffrender.refinement import Refinement, Status, refine
+from pyklip_diffrender.scene import Planet
+
+__all__ = [
+    "FITS", "PRIOR", "SUCCESS", "FitRow", "Pistons", "adam_on_pixels", "drift_rms", "error_of",
+    "fitted", "model", "noise", "observed", "old", "piston_of_segments", "star",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+
+NPIX, SIZE = 64, 24
+FLUX, BACKGROUND, READ_NOISE = 1e11, 500.0, 42.0
+OFFSET = (0.002, -0.001)
+FEW = FourierModes(3)
+MORE = JointBasis([SegmentMotions(), FEW])
+
+SUCCESS = 0.5
+"""Largest error of the star, in sigma, with which a fit may say that it has converged: the
+parameters that it determines take up about 40 of 576 pixels, an error of 0.26 sigma."""
+
+
+@lru_cache(maxsize=2)
+def model(dtype: torch.dtype = torch.float64) -> OpticalSystem:
+    """24 x 24 pixels."""
+    return nircam_coronagraph(monochromatic=WAVELENGTH, npix=NPIX, fov_pixels=SIZE, dtype=dtype)
+
+
+@lru_cache(maxsize=1)
+def old() -> Array:
+    """The wavefront that fits start from, m."""
+    return random_opd(3, npix=NPIX).data
+
+
+@lru_cache(maxsize=1)
+def _now() -> Array:
+    size = 4e-9 / (1 + FEW.frequencies)
+    change = size * torch.randn(len(FEW), generator=torch.Generator().manual_seed(1))
+    return old() + FEW.opd(change.double(), PupilGrid.full(NPIX)).numpy()
+
+
+def drift_rms() -> float:
+    """How far the wavefront has moved, rms over the pupil, m."""
+    return float((_now() - old())[model().entrance.lit.numpy()].std())
+
+
+def star(opd: Array | None = None) -> Array:
+    """The true star, photons."""
+    with torch.no_grad():
+        return FLUX * model()(_now() if opd is None else opd, OFFSET).numpy()
+
+
+def noise(truth: Array | None = None) -> Array:
+    """Standard deviation of every pixel."""
+    return np.sqrt((star() if truth is None else truth) + BACKGROUND + READ_NOISE**2)
+
+
+def planet(*planets: Planet) -> Array:
+    """Their light, photons."""
+    with torch.no_grad():
+        images = [
+            FLUX * p.contrast * model()(_now(), tuple(np.add(OFFSET, p.offset))).numpy()
+            for p in planets
+        ]
+    return sum(images, np.zeros((SIZE, SIZE)))
+
+
+def observed(truth: Array, seed: int = 2) -> Observation:
+    """A frame of it, with noise."""
+    rng = np.random.default_rng(seed)
+    counts = rng.poisson(truth + BACKGROUND) + rng.normal(0, READ_NOISE, truth.shape)
+    error = np.sqrt(np.maximum(counts, 0) + READ_NOISE**2)
+    return Observation.from_arrays(counts, error, pixelscale=0.062424185, name="hard case")
+
+
+def error_of(image: Array, truth: Array | None = None) -> float:
+    """Rms error of a star with its background, in sigma."""
+    truth = star() if truth is None else truth
+    return float(np.sqrt(np.mean(((image - BACKGROUND - truth) / noise(truth)) ** 2)))
+
+
+def fitted(
+    frame: Observation, opd: Array | None = None, dtype: torch.dtype = torch.float64, **options: Any
+) -> Refinement:
+    """The fit, from the old wavefront unless another is given."""
+    settings = {"basis": FEW, "response_npix": NPIX, **options}
+    return refine(model(dtype), frame, old() if opd is None else opd, **settings)
+
+
+# -- what no image shows -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pistons:
+    """What a fit with free segments says of the mean of their pistons.
+
+    Attributes
+    ----------
+    fit : Refinement
+    together, error : float
+        Projection of the coefficients on it, of unit length, and its posterior deviation, nm.
+    coefficients, errors : ndarray, (54,)
+        Of all segment motions.
+    """
+
+    fit: Refinement
+    together: float
+    error: float
+    coefficients: Array
+    errors: Array
+
+
+PRIOR = 4.0
+"""nm, of every segment motion."""
+
+
+def piston_of_segments() -> Pistons:
+    """18 pistons are free; what they have in common is invisible."""
+    prior = WavefrontPrior({"segment": PRIOR, "texture": 3.0}, fit_scales=False)
+    fit = fitted(observed(star()), basis=MORE, prior=prior)
+    assert fit.linear is not None
+    assert fit.coefficients is not None
+    found = fit.coefficients.numpy()
+    covariance = fit.linear.covariance.numpy()[-len(MORE) :, -len(MORE) :]
+    mean = np.zeros(len(MORE))
+    mean[:54:3] = 18**-0.5
+    return Pistons(
+        fit, float(mean @ found), float(np.sqrt(mean @ covariance @ mean)), found[:54],
+        np.sqrt(np.diag(covariance))[:54],
+    )  # fmt: skip
+
+
+def adam_on_pixels() -> tuple[Refinement, Array]:
+    """60 steps of Adam, and where it started."""
+    fit = refine(
+        model(), observed(star()), old(), method="adam", iterations=60, learning_rate=1e-10,
+        start={"star_offset": OFFSET},
+    )  # fmt: skip
+    return fit, old()
+
+
+# -- what is done to the frame -----------------------------------------------------------------
+
+
+def _missing(share: float) -> Observation:
+    frame = observed(star())
+    valid = np.random.default_rng(9).random(frame.data.shape) >= share
+    return replace(frame, valid=valid)
+
+
+def _saturated(flagged: bool) -> Observation:
+    """The brightest 3 % of the pixels are full."""
+    frame = observed(star())
+    full = float(np.quantile(frame.data, 0.97))
+    return replace(
+        frame, data=np.minimum(frame.data, full), valid=~((frame.data >= full) & flagged)
+    )
+
+
+def _hit(flagged: bool, sigma: float = 1000.0, count: int = 10) -> Observation:
+    """Hot pixels, or cosmic rays, at 1000 sigma."""
+    frame = observed(star())
+    where = np.random.default_rng(8).choice(frame.data.size, count, replace=False)
+    data, valid = frame.data.copy(), np.ones(frame.data.shape, dtype=bool)
+    data.flat[where] += sigma * frame.error.flat[where]
+    valid.flat[where] = not flagged
+    return replace(frame, data=data, valid=valid)
+
+
+def _wave(waves: float) -> Array:
+    return _now() + waves * WAVELENGTH * segment(NPIX).numpy()
+
+
+@dataclass(frozen=True)
+class FitRow:
+    """A line of the table of fits.
+
+    Attributes
+    ----------
+    case, trouble, sees : str
+    ends : tuple of Status
+        How it may end.
+    run : callable
+        Real dtype to (fit, error of its star in sigma).
+    limit : float
+        Largest error.
+    """
+
+    case: str
+    trouble: str
+    sees: str
+    ends: tuple[Status, ...]
+    run: Callable[[torch.dtype], tuple[Refinement, float]]
+    limit: float = SUCCESS
+
+
+def _row(
+    case: str,
+    trouble: str,
+    sees: str,
+    make: Callable[[], Observation],
+    *ends: Status,
+    limit: float = SUCCESS,
+    truth: Callable[[], Array] = star,
+    start: Callable[[], Array] = old,
+    **options: Any,
+) -> FitRow:
+    def run(dtype: torch.dtype) -> tuple[Refinement, float]:
+        fit = fitted(make(), start(), dtype, **options)
+        return fit, error_of(fit.star_image, truth())
+
+    return FitRow(case, trouble, sees, ends or (Status.CONVERGED,), run, limit)
+
+
+_FAILED = (Status.MODEL_MISMATCH, Status.ITERATION_LIMIT, Status.DIVERGED)
+_ANY = float("inf")
+_BRIGHT = Planet(1e-3, 0.55, 40.0)
+_NEAR = Planet(1e-4, 0.3, 40.0)
+_EDGE = Planet(1e-3, 11.5 * 0.062424185, 90.0)
+
+FITS = [
+    _row("nothing hard", "", "converged", lambda: observed(star())),
+    _row("5 % of the pixels missing", "bias", "converged", lambda: _missing(0.05)),
+    _row("50 % missing", "bias; wild where nothing was seen", "converged", lambda: _missing(0.5)),
+    _row("saturated core, flagged", "bias", "converged", lambda: _saturated(True)),
+    _row("saturated core, not flagged", "the wavefront bends to it",
+         "a status that is not success", lambda: _saturated(False), *_FAILED, limit=_ANY),
+    _row("10 pixels at 1000 sigma, flagged", "bias", "converged", lambda: _hit(True)),
+    _row("10 pixels at 1000 sigma, not flagged", "the wavefront bends to them",
+         "a status that is not success", lambda: _hit(False), *_FAILED, limit=_ANY),
+    _row("the same with robust=3", "they outweigh everything else",
+         "a status that is not success, a better star", lambda: _hit(False), *_FAILED, limit=_ANY,
+         robust=3.0),
+    _row("planet of 2e-5 at 0.3 arcsec", "the wavefront takes it", "converged",
+         lambda: observed(star() + planet(replace(_NEAR, contrast=2e-5)))),
+    _row("planet of 1e-4 at 0.3 arcsec", "the wavefront takes it", "a status that is not success",
+         lambda: observed(star() + planet(_NEAR)), *_FAILED, limit=_ANY),
+    _row("bright planet, 1e-3", "the wavefront takes it", "a status that is not success",
+         lambda: observed(star() + planet(_BRIGHT)), *_FAILED, limit=_ANY),
+    _row("the same with companions=1", "", "converged, planet listed",
+         lambda: observed(star() + planet(_BRIGHT)), companions=1),
+    _row("planet of 1e-3 at the edge, companions=1", "half a planet is taken for a wavefront",
+         "converged, planet listed", lambda: observed(star() + planet(_EDGE)), companions=1),
+    _row("a segment 1.5 waves too high, known", "phase above pi", "converged",
+         lambda: observed(star(_wave(1.5))), truth=lambda: star(_wave(1.5)),
+         start=lambda: _wave(1.5) + old() - _now()),
+    _row("the same, unknown", "a wrong minimum", "a status that is not success",
+         lambda: observed(star(_wave(1.5))), *_FAILED, truth=lambda: star(_wave(1.5)),
+         limit=_ANY, basis=MORE),
+    _row("the start upside down", "a wrong minimum", "a status that is not success",
+         lambda: observed(star()), *_FAILED, start=lambda: old()[::-1].copy(), limit=_ANY),
+    _row("the start transposed", "a wrong minimum", "a status that is not success",
+         lambda: observed(star()), *_FAILED, start=lambda: old().T.copy(), limit=_ANY),
+    _row("the start mirrored", "a wrong minimum", "a status that is not success",
+         lambda: observed(star()), *_FAILED, start=lambda: old()[:, ::-1].copy(), limit=_ANY),
+]  # fmt: skip

@@ -1,0 +1,296 @@
+"""Rows of the stability table: images and gradients of the optics."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache, partial
+
+import mpmath
+import numpy as np
+import poppy_reference as reference
+import torch
+from astropy import units as u
+from hard_cases import (
+    FLOAT32_IMAGE,
+    NPIX,
+    WAVELENGTH,
+    Row,
+    array,
+    distance,
+    segment,
+    small,
+    system,
+    wavefront,
+    worst,
+)
+
+from pyklip_diffrender.geometry import PupilGrid, jwst_pupil, maskrnd_openings, polygon_coverage
+from pyklip_diffrender.nircam import NIRCAM_LW_PIXELSCALE, mask335r_complement
+from pyklip_diffrender.scene import Planet, Scene
+from pyklip_diffrender.simulation import expected_photons, planet_photons, star_photons
+
+__all__ = ["NPIX", "ROWS", "summed_in_float32"]
+
+FLUX, READ_NOISE = 2.8e12, 42.0
+"""Photons of the paper's star, and its read noise: they say how near to the truth is near."""
+
+
+# -- images ----------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=8)
+def _plain_fft(mas: float) -> np.ndarray:
+    """The image by poppy's FFTs; the offset lies on no axis and no diagonal."""
+    planes = reference.coronagraph(
+        jwst_pupil(NPIX).numpy(),
+        reference.lopsided_opd(NPIX),
+        polygon_coverage(maskrnd_openings(), PupilGrid.full(NPIX)).numpy(),
+        reference.zernike_opd(reference.lopsided_zernikes(), NPIX),
+        oversample=4,
+        fov_pixels=32,
+        pixelscale=NIRCAM_LW_PIXELSCALE,
+    )
+    return reference.image(planes, WAVELENGTH, *_offset(mas))
+
+
+def _offset(mas: float) -> tuple[float, float]:
+    return mas * 1e-3 * math.cos(0.7), mas * 1e-3 * math.sin(0.7)
+
+
+def plain_fft(mas: float, route: str, sampling: float | None, dtype: torch.dtype) -> float:
+    """Semi-analytic image against the plain FFT with 4 samples per lambda/D on the occulter."""
+    model = small(
+        si_wfe=reference.lopsided_zernikes(), flip_si_wfe=True, dtype=dtype, route=route,
+        occulter_sampling=sampling,
+    )  # fmt: skip
+    return worst(model(reference.lopsided_opd(NPIX), _offset(mas)), _plain_fft(mas))
+
+
+def sampling(dtype: torch.dtype) -> float:
+    """The default route against 16 cells per lambda/D, plane by plane."""
+    fine = small(occulter_sampling=16.0, route="planes")(wavefront())
+    return worst(system(dtype)(wavefront()), fine)
+
+
+def occulter(dtype: torch.dtype) -> float:
+    """1 - t at radii from 1e-12 arcsec to the edge, against 50 digits."""
+    radii = np.concatenate([[0.0], np.geomspace(1e-12, 1.0, 40)])
+    with mpmath.workdps(50):
+        # SIGMA as a double, as the code has it.
+        s = [mpmath.mpf(float(r)) * mpmath.mpf(reference.SIGMA) for r in radii]
+        exact = [1.0 if x == 0 else float((2 * mpmath.besselj(1, x) / x) ** 2) for x in s]
+    x = torch.from_numpy(radii)
+    got = mask335r_complement(x, torch.zeros_like(x)).to(dtype)
+    return float(np.abs(array(got) / exact - 1).max())
+
+
+def hit(microns: float, waves: float, dtype: torch.dtype) -> float:
+    """A segment `waves` too high against one a whole wave lower: the same image."""
+    wavelength = microns * 1e-6
+    model, opd = system(dtype, wavelength), wavefront()
+    low = model(opd + (waves - 1) * wavelength * segment())
+    return worst(model(opd + waves * wavelength * segment()), low)
+
+
+def _gradient(model: object, opd: torch.Tensor) -> torch.Tensor:
+    weight = torch.rand(32, 32, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    variable = opd.clone().requires_grad_()
+    (model(variable) * weight).sum().backward()  # type: ignore[operator]
+    assert variable.grad is not None
+    return variable.grad
+
+
+def hit_gradient(waves: float, dtype: torch.dtype) -> float:
+    """The same for the gradient of a sum of pixels."""
+    model, opd = system(dtype), wavefront()
+    return distance(
+        _gradient(model, opd + waves * WAVELENGTH * segment()),
+        _gradient(system(torch.float64), opd + (waves - 1) * WAVELENGTH * segment()),
+    )
+
+
+def piston(dtype: torch.dtype) -> float:
+    """1 um of piston over the whole pupil."""
+    exact = system(torch.float64)(wavefront())
+    return worst(system(dtype)(wavefront() + 1e-6), exact)
+
+
+def piston_gradient(dtype: torch.dtype) -> float:
+    """Share of the gradient along piston."""
+    gradient = _gradient(system(dtype), wavefront())
+    lit = system(dtype).entrance.lit
+    return abs(float(gradient.sum())) / (float(gradient.norm()) * math.sqrt(float(lit.sum())))
+
+
+def units(dtype: torch.dtype) -> float:
+    """The wavefront in m, um and nm."""
+    model, opd = system(dtype), wavefront().numpy()
+    truth = system(torch.float64)(wavefront())
+    return max(worst(model(q), truth) for q in (opd * u.m, opd * 1e6 * u.um, opd * 1e9 * u.nm))
+
+
+def threads(dtype: torch.dtype) -> float:
+    """Eight threads against one."""
+    before = torch.get_num_threads()
+    images = []
+    for count in (1, 8):
+        torch.set_num_threads(count)
+        images.append(small(dtype=dtype, npix=256, fov_pixels=64)(np.zeros((256, 256))))
+    torch.set_num_threads(before)
+    return worst(images[1], images[0])
+
+
+# -- planets and gradients near the truth ------------------------------------------------------
+
+
+def faint_planet(separation: float, dtype: torch.dtype) -> float:
+    """A planet of contrast 1e-10 in the scene, less the star, against the planet alone."""
+    planet = Planet(1e-10, separation, 40.0)
+    scene = Scene(planets=(planet,))
+    model, opd = system(dtype), wavefront()
+    got = expected_photons(model, scene, opd) - star_photons(model, scene, opd)
+    return worst(got, planet_photons(system(torch.float64), scene, planet, opd))
+
+
+def summed_in_float32(separation: float) -> float:
+    """The error of that planet if star and planet were added up in float32."""
+    model, opd = system(torch.float32), wavefront()
+    star = model(opd)
+    planet = 1e-10 * model(opd, Planet(1.0, separation, 40.0).offset)
+    return worst((star + planet) - star, planet)
+
+
+def _chi2(dtype: torch.dtype, opd: torch.Tensor) -> torch.Tensor:
+    truth = system(torch.float64)(wavefront()).detach()
+    sigma = torch.sqrt(FLUX * truth + READ_NOISE**2)
+    return (((FLUX * system(dtype)(opd).double() - FLUX * truth) / sigma) ** 2).mean()
+
+
+def chi2_gradient(nanometres: float, dtype: torch.dtype) -> float:
+    """Gradient of chi2 with the wavefront so far from the truth.
+
+    float64 against a finite difference along the line to the truth, float32 against float64.
+    """
+    away = wavefront(9, 1e-9)
+    opd = wavefront() + nanometres * away
+    gradients = []
+    for kind in (torch.float64, dtype):
+        variable = opd.clone().requires_grad_()
+        _chi2(kind, variable).backward()
+        assert variable.grad is not None
+        gradients.append(variable.grad)
+    if dtype == torch.float32:
+        return distance(gradients[1], gradients[0])
+    step = 1e-3 * nanometres
+    at = [float(_chi2(dtype, opd + k * step * away)) for k in (-2, -1, 1, 2)]
+    numeric = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * step)
+    return abs(float((gradients[0] * away).sum()) / numeric - 1)
+
+
+def _rows() -> list[Row]:
+    rows = [
+        Row(
+            f"star {mas:g} mas off, against a plain FFT" if mas else "star exactly on the axis",
+            "what the occulter leaves is a small difference of large fields",
+            "the image of the plain FFT",
+            (1e-7, FLOAT32_IMAGE),
+            partial(plain_fft, mas, "auto", None),
+        )
+        for mas in (0.0, 1.0, 10.0, 50.0, 100.0)
+    ]
+    rows += [
+        Row(
+            "10 mas off, plane by plane, with the FFT's samples on the occulter",
+            "as above, without the samples' own error",
+            "the image of the plain FFT",
+            (1e-11, FLOAT32_IMAGE),
+            partial(plain_fft, 10.0, "planes", 4.0),
+        ),
+        Row(
+            "default sampling of the occulter instead of 16 cells per lambda/D",
+            "the disc is sampled too coarsely",
+            "the converged image; finer cells change it less and less",
+            (1e-7, FLOAT32_IMAGE),
+            sampling,
+        ),
+        Row(
+            "occulter at r from 0 to 1 arcsec, against 50 digits",
+            "0 / 0 in the middle; 1 - t loses its digits when t is formed first",
+            "the right transmission, 1 - t = 1 at r = 0",
+            (1e-13, 1.2e-7),
+            occulter,
+        ),
+        Row(
+            "micrometeoroid, 800 nm of surface at 2 um",
+            "phase above pi",
+            "the image one wave lower",
+            (1e-12, FLOAT32_IMAGE),
+            partial(hit, 2.0, 0.8),
+        ),
+        Row(
+            "a segment 1.5 waves too high",
+            "phase above pi",
+            "the image one wave lower",
+            (1e-12, FLOAT32_IMAGE),
+            partial(hit, 4.5, 1.5),
+        ),
+        Row(
+            "the gradient there",
+            "phase above pi",
+            "the gradient one wave lower",
+            (1e-12, FLOAT32_IMAGE),
+            partial(hit_gradient, 1.5),
+        ),
+        Row(
+            "1 um of piston over the whole pupil",
+            "no image can show it: a fit may drift",
+            "the same image",
+            (1e-12, FLOAT32_IMAGE),
+            piston,
+        ),
+        Row(
+            "share of the gradient along piston",
+            "as above",
+            "no force towards it",
+            (1e-12, 1e-6),
+            piston_gradient,
+        ),
+        Row(
+            "OPD as Quantity in m, um, nm",
+            "torch drops units",
+            "the same image",
+            (1e-12, FLOAT32_IMAGE),
+            units,
+        ),
+        Row(
+            "8 threads instead of 1",
+            "sums in another order",
+            "the same image but for rounding; at a fixed number of threads the same bits",
+            (1e-12, FLOAT32_IMAGE),
+            threads,
+        ),
+    ]
+    rows += [
+        Row(
+            f"planet of contrast 1e-10 at {separation:g} arcsec",
+            "in float32 the star swallows it",
+            "the planet: light is added up in float64",
+            (1e-6, 1e-5),
+            partial(faint_planet, separation),
+        )
+        for separation in (0.3, 0.6, 1.0)
+    ]
+    rows += [
+        Row(
+            f"gradient of chi2, wavefront {nanometres:g} nm from the truth",
+            "the residual is a small difference of two images",
+            "a gradient to descend along",
+            (1e-9, limit),
+            partial(chi2_gradient, nanometres),
+        )
+        for nanometres, limit in ((100.0, 1e-5), (10.0, 5e-5), (1.0, 5e-4), (0.1, 5e-3))
+    ]
+    return rows
+
+
+ROWS = _rows()

@@ -1,0 +1,200 @@
+"""The same again: same seed, same bits; threads; a process killed while it writes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from astropy.io import fits
+from hard_cases import DTYPES, NPIX, small, system, wavefront, worst
+from stability_fits import error_of, fitted, noise, observed, star
+
+from pyklip_diffrender.arrays import AberrationOptic
+from pyklip_diffrender.files import open_fits, write_fits
+from pyklip_diffrender.geometry import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.masks import FourierMask
+from pyklip_diffrender.opd import random_drift, random_opd
+from pyklip_diffrender.orientation import Orientation
+from pyklip_diffrender.planes import Wavefront
+from pyklip_diffrender.scene import Planet, Scene
+from pyklip_diffrender.simulation import simulate
+
+pytestmark = pytest.mark.hard
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def eight_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(8)
+    yield
+    torch.set_num_threads(before)
+
+
+def everything(seed: int) -> list[bytes]:
+    """Bits of all that draws random numbers."""
+    scene = Scene(planets=(Planet(1e-4, 0.6, 30.0),))
+    made = simulate(system(torch.float64), scene, wavefront().numpy(), seed=seed, frames=2)
+    arrays = (made.data, made.error, random_opd(seed, 48).data, random_drift(seed, 10.0, 48).data)
+    return [array.tobytes() for array in arrays]
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_does_not() -> None:
+    first, again, other = everything(7), everything(7), everything(8)
+    assert first == again
+    assert all(a != b for a, b in zip(first, other, strict=True))
+
+
+@pytest.mark.usefixtures("eight_threads")
+@pytest.mark.parametrize("dtype", DTYPES, ids=["float64", "float32"])
+def test_eight_threads_give_the_same_bits_every_time(dtype: torch.dtype) -> None:
+    images = [small(dtype=dtype)(wavefront()).numpy() for _ in range(3)]
+    assert images[0].tobytes() == images[1].tobytes() == images[2].tobytes()
+
+
+def test_a_fit_with_eight_threads_is_the_serial_fit() -> None:
+    """Bits differ, sums are taken in another order; a thousandth of the noise is allowed."""
+    before = torch.get_num_threads()
+    fits_ = []
+    for count in (1, 8, 8):
+        torch.set_num_threads(count)
+        fits_.append(fitted(observed(star()), max_iterations=6))
+    torch.set_num_threads(before)
+    serial, first, again = fits_
+    assert first.opd.tobytes() == again.opd.tobytes()
+    assert first.star_image.tobytes() == again.star_image.tobytes()
+    assert np.abs((first.star_image - serial.star_image) / noise()).max() < 1e-3
+    assert first.status is serial.status
+    assert error_of(first.star_image) < 1
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=["float64", "float32"])
+def test_eight_callers_of_one_model_get_what_one_gets(dtype: torch.dtype) -> None:
+    """A fresh model: its constants are built by whoever comes first."""
+    serial, shared = (
+        small(dtype=dtype, monochromatic=None, nlambda=2, npix=64, fov_pixels=16) for _ in range(2)
+    )
+    opds = [torch.from_numpy(random_opd(k, npix=64).data) for k in range(8)]
+    offsets = [(0.01 * k, -0.005 * k) for k in range(8)]
+    expected = [serial(*each).numpy() for each in zip(opds, offsets, strict=True)]
+    with ThreadPoolExecutor(8) as pool:
+        got = [image.numpy() for image in pool.map(shared, opds, offsets)]
+    for image, true in zip(got, expected, strict=True):
+        assert worst(image, true) < (1e-12 if dtype == torch.float64 else 1e-5)
+    assert worst(expected[1], expected[0]) > 0.1
+
+
+def test_two_callers_of_a_padded_mask_at_two_wavelengths() -> None:
+    """The second caller stores its lattice between the first one's store and read."""
+    other_is_done, first_has_stored = threading.Event(), threading.Event()
+    short, long = 4.0e-6, 5.0e-6
+
+    class Interrupted(FourierMask):
+        def __setattr__(self, name: str, value: object) -> None:
+            super().__setattr__(name, value)
+            if name == "_latest" and isinstance(value, tuple) and value[0] == short:
+                first_has_stored.set()
+                other_is_done.wait(5)
+
+    def transmission(wavelength: float) -> torch.Tensor:
+        return torch.full((16, 16), wavelength * 1e6, dtype=torch.float64)
+
+    grid = PupilGrid.full(8, JWST_DIAMETER)
+    field = torch.ones(8, 8, dtype=torch.complex128)
+    mask = Interrupted(transmission, 2, 8, JWST_DIAMETER, "padded")
+
+    def call(wavelength: float) -> torch.Tensor:
+        return mask.apply(Wavefront(field, wavelength, grid), {}, grid).field
+
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(call, short)
+        assert first_has_stored.wait(5)
+        second = pool.submit(call, long)
+        np.testing.assert_allclose(second.result().real, 5.0, rtol=1e-12)
+        other_is_done.set()
+        np.testing.assert_allclose(first.result().real, 4.0, rtol=1e-12)
+
+
+def test_two_callers_of_an_aberration_on_two_windows() -> None:
+    """As above: the second basis comes between the first one's store and its use."""
+    other_is_done, first_has_stored = threading.Event(), threading.Event()
+    small_, large = PupilGrid.full(8), PupilGrid.full(12)
+
+    class Interrupted(AberrationOptic):
+        def __setattr__(self, name: str, value: object) -> None:
+            super().__setattr__(name, value)
+            if name == "_known" and isinstance(value, tuple) and value[0] == small_:
+                first_has_stored.set()
+                other_is_done.wait(5)
+
+    ones = {4e-6: torch.ones(8, 8, dtype=torch.complex128)}
+    optic = Interrupted(
+        ones, 8, JWST_DIAMETER, torch.float64, torch.device("cpu"), "shared", Orientation()
+    )
+
+    def basis(grid: PupilGrid) -> torch.Tensor:
+        field = torch.ones(grid.shape, dtype=torch.complex128)
+        return optic._basis(3, Wavefront(field, 4e-6, grid))
+
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(basis, small_)
+        assert first_has_stored.wait(5)
+        assert pool.submit(basis, large).result().shape == (3, 12, 12)
+        other_is_done.set()
+        assert first.result().shape == (3, 8, 8)
+
+
+@pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
+def test_a_process_killed_in_the_middle_of_the_file_leaves_the_old_one(
+    tmp_path: Path, suffix: str
+) -> None:
+    """Half of the new file is on the disk when the process is killed."""
+    path = tmp_path / f"product{suffix}"
+    write_fits(fits.HDUList([fits.PrimaryHDU(np.zeros((70, 70)))]), path)
+    program = textwrap.dedent(
+        """
+        import os, sys, time
+        import numpy as np
+        from astropy.io import fits
+        from pyklip_diffrender.files import write_fits
+        whole = fits.HDUList.writeto
+
+        def half(hdus, name, **options):
+            whole(hdus, name, **options)
+            os.truncate(name, os.path.getsize(name) // 2)
+            print("half", flush=True)
+            time.sleep(60)
+
+        fits.HDUList.writeto = half
+        write_fits(fits.HDUList([fits.PrimaryHDU(np.ones((70, 70)))]), sys.argv[1])
+        """
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(path)],
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"half\n"
+        process.send_signal(signal.SIGKILL)
+    with open_fits(path) as hdus:
+        assert hdus[0].data.shape == (70, 70)
+        assert not hdus[0].data.any()
+
+
+def test_npix_of_the_shared_wavefront() -> None:
+    """Guards the comparisons above: not flat, not symmetric."""
+    map_ = wavefront().numpy()
+    assert map_.shape == (NPIX, NPIX)
+    assert min(np.abs(map_ - t).max() for t in (map_.T, map_[::-1], map_[:, ::-1])) > 1e-8

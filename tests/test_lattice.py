@@ -1,0 +1,279 @@
+"""Point sources on the detector's lattice: what the model gives for each of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.lattice import PointSources
+from pyklip_diffrender.nircam import SIAF_PIXELSCALE, SIAF_SHEAR, nircam_coronagraph
+from pyklip_diffrender.opd import random_opd
+from pyklip_diffrender.optics import OpticalSystem
+
+WAVELENGTH = 4.5e-6
+SIAF: dict[str, Any] = {"pixelscale": SIAF_PIXELSCALE, "shear": SIAF_SHEAR}
+MOVED: dict[str, Any] = {
+    "detector_shift": (0.011, -0.02),
+    "lyot_shift": (0.003, -0.002),
+    "lyot_rotation": 0.2,
+    "si_zernikes": torch.linspace(-8e-9, 5e-9, 36, dtype=torch.float64),
+}
+
+
+def system(filter: str = "F444W", **changes: Any) -> OpticalSystem:
+    settings = {"npix": 128, "fov_pixels": (30, 33), **changes}
+    if "nlambda" not in settings:
+        settings.setdefault("monochromatic", WAVELENGTH)
+    return nircam_coronagraph(filter, **settings)
+
+
+@pytest.fixture(scope="module")
+def opd() -> torch.Tensor:
+    return torch.from_numpy(random_opd(5, npix=128).data)
+
+
+def worst(
+    model: OpticalSystem, opd: torch.Tensor | None, pixels: list[tuple[int, int]], **values: Any
+) -> float:
+    """Largest error of the templates at some pixels, each as a fraction of its own peak."""
+    sources = PointSources(model, opd, values)
+    assert sources.route == "lattice"
+    rows, columns = zip(*pixels, strict=True)
+    images = sources.images(rows, columns)
+    assert images.dtype == torch.float32
+    errors = []
+    for image, position in zip(images, sources.positions(rows, columns), strict=True):
+        truth = model(opd, position, **{k: v for k, v in values.items() if k != "star_offset"})
+        errors.append(float((image - truth).abs().max() / truth.max()))
+    return max(errors)
+
+
+# Near the axis, at the mask's flank, beyond it, two corners and an edge.
+PIXELS = [(15, 16), (15, 20), (9, 25), (2, 3), (0, 0), (29, 32), (0, 17)]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        SIAF,
+        {**SIAF, "oversample": 2},
+        {"oversample": 3},
+        {"pixelscale": (0.04, 0.11), "shear": 0.3},
+        {"filter": "F335M", "nlambda": 3},
+        {"filter": "F250M", "nlambda": 2, "oversample": 2, **SIAF},
+        {"image_mask": None},
+        {"image_mask": None, "pupil_mask": None, "si_wfe": False, "oversample": 2},
+        {"pupil_mask": None, "si_wfe": False},
+        {"dtype": torch.float32},
+    ],
+    ids=str,
+)
+def test_templates_are_those_of_the_model(settings: dict[str, Any], opd: torch.Tensor) -> None:
+    limit = 1e-4 if settings.get("dtype") == torch.float32 else 3e-6
+    assert worst(system(**settings), opd, PIXELS) < limit
+
+
+@pytest.mark.parametrize("name", [*MOVED, "blur", "all"])
+@pytest.mark.parametrize("oversample", [1, 2])
+def test_parameters_are_honoured(name: str, oversample: int, opd: torch.Tensor) -> None:
+    every = {**MOVED, "blur": 0.02}
+    values = every if name == "all" else {name: every[name]}
+    assert worst(system(oversample=oversample, **SIAF), opd, PIXELS, **values) < 3e-6
+
+
+def test_the_position_is_the_pixel_and_not_that_of_the_star(opd: torch.Tensor) -> None:
+    model = system()
+    assert worst(model, opd, PIXELS[:3], star_offset=(0.2, 0.3)) < 3e-6
+
+
+def test_an_opd_with_absorption_and_none_at_all(opd: torch.Tensor) -> None:
+    assert worst(system(), torch.complex(opd, 0.4 * opd.flip(0)), PIXELS) < 3e-6
+    assert worst(system(), None, PIXELS) < 1e-5
+
+
+@pytest.mark.parametrize("sampling", [1.2, 3.0, 6.0])
+def test_finer_cells_give_the_same_templates(sampling: float, opd: torch.Tensor) -> None:
+    """One, two and three cells a pixel: the inverse transform of a folded spectrum."""
+    model = system(fov_pixels=(31, 33), **SIAF)
+    exact = system(fov_pixels=(31, 33), occulter_sampling=12.0, **SIAF)(opd)
+    image = PointSources(model, opd, sampling=sampling).images([15], [16])[0]
+    # Single precision of the result.
+    assert float((image - exact).abs().max() / exact.max()) < 2e-7
+
+
+def test_all_pixels_at_once_are_the_pixels_one_by_one(opd: torch.Tensor) -> None:
+    model = system(fov_pixels=(12, 11))
+    sources = PointSources(model, opd)
+    rows, columns = torch.meshgrid(torch.arange(12), torch.arange(11), indexing="ij")
+    every = sources.images(rows.flatten(), columns.flatten())
+    assert every.shape == (132, 12, 11)
+    for k in (0, 17, 66, 131):
+        single = sources.images([k // 11], [k % 11])[0]
+        torch.testing.assert_close(every[k], single, rtol=1e-5, atol=1e-6 * float(single.max()))
+    assert sources.images([], []).shape == (0, 12, 11)
+
+
+def test_another_kind_of_plane_takes_the_models_own_route(opd: torch.Tensor) -> None:
+    class Unknown:
+        name = "unknown"
+        parameters = ()
+
+        def window(self, values: Any) -> None:
+            return None
+
+        def apply(self, wavefront: Any, values: Any, onto: Any) -> Any:
+            return wavefront
+
+    plain = system()
+    model = OpticalSystem(
+        plain.entrance, [*plain.planes, Unknown()], plain.detector, plain.bandpass
+    )
+    sources = PointSources(model, opd)
+    assert sources.route == "model"
+    torch.testing.assert_close(
+        sources.images([3, 15], [4, 16]),
+        PointSources(plain, opd).images([3, 15], [4, 16]),
+        rtol=1e-4,
+        atol=1e-10,
+    )
+
+
+def test_bad_pixels_and_maps_are_refused(opd: torch.Tensor) -> None:
+    sources = PointSources(system(), opd)
+    with pytest.raises(ShapeError, match="rows: expected indices from 0 to 29"):
+        sources.images([30], [0])
+    with pytest.raises(ShapeError, match="columns"):
+        sources.images([0], [-1])
+    with pytest.raises(ShapeError, match="2 rows and 1 columns"):
+        sources.images([0, 1], [0])
+    with pytest.raises(ShapeError, match="one map"):
+        PointSources(system(), torch.stack([opd, opd]))
+    with pytest.raises(TypeError, match="lyot_shift"):
+        PointSources(system(), opd, {"lyot_shfit": (0, 0)})
+
+
+def test_templates_at_full_size() -> None:
+    """1024 samples, sheared pixels: on the axis, 0.3, 0.6 and 2 arcsec from it, in a corner."""
+    model = nircam_coronagraph(monochromatic=WAVELENGTH, **SIAF)
+    pixels = [(40, 40), (44, 41), (33, 46), (60, 65), (0, 79)]
+    opd = torch.from_numpy(random_opd(7).data)
+    assert worst(model, opd, pixels) < 3e-6
+
+
+# -- the model's own route -------------------------------------------------------------------
+
+
+def both_routes(**changes: Any) -> tuple[OpticalSystem, OpticalSystem]:
+    """By convolution, and plane by plane with cells so fine that it stands for the truth."""
+    fast = system(**changes)
+    assert fast.route == "lattice"
+    return fast, system(**{"occulter_sampling": 16.0, **changes}, route="planes")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        SIAF,
+        {**SIAF, "oversample": 2},
+        {"oversample": 3},
+        {"pixelscale": (0.04, 0.11), "shear": 0.2},
+        {"filter": "F335M", "nlambda": 3},
+        {"npix": 127},
+        {"npix": 131, **SIAF},
+        {"si_wfe": False},
+        {"pupil_mask": None},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("offset", [None, (0.31, -0.22)], ids=["axis", "beside"])
+def test_both_routes_converge_to_one_image(
+    settings: dict[str, Any], offset: tuple[float, float] | None
+) -> None:
+    fast, planes = both_routes(**settings)
+    opd = torch.from_numpy(random_opd(5, npix=fast.npix).data)
+    values = {} if offset is None else {"star_offset": offset}
+    truth = planes(opd, **values)
+    assert float((fast(opd, **values) - truth).abs().max() / truth.max()) < 3e-8
+
+
+@pytest.mark.parametrize("name", [*MOVED, "blur", "star_offset", "all"])
+def test_both_routes_take_parameters_alike(name: str, opd: torch.Tensor) -> None:
+    fast, planes = both_routes(**SIAF, oversample=2)
+    every = {**MOVED, "blur": 0.02, "star_offset": (0.02, 0.01)}
+    values = every if name == "all" else {name: every[name]}
+    truth = planes(opd, **values)
+    assert float((fast(opd, **values) - truth).abs().max() / truth.max()) < 3e-8
+
+
+def test_full_size_error_of_the_default() -> None:
+    fast, planes = both_routes(npix=1024, fov_pixels=80)
+    opd = torch.from_numpy(random_opd(5).data)
+    truth = planes(opd)
+    assert float((fast(opd) - truth).abs().max() / truth.max()) < 1e-8
+
+
+@pytest.mark.parametrize("settings", [{}, {"npix": 127, **SIAF, "oversample": 2}], ids=str)
+@pytest.mark.parametrize("absorbs", [False, True])
+def test_blocks_of_rows_give_what_the_whole_pupil_gives(
+    settings: dict[str, Any], absorbs: bool
+) -> None:
+    """What is computed with and without derivatives differs by rounding only."""
+    model = system(**settings)
+    opd = torch.from_numpy(random_opd(5, npix=model.npix).data)
+    opd = torch.complex(opd, 0.3 * opd.flip(0)) if absorbs else opd
+    for offset in (None, torch.tensor([0.03, -0.01], dtype=torch.float64)):
+        values = {} if offset is None else {"star_offset": offset}
+        (streamed,) = model.fields(opd, **values)
+        (whole,) = model.fields(opd.clone().requires_grad_(), **values)
+        assert whole.requires_grad
+        assert not streamed.requires_grad
+        error = (streamed - whole.detach()).abs().max() / streamed.abs().max()
+        assert float(error) < 1e-11
+
+
+def test_every_kind_of_derivative_is_that_of_the_planes(opd: torch.Tensor) -> None:
+    """Reverse, forward, by `jacfwd` with a batch of directions, and a batch of maps by `vmap`."""
+    fast, planes = both_routes(fov_pixels=8)
+    change = torch.from_numpy(random_opd(6, npix=128).data)
+    offset = torch.tensor([0.02, 0.01], dtype=torch.float64)
+
+    def found(model: OpticalSystem) -> list[torch.Tensor]:
+        model(opd)
+        variable = opd.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(model(variable).square().sum(), variable)
+        _, forward = torch.func.jvp(model, (opd,), (change,))
+        with torch.autograd.forward_ad.dual_level():
+            dual = torch.autograd.forward_ad.make_dual(opd, change)
+            old_style = torch.autograd.forward_ad.unpack_dual(model(dual)).tangent
+        jacobian = torch.func.jacfwd(lambda o: model(opd, o))(offset)
+        batch = torch.func.vmap(model)(torch.stack([opd, change]))
+        many = model(torch.stack([opd, change]))
+        return [gradient, forward, old_style, jacobian, batch, many]
+
+    for mine, truth in zip(found(fast), found(planes), strict=True):
+        assert float((mine - truth).abs().max() / truth.abs().max()) < 1e-6
+
+
+def test_single_precision_by_convolution(opd: torch.Tensor) -> None:
+    exact, single = system()(opd), system(dtype=torch.float32)(opd)
+    assert single.dtype == torch.float32
+    assert float((single - exact).abs().max() / exact.max()) < 1e-4
+
+
+def test_the_route_can_be_chosen() -> None:
+    assert system().route == "lattice"
+    assert system(route="planes").route == "planes"
+    assert system().with_fidelity(route="planes").route == "planes"
+    # Cells that fit these pixels are needlessly many.
+    assert system(pixelscale=0.01).route == "planes"
+    assert system(pixelscale=0.01, route="lattice").route == "lattice"
+    assert system(image_mask=None).route == "planes"
+    with pytest.raises(IncompatibleSetupError, match="one round occulter"):
+        system(image_mask=None, route="lattice")
+    with pytest.raises(IncompatibleSetupError, match="'fft'"):
+        system(route="fft")
