@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.observation import Observation
     from pyklip_diffrender.opd import drift, random_opd, read_opd
     from pyklip_diffrender.optics import OpticalSystem
+    from pyklip_diffrender.priors import WavefrontPrior, learn_prior
     from pyklip_diffrender.pyklip_backend import (
         DiffrenderSettings,
         backend,
@@ -40,6 +41,7 @@ __all__ = [
     "Scene",
     "Star",
     "Status",
+    "WavefrontPrior",
     "__version__",
     "backend",
     "contrast_curve",
@@ -47,6 +49,7 @@ __all__ = [
     "drift",
     "from_poppy",
     "from_webbpsf",
+    "learn_prior",
     "measure",
     "nircam_coronagraph",
     "observation_from_dataset",
@@ -69,12 +72,14 @@ _MODULE_OF = {
     "Scene": "scene",
     "Star": "scene",
     "Status": "refinement",
+    "WavefrontPrior": "priors",
     "backend": "pyklip_backend",
     "contrast_curve": "detection",
     "detect": "detection",
     "drift": "opd",
     "from_poppy": "bridges",
     "from_webbpsf": "bridges",
+    "learn_prior": "priors",
     "measure": "detection",
     "nircam_coronagraph": "nircam",
     "observation_from_dataset": "pyklip_backend",

@@ -112,8 +112,17 @@ def _demo(options: argparse.Namespace) -> None:
         f"wavefront map is {options.hours:g} h old.\nSNR: the paper's, in the planet's annulus. "
         "Throughput: share of the planet's light kept.\nStar error: rms of what is left of the "
         "star in that annulus, in units of the noise.\n"
-        f"Refinement: {result.fit.status.message}."
+        f"Refinement: {result.fit.status.message}.\n\n"
+        "Point sources with the wavefront integrated out, which loses none of the planet:"
     )
+    for row in result.detection.table:
+        print(
+            f"  {row['separation'].to_value('arcsec'):.3f} arcsec at "
+            f"{row['position_angle'].to_value('deg'):.1f} deg: contrast {row['contrast']:.2e} +- "
+            f"{row['contrast_error']:.1e}, S/N {row['snr']:.1f}"
+        )
+    if not len(result.detection.table):
+        print(f"  none above {result.detection.threshold:g} sigma")
     for path in (*written, figure):
         print(f"wrote {path}")
 
@@ -166,6 +175,8 @@ def _detect(options: argparse.Namespace) -> None:
 
 
 def _bench(options: argparse.Namespace) -> None:
+    import shlex
+
     from pyklip_diffrender.bench import Setting, run_bench, write_page, write_table
     from pyklip_diffrender.report import draw_bench, save
 
@@ -178,7 +189,7 @@ def _bench(options: argparse.Namespace) -> None:
         options.rows,
         budget=0.1 if options.quick else 2.0,
         memory=not options.no_memory,
-        command=" ".join(["pyklip-diffrender bench", *shown]),
+        command=shlex.join(["pyklip-diffrender", "bench", *shown]),
     )
     table["row", "column", "precision", "seconds", "ratio", "error", "sigma"].pprint_all()
     figure = options.output / "performance.png"

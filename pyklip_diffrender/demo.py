@@ -17,6 +17,7 @@ from astropy.io import fits
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from pyklip_diffrender.detection import Detection, detect
 from pyklip_diffrender.files import replacing, write_fits
 from pyklip_diffrender.metrics import annulus_snr, star_model_error, throughput
 from pyklip_diffrender.nircam import nircam_coronagraph
@@ -59,6 +60,8 @@ class DemoResult:
         Star-subtracted frames, photons: "initial", "KLIP", "refined", "optimal".
     table : Table
         One row an image: annulus SNR, planet throughput, star-model error, seconds.
+    detection : Detection
+        Point sources with the wavefront integrated out instead of subtracted.
     """
 
     model: OpticalSystem
@@ -70,6 +73,7 @@ class DemoResult:
     images: dict[str, Image]
     noise: Image
     table: Table
+    detection: Detection
 
 
 def simulate_references(model: OpticalSystem, opd: Image, *, seed: int) -> Image:
@@ -122,6 +126,7 @@ def run_demo(
     seconds = {"initial": time.perf_counter() - began}
     fit = refine(model, observation, measured, seed=seed, progress=progress)
     seconds["refined"] = fit.seconds
+    found = detect(fit, progress=progress)
     drift_later = measured.data + random_drift(seed + 1000, hours + 3).data
     references = simulate_references(model, drift_later, seed=seed + 2000)
     began = time.perf_counter()
@@ -161,7 +166,9 @@ def run_demo(
     for name, form in zip(table.colnames[1:], (".1f", ".2f", ".2f", ".1f"), strict=True):
         table[name].format = form
     table.meta = {"contrast": contrast, "separation": separation, "hours": hours, "seed": seed}
-    return DemoResult(model, scene, observation, measured, true_opd, fit, images, noise, table)
+    return DemoResult(
+        model, scene, observation, measured, true_opd, fit, images, noise, table, found
+    )
 
 
 def write_demo(result: DemoResult, folder: Path) -> list[Path]:
@@ -181,9 +188,14 @@ def write_demo(result: DemoResult, folder: Path) -> list[Path]:
         hdus.append(hdu)
     for hdu in hdus[1 : 2 + len(result.images)]:
         hdu.header["BUNIT"] = "photon"
+    hdu = fits.ImageHDU(result.detection.snr.astype(np.float32), name="SNR")
+    hdus.append(hdu)
     images = folder / "demo.fits"
     write_fits(hdus, images)
     table = folder / "demo.ecsv"
     with replacing(table) as temporary:
         result.table.write(temporary, format="ascii.ecsv", overwrite=True)
-    return [images, table]
+    candidates = folder / "candidates.ecsv"
+    with replacing(candidates) as temporary:
+        result.detection.table.write(temporary, format="ascii.ecsv", overwrite=True)
+    return [images, table, candidates]

@@ -141,6 +141,45 @@ class LinearModel:
         return torch.cholesky_inverse(self._factor) * self._scale[:, None] * self._scale
 
     @cached_property
+    def determined(self) -> Tensor:
+        """How far the data determine every unknown, (unknowns,).
+
+        1 less the ratio of posterior to prior variance: near 0 for what the data do not see, 1
+        for what has no prior.
+        """
+        inverse = torch.linalg.solve_triangular(
+            self._factor, torch.eye(len(self.vector), dtype=torch.float64), upper=False
+        )
+        variance = inverse.square_().sum(dim=0) * self._scale**2
+        return 1 - variance / self.deviation**2
+
+    def unseen(self, limit: float = 0.01) -> tuple[str, ...]:
+        """Names of the unknowns of which the data determine less than `limit`."""
+        return tuple(
+            name for name, share in zip(self.names, self.determined, strict=True) if share < limit
+        )
+
+    def degenerate(self, limit: float = 0.95) -> list[tuple[str, str, float]]:
+        """Pairs of unknowns that the data hardly tell apart.
+
+        Parameters
+        ----------
+        limit : float
+            Smallest absolute posterior correlation.
+
+        Returns
+        -------
+        list of (name, name, correlation)
+            The strongest first.
+        """
+        covariance = self.covariance
+        deviation = covariance.diagonal().sqrt()
+        correlation = (covariance / deviation[:, None] / deviation).triu(1)
+        found = torch.nonzero(correlation.abs() >= limit).tolist()
+        pairs = [(self.names[i], self.names[j], float(correlation[i, j])) for i, j in found]
+        return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+    @cached_property
     def step(self) -> Tensor:
         """From `vector` to the most probable unknowns of the linear model, (unknowns,).
 

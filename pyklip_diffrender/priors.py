@@ -8,15 +8,22 @@ the modes integrated out, is stationary (D. MacKay, "Bayesian interpolation", Ne
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
+from scipy.optimize import minimize
 from torch import Tensor
 
 from pyklip_diffrender.bases import Basis
+from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.geometry import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.opd import resample
 
-__all__ = ["EvidenceUpdate", "WavefrontPrior", "solve_with_evidence"]
+__all__ = ["EvidenceUpdate", "WavefrontPrior", "learn_prior", "solve_with_evidence"]
 
 
 @dataclass(frozen=True)
@@ -96,6 +103,78 @@ class EvidenceUpdate:
         """The same for unknowns measured in other units, `unit` of the new ones to the old."""
         variance = None if self.variance is None else self.variance * unit**2
         return replace(self, step=self.step * unit, variance=variance)
+
+
+def learn_prior(
+    maps: Sequence[NDArray[np.float64]],
+    basis: Basis,
+    *,
+    diameter: float = JWST_DIAMETER,
+    npix: int = 128,
+    ridge: float = 1e-3,
+) -> WavefrontPrior:
+    """A prior for wavefront changes from the differences of successive wavefront maps.
+
+    Parameters
+    ----------
+    maps : sequence of ndarray, (n, n)
+        At least two, m, entrance-pupil orientation; 0 or constant outside the mirror.
+    basis : Basis
+    diameter : float
+        Side of the maps, m.
+    npix : int
+        Samples on which modes are fitted; the maps are averaged onto them.
+    ridge : float
+        Of the fit, relative to the modes' own norms: modes that the mirror does not tell apart
+        share what they explain.
+
+    Returns
+    -------
+    WavefrontPrior
+        Scales of the groups, knee and slope at which the fitted coefficients are most probable.
+        Scales are not fixed: `refine` starts from them.
+
+    Raises
+    ------
+    ShapeError
+        For fewer than two maps, or maps of different shapes.
+    """
+    stack = np.asarray([np.asarray(each, dtype=float) for each in maps])
+    if stack.ndim != 3 or len(stack) < 2:
+        raise ShapeError(f"maps: got shape {stack.shape}, expected at least two square maps")
+    changes = np.diff(stack, axis=0) * 1e9
+    grid = PupilGrid.full(npix, diameter)
+    averaged = np.stack([resample(change, npix) for change in changes])
+    lit = torch.from_numpy(np.abs(averaged).max(axis=0) > 0)
+    inside = basis.modes(grid, 0, len(basis))[:, lit]
+    system = inside @ inside.T
+    system.diagonal().mul_(1 + ridge)
+    right = inside @ torch.from_numpy(averaged)[:, lit].T
+    coefficients = torch.linalg.solve(system, right).square().mean(dim=1).sqrt().numpy()
+    frequency, group = basis.frequencies.numpy(), basis.group_index.numpy()
+
+    def deviations(logs: NDArray[np.float64]) -> NDArray[np.float64]:
+        scales, knee, slope = np.exp(logs[:-2]), np.exp(logs[-2]), np.exp(logs[-1])
+        return np.asarray(scales[group] / (1 + (frequency / knee) ** slope))
+
+    def surprise(logs: NDArray[np.float64]) -> float:
+        expected = deviations(logs)
+        return float(np.sum(np.log(expected) + 0.5 * (coefficients / expected) ** 2))
+
+    groups = len(basis.groups)
+    typical = [0.5 * np.log(np.mean(coefficients[group == k] ** 2) + 1e-12) for k in range(groups)]
+    answer = minimize(
+        surprise,
+        np.array([*typical, np.log(8.0), 0.0]),
+        method="L-BFGS-B",
+        bounds=[(None, None)] * groups + [(0.0, np.log(1e3)), (np.log(0.1), np.log(6.0))],
+    )
+    scales = np.exp(answer.x[:-2])
+    return WavefrontPrior(
+        scales={name: float(s) for name, s in zip(basis.groups, scales, strict=True)},
+        knee=float(np.exp(answer.x[-2])),
+        slope=float(np.exp(answer.x[-1])),
+    )
 
 
 def _inverse_of_lower(factor: Tensor) -> Tensor:

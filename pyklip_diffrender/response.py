@@ -205,7 +205,7 @@ class Responses:
     relinearise : float
         Relative change of the field (radians, for a phase), rms over the pupil, beyond which the
         response is computed anew. A response from 0.2 away (a star 15 mas off) halves the error
-        that a fit states for the star's position and biases it by five times that much.
+        that a fit states for the star's position and moves it by four of those errors.
     memory_limit : float
         Bytes that may be kept.
     progress : bool

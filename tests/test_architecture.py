@@ -26,7 +26,7 @@ LAYERS = (
     ("nircam",),
     ("bridges",),
     ("observation", "scene", "simulation"),
-    ("bases", "priors", "opd"),
+    ("bases", "opd", "priors"),
     ("response", "multifidelity", "linear_file", "linear_model"),
     ("refinement",),
     ("metrics", "detection"),

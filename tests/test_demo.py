@@ -59,18 +59,25 @@ def test_the_demo_finds_the_planet_that_klip_loses(tmp_path: Path) -> None:
     assert abs(rows["initial"]["annulus SNR"]) < 4
     assert rows["refined"]["seconds"] == pytest.approx(result.fit.seconds)
 
-    images, written_table = write_demo(result, tmp_path / "new")
+    # With the wavefront integrated out the planet is whole, and where it is.
+    (found,) = result.detection.table
+    assert found["snr"] > rows["refined"]["annulus SNR"]
+    assert abs(found["contrast"] - 1e-6) < 3 * found["contrast_error"]
+    assert found["separation"].to_value("arcsec") == pytest.approx(0.6, abs=0.02)
+    assert found["position_angle"].to_value("deg") == pytest.approx(54.0, abs=2.0)
+
+    images, written_table, candidates = write_demo(result, tmp_path / "new")
     figure = tmp_path / "new" / "demo.png"
     save(draw_demo(result), figure)
     assert sorted(p.name for p in figure.parent.iterdir()) == [
-        "demo.ecsv", "demo.fits", "demo.png",
+        "candidates.ecsv", "demo.ecsv", "demo.fits", "demo.png",
     ]  # fmt: skip
     assert figure.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert figure.stat().st_size > 50_000
     with open_fits(images) as hdus:
         assert [hdu.name for hdu in hdus[1:]] == [
             "FRAME", "INITIAL", "KLIP", "REFINED", "OPTIMAL", "OPD_MEASURED", "OPD_TRUE",
-            "OPD_REFINED",
+            "OPD_REFINED", "SNR",
         ]  # fmt: skip
         np.testing.assert_array_equal(hdus["REFINED"].data, result.fit.residual[0])
         np.testing.assert_array_equal(hdus["FRAME"].data, result.observation.data[0])
@@ -82,3 +89,4 @@ def test_the_demo_finds_the_planet_that_klip_loses(tmp_path: Path) -> None:
     assert list(read["star model"]) == list(table["star model"])
     np.testing.assert_allclose(read["annulus SNR"], table["annulus SNR"], rtol=1e-6)
     assert read.meta["hours"] == 40.0
+    assert len(Table.read(candidates, format="ascii.ecsv")) == 1

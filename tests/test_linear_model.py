@@ -230,3 +230,28 @@ def test_another_file_is_no_linear_model(tmp_path: Path) -> None:
 def test_frames_must_agree_on_the_number_of_templates(pair: LinearModel) -> None:
     with pytest.raises(ShapeError, match="one number"):
         pair.weigh({0: random(2, NY, NX, seed=1), 1: random(3, NY, NX, seed=2)})
+
+
+def test_what_the_data_do_not_see_is_named(single: LinearModel) -> None:
+    """One unknown without effect, two with the same effect."""
+    part = single.frames[0]
+    jacobian = part.jacobian.clone()
+    jacobian[0] = 0
+    jacobian[2] = jacobian[1]
+    part = replace(part, jacobian=jacobian)
+    white = (jacobian.double() * part.weight).flatten(1)
+    model = replace(
+        single,
+        frames=(part,),
+        curvature=white @ white.T,
+        deviation=torch.full((SHARED,), 5.0, dtype=torch.float64),
+    )
+    assert model.unseen() == ("unknown[0]",)
+    ((first, second, correlation),) = model.degenerate()
+    assert (first, second) == ("unknown[1]", "unknown[2]")
+    assert correlation < -0.95
+    prior = model.deviation**2
+    torch.testing.assert_close(model.determined, 1 - model.covariance.diagonal() / prior)
+    free = replace(model, deviation=torch.full((SHARED,), torch.inf, dtype=torch.float64))
+    free = replace(free, deviation=torch.where(torch.arange(SHARED) < 3, 5.0, torch.inf))
+    assert float(free.determined[3:].min()) == 1.0

@@ -8,13 +8,13 @@ import torch
 from scipy.stats import multivariate_normal
 
 from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
-from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.geometry import PupilGrid
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.geometry import PupilGrid, jwst_pupil
 from pyklip_diffrender.nircam import nircam_coronagraph
 from pyklip_diffrender.opd import random_opd
 from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.priors import WavefrontPrior, solve_with_evidence
+from pyklip_diffrender.priors import WavefrontPrior, learn_prior, solve_with_evidence
 from pyklip_diffrender.response import (
     NANOMETRE,
     WavefrontResponse,
@@ -277,3 +277,29 @@ def test_the_prior_falls_with_frequency() -> None:
     torch.testing.assert_close(shape[at_three], torch.full_like(shape[at_three], 0.5))
     order = BASIS.frequencies[54:].argsort()
     assert (np.diff(shape[54:][order].numpy()) <= 0).all()
+
+
+def test_a_prior_is_learnt_from_maps() -> None:
+    """Random walks with known scales, seen on the mirror only."""
+    basis = JointBasis([SegmentMotions(), FourierModes(10)])
+    truth = WavefrontPrior(scales={"segment": 3.0, "texture": 0.4}, knee=3.0, slope=1.5)
+    scales = torch.tensor([3.0, 0.4], dtype=torch.float64)
+    deviation = scales[basis.group_index] * truth.shape(basis)
+    grid = PupilGrid.full(128)
+    mirror = (jwst_pupil(128) > 0).numpy()
+    generator = torch.Generator().manual_seed(3)
+    steps = [
+        basis.opd(torch.randn(len(basis), dtype=torch.float64, generator=generator) * deviation,
+                  grid).numpy() * 1e-9 * mirror
+        for _ in range(12)
+    ]  # fmt: skip
+    maps = np.cumsum([np.zeros((128, 128)), *steps], axis=0)
+    found = learn_prior(maps, basis)
+    # Segment motions and low Fourier modes look alike: what one has, the other may take.
+    assert found.scales["segment"] == pytest.approx(3.0, rel=0.3)
+    learnt = torch.tensor([found.scales[name] for name in basis.groups], dtype=torch.float64)
+    ratio = (learnt[basis.group_index] * found.shape(basis) / deviation)[basis.frequencies > 5]
+    assert float(ratio.min()) > 0.6
+    assert float(ratio.max()) < 1.6
+    with pytest.raises(ShapeError, match="at least two"):
+        learn_prior(maps[:1], basis)

@@ -1,4 +1,4 @@
-"""Is S/N calibrated? S/N at planet-free positions and the contrast limit, against drift.
+"""Calibration: S/N at planet-free positions and the contrast limit, against drift.
 
     python examples/paper/calibration.py --opd BEFORE AFTER --seeds 20
 

@@ -50,7 +50,7 @@ NIRCAM_FIT: dict[str, Any] = {
     "kappa_floor": 0.01,
     "max_iterations": 40,
     "relinearise": 0.3,
-    "tolerance": 2e-3,
+    "tolerance": 5e-4,
 }
 """Arguments of `refine`. One percent of the star stays as model error; a companion as bright as
 the speckles gets parameters of its own; pixels that no model explains lose their weight."""
