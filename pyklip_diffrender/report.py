@@ -230,7 +230,8 @@ def draw_bench(table: Table) -> Figure:
     for ax, row in zip(figure.subplots(1, 2), ("forward", "forward + backward"), strict=True):
         measured = np.isfinite(table["seconds"]) & (table["error"] > 0)
         chosen = table[(table["row"] == row) & measured]
-        for line in chosen:
+        chosen.sort("seconds")
+        for number, line in enumerate(chosen):
             ours = str(line["column"]).startswith(("this package", "multi-fidelity", "coarse"))
             colour = "#5b3f95" if ours else "#c0631a"
             filled = colour if line["precision"] == "float64" else "none"
@@ -238,10 +239,11 @@ def draw_bench(table: Table) -> Figure:
             if line["precision"] == "float32":
                 continue  # Next to its own kind in float64, which has the name.
             late = line["seconds"] > chosen["seconds"].max() / 10
+            name = str(line["column"])
             ax.annotate(
-                str(line["column"]), (line["seconds"], line["error"]),
-                xytext=(-6, 5) if late else (6, 5), textcoords="offset points", fontsize=7,
-                ha="right" if late else "left", color=_INK,
+                name if ours else name.split(",")[0], (line["seconds"], line["error"]),
+                xytext=(-7 if late else 7, -9 if number % 2 else 5), textcoords="offset points",
+                fontsize=7, ha="right" if late else "left", color=_INK,
             )  # fmt: skip
         # Nothing is both faster and better than these.
         order = np.argsort(chosen["seconds"])

@@ -1,0 +1,113 @@
+"""How long things take, and how much memory: side by side, in one process."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+__all__ = [
+    "exponent",
+    "give_back",
+    "interleaved",
+    "resident",
+    "seconds",
+    "start_peak",
+    "synchronise",
+]
+
+_FEWEST_ROUNDS = 3
+
+_SHORT = 0.05
+"""Seconds: what takes less is called several times in a row, with warm caches."""
+
+
+def synchronise(device: str) -> None:
+    """Wait until an accelerator has done what it was asked to."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def seconds(work: Callable[[], Any], device: str = "cpu") -> float:
+    """Duration of one call."""
+    synchronise(device)
+    start = time.perf_counter()
+    work()
+    synchronise(device)
+    return time.perf_counter() - start
+
+
+def interleaved(
+    works: Sequence[Callable[[], Any]], budget: float, device: str = "cpu"
+) -> list[float]:
+    """The shortest duration of each of several functions, called in turns.
+
+    In turns, because what else the machine does then disturbs all alike.
+
+    Parameters
+    ----------
+    works : sequence of callable
+        Warm: each was called before.
+    budget : float
+        Seconds for each; what takes longer than a third of it is called less than three times,
+        but at least once.
+    device : str
+        See `synchronise`.
+    """
+    shortest = [math.inf] * len(works)
+    spent = [0.0] * len(works)
+    for turn in range(max(_FEWEST_ROUNDS, math.ceil(budget / _SHORT))):
+        rested = True
+        for k, work in enumerate(works):
+            if turn and spent[k] + shortest[k] > budget:
+                continue
+            rested = False
+            for _ in range(5 if shortest[k] < _SHORT else 1):
+                taken = seconds(work, device)
+                spent[k] += taken
+                shortest[k] = min(shortest[k], taken)
+        if rested:
+            break
+    return shortest
+
+
+def exponent(sizes: Sequence[float], durations: Sequence[float]) -> float:
+    """The power of the size with which a duration grows: a straight line through logarithms."""
+    return float(np.polyfit(np.log(sizes), np.log(durations), 1)[0])
+
+
+_STATUS, _FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+def resident(name: str = "VmRSS") -> float:
+    """Bytes of memory that this process holds, or held at most ("VmHWM"); NaN if not Linux."""
+    if not _STATUS.is_file():
+        return math.nan
+    for line in _STATUS.read_text(encoding="utf-8").splitlines():
+        if line.startswith(f"{name}:"):
+            return 1024.0 * float(line.split()[1])
+    return math.nan
+
+
+def give_back() -> None:
+    """Return freed memory to the system (glibc), so that it does not hide what comes next."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
+
+
+def start_peak(device: str = "cpu") -> None:
+    """Forget how much memory was held at most."""
+    if torch.device(device).type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    elif _FORGET.exists():
+        _FORGET.write_text("5", encoding="ascii")

@@ -1,0 +1,233 @@
+"""The benchmark: what it measures, what it says where it cannot, and the page made of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from astropy.table import Table
+
+from pyklip_diffrender.bench import Setting, rivals, run_bench, write_page, write_table
+from pyklip_diffrender.bench import images as bench_images
+from pyklip_diffrender.bench.case import Case
+from pyklip_diffrender.bench.images import forward
+from pyklip_diffrender.bench.memory import memory_of, peak_memory
+from pyklip_diffrender.bench.page import page, targets
+from pyklip_diffrender.bench.rivals import load, paper_recipe
+from pyklip_diffrender.bench.rows import ROWS, chosen_rows
+from pyklip_diffrender.bench.timing import exponent, interleaved
+from pyklip_diffrender.bridges.plain import plain_stpsf
+from pyklip_diffrender.cli import main
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.report import draw_bench
+
+
+@pytest.fixture(scope="module")
+def here() -> Setting:
+    return Setting(quick=True)
+
+
+@pytest.fixture(scope="module")
+def measured(here: Setting) -> Table:
+    """The rows on images, in a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("STPSF_PATH", raising=False)
+        return run_bench(here, ["forward"], budget=0.02, memory=False, command="bench --quick")
+
+
+def line(table: Table, row: str, column: str, precision: str = "float64") -> Any:
+    (found,) = (
+        r for r in table if (r["row"], r["column"], r["precision"]) == (row, column, precision)
+    )
+    return found
+
+
+def test_every_way_to_an_image_agrees_with_the_converged_one(measured: Table) -> None:
+    """The codes that are compared with solve the same problem: no flip, no wrong scale."""
+    assert line(measured, "forward", "this package, 128")["error"] < 1e-7
+    assert line(measured, "forward", "poppy, FFT, oversample 4")["error"] < 1e-7
+    # Padded by 2, as in the paper's recipe, the occulter is sampled more coarsely.
+    for row in ("forward", "forward + backward"):
+        assert line(measured, row, "the paper's recipe")["error"] < 1e-6
+
+
+@pytest.mark.parametrize("name", ["prysm", "hcipy"])
+def test_other_codes_agree_too(here: Setting, name: str) -> None:
+    try:
+        load(name)
+    except ImportError as error:
+        pytest.skip(f"needs the extra 'bench': {error}")
+    image = getattr(rivals, f"{name}_image")(here.arrays)()
+    assert here.judge(bench_images._scaled(image, here)).error < 1e-7
+
+
+def test_the_papers_recipe_has_the_derivative_of_the_package(here: Setting) -> None:
+    weight = torch.from_numpy(np.random.default_rng(1).standard_normal(here.truth.shape))
+    slopes = []
+    for image in (paper_recipe(here.arrays, "cpu"), here.model):
+        opd = here.opd.clone().requires_grad_()
+        slopes.append(torch.autograd.grad((weight * image(opd)).sum(), opd)[0])
+    assert (slopes[0] - slopes[1]).norm() < 1e-5 * slopes[1].norm()
+
+
+def test_errors_are_of_the_answers_and_ratios_to_the_reference(measured: Table) -> None:
+    ours, theirs = (
+        line(measured, "forward + backward", name)
+        for name in ("this package, 128", "the paper's recipe")
+    )
+    assert theirs["ratio"] == 1
+    assert ours["ratio"] == pytest.approx(theirs["seconds"] / ours["seconds"])
+    coarse = line(measured, "forward", "coarse alone, 64")
+    mixed = line(measured, "forward", "multi-fidelity, 64")
+    assert mixed["error"] < 0.1 * coarse["error"]
+    assert mixed["sigma"] < 0.2 * coarse["sigma"]
+    assert line(measured, "forward", "this package, 128", "float32")["error"] > ours["error"]
+
+
+def test_what_cannot_be_measured_is_said(measured: Table) -> None:
+    found = line(measured, "forward", "stpsf calc_psf, fft_oversample 4")
+    assert math.isnan(found["seconds"])
+    assert "STPSF_PATH" in found["note"]
+    assert "no GPU" in line(measured, "forward", "this package as a CUDA graph")["note"]
+
+
+def test_a_missing_library_is_said(here: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> None:
+        raise ImportError(f"No module named {name!r}")
+
+    monkeypatch.setattr(bench_images, "load", absent)
+    monkeypatch.delenv("STPSF_PATH", raising=False)
+    notes = {case.column: case.note for case in forward(here) if case.make is None}
+    assert "No module named 'prysm'" in notes["prysm"]
+    assert "No module named 'hcipy'" in notes["hcipy"]
+
+
+def test_stpsf_is_one_of_the_ways(stpsf_path: Path) -> None:
+    with_data = Setting(quick=True, stpsf_path=str(stpsf_path))
+    cases = {case.column: case for case in forward(with_data) if "stpsf" in case.column}
+    theirs, ours = cases.values()
+    for case, most in ((theirs, 1e-6), (ours, 1e-6)):
+        assert case.make is not None
+        assert case.judge(case.make()()).error < most
+    with pytest.raises(IncompatibleSetupError, match="npix512"):
+        plain_stpsf(stpsf_path, 512)
+
+
+def test_the_other_rows_run(here: Setting) -> None:
+    table = run_bench(here, ["Jacobian"], budget=0.01, memory=False)
+    fine = line(table, "Jacobian", "this package, 166 modes on 64", "float32")
+    rough = line(table, "Jacobian", "this package, 166 modes on 32", "float32")
+    assert fine["error"] < rough["error"] < 0.1
+    one_by_one = line(table, "Jacobian", "mode by mode, forward mode on 128")
+    assert one_by_one["times"] == 166
+    assert one_by_one["seconds"] > fine["seconds"]
+
+
+def test_refinement_and_detection_run(here: Setting) -> None:
+    table = run_bench(here, ["refinement", "S/N", "contrast"], budget=0.01, memory=False)
+    ours = line(table, "refinement", "this package, the wavefront alone free")
+    assert ours["error"] < line(table, "refinement", "the paper's recipe, 1000 Adam steps")["error"]
+    curve = line(table, "contrast curve", "this package, 20 x 6 positions")
+    assert curve["error"] < 0.05
+    assert curve["ratio"] > 50
+    assert line(table, "S/N map", "this package, 576 positions")["error"] < 1e-3
+
+
+def test_rows_are_chosen_by_how_they_begin() -> None:
+    assert [row.name for row in chosen_rows(["Jac", "S/N"])] == ["Jacobian", "S/N map"]
+    assert chosen_rows([]) == list(ROWS)
+    with pytest.raises(IncompatibleSetupError, match="rows: got 'backward'"):
+        chosen_rows(["backward"])
+
+
+def test_durations_are_the_shortest_and_taken_in_turns() -> None:
+    calls: list[str] = []
+
+    def work(name: str, seconds: float) -> Any:
+        def run() -> None:
+            calls.append(name)
+            time.sleep(seconds)
+
+        return run
+
+    short, long = interleaved([work("short", 0.001), work("long", 0.06)], 0.1)
+    assert 0.001 <= short < 0.06 <= long
+    assert calls.index("long") < len(calls) - 1 - calls[::-1].index("short")
+    assert calls.count("long") <= 2
+
+
+def test_exponents() -> None:
+    assert exponent([1, 2, 4], [3, 12, 48]) == pytest.approx(2)
+
+
+def test_memory_is_that_of_the_arrays(here: Setting) -> None:
+    if not Path("/proc/self/clear_refs").exists():
+        pytest.skip("needs Linux: /proc/self/clear_refs")
+
+    def make() -> Any:
+        kept = np.ones(4_000_000)
+        return lambda: kept + 1
+
+    assert 30e6 < memory_of(Case("row", "column", make), here) < 90e6
+
+
+def test_memory_in_a_process_of_its_own(here: Setting) -> None:
+    (case,) = (
+        c for c in forward(here) if c.column == "this package, 128" and c.precision == "float64"
+    )
+    assert 1e5 < peak_memory(case, here) < 1e9
+    assert math.isnan(peak_memory(case, here, timeout=0.01))
+
+
+def test_page_and_figure_from_the_table_alone(measured: Table, tmp_path: Path) -> None:
+    table = run_bench(
+        Setting(quick=True), ["scaling"], budget=0.01, memory=False, command="bench --quick"
+    )
+    assert np.isfinite(list(table.meta["exponents"].values())).all()
+    assert len(table.meta["exponents"]) == 5
+    assert all(limit.get("limit", 1) > 0 for limit in table.meta["limits"])
+    written = write_table(table, tmp_path / "results")
+    assert main(["bench", "--page", str(written), "-o", str(tmp_path)]) == 0
+    text = (tmp_path / "performance.md").read_text(encoding="utf-8")
+    assert "## Scaling" in text
+    assert "nothing was measured on a GPU" in text
+    assert "![Error against time](results/performance.png)" in text
+
+    path = write_page(write_table(measured, tmp_path), tmp_path)
+    text = path.read_text(encoding="utf-8")
+    assert "| this package, 128 | float64, eager |" in text
+    assert "not measured: no data directory" in text
+    assert len(draw_bench(measured).axes) == 2
+
+
+def test_what_was_asked_for_is_judged() -> None:
+    facts = {"precision": "float64", "sigma": math.nan}
+    table = Table(
+        [
+            {"row": "contrast curve", "column": "this package, 20 x 6 positions",
+             "seconds": 1.0, "error": 0.01, **facts},
+            {"row": "contrast curve", "column": "120 injections, each refined again",
+             "seconds": 60.0, "error": 0.0, **facts},
+        ]
+    )  # fmt: skip
+    judged = {words: met for words, *_, met in targets(table)}
+    assert judged.pop(next(words for words in judged if words.startswith("contrast"))) == "yes"
+    assert set(judged.values()) == {""}
+    table["error"][0] = 0.06
+    assert targets(table)[-1][-1] == "no"
+
+
+def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "--rows", "nothing", "-o", str(tmp_path)]) == 1
+    assert "expected some of 'forward'" in capsys.readouterr().err
+    options = ["--quick", "--no-memory", "--rows", "forward + backward", "-o", str(tmp_path)]
+    assert main(["bench", *options]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"performance.ecsv", "performance.png"}
+    table = Table.read(tmp_path / "performance.ecsv", format="ascii.ecsv")
+    assert table.meta["command"] == ("pyklip-diffrender bench --quick --rows 'forward + backward'")
+    assert page(table).startswith("# Performance")
