@@ -150,7 +150,11 @@ class WavefrontResponse:
         _log.debug("response of %d modes at %d pupil samples", len(basis), coarse.npix)
 
     def image(
-        self, fields: Sequence[Tensor], values: dict[str, Tensor], amplitude_modes: int = 0
+        self,
+        fields: Sequence[Tensor],
+        values: dict[str, Tensor],
+        amplitude_modes: int = 0,
+        modes: int | None = None,
     ) -> Tensor:
         """Derivative of the image, for a star with the given fields.
 
@@ -165,21 +169,23 @@ class WavefrontResponse:
             Values of the model's other parameters (the blur matters here).
         amplitude_modes : int
             How many modes, the first, are amplitude modes as well.
+        modes : int, optional
+            How many modes, the first, are wanted; default all.
 
         Returns
         -------
         Tensor, (modes + amplitude_modes, ny, nx), float32
             Light per pixel (fraction of what the pupil collects) per nm.
         """
-        modes = len(self.fields[0])
+        modes = len(self.fields[0]) if modes is None else modes
         shape = (modes + amplitude_modes, *self.fields[0].shape[1:])
         total = torch.zeros(shape, device=self.model.device)
         for field, change, weight in zip(
             fields, self.fields, self.model.bandpass.weights, strict=True
         ):
             conjugate = (2 * weight) * field.to(change.dtype).conj()
-            product = change * conjugate
-            total[:modes] += product.real
+            product = change[: max(modes, amplitude_modes)] * conjugate
+            total[:modes] += product[:modes].real
             total[modes:] += product[:amplitude_modes].imag
         return self.coarse.detector.image(total, values)
 

@@ -110,15 +110,20 @@ class Forward:
         star = values.get("star_offset", torch.zeros(2, dtype=torch.float64))
         return {**values, "star_offset": star + offset.to(star.device)}
 
-    def jacobian(self, point: Point, with_modes: bool) -> Tensor:
-        """Derivative of `total`, (unknowns, ny, nx), float64; without the modes if so asked."""
+    def jacobian(self, point: Point, modes: int) -> Tensor:
+        """Derivative of `total`, (unknowns, ny, nx), float64.
+
+        Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront.
+        """
         unknowns, vector = point.unknowns, point.vector
         values, opd = unknowns.values(vector), self.coarse_opd(point)
         flux = unknowns.level("flux", vector)
-        count = unknowns.where("modes" if with_modes else "companions").stop
+        count = unknowns.where("companions").stop
+        if modes:
+            count = unknowns.where("modes").start + modes
         # One array, filled in place: it is the largest of the fit.
         rows = torch.empty(count, *point.image.shape, dtype=torch.float64, device=opd.device)
-        response = self._response_at(point) if with_modes else None
+        response = self._response_at(point) if modes else None
         if unknowns.optical:
             slopes = (
                 response.parameters(point.fields, values)
@@ -142,10 +147,10 @@ class Forward:
             turned = torch.tensordot(unknowns.turn.T.to(moved.device), moved, dims=1)
             rows[first + 1 : first + 3] = flux * source[0] * turned
         if response is not None:
-            amplitude, modes = unknowns.where("amplitude"), unknowns.where("modes")
-            slopes = response.image(point.fields, values, unknowns.amplitude_modes)
-            rows[amplitude] = slopes[len(self.basis) :]
-            rows[modes] = slopes[: len(self.basis)]
+            amplitude = unknowns.where("amplitude")
+            slopes = response.image(point.fields, values, unknowns.amplitude_modes, modes)
+            rows[amplitude] = slopes[modes:]
+            rows[amplitude.stop :] = slopes[:modes]
             rows[amplitude.start :] *= flux
         return rows
 

@@ -45,6 +45,11 @@ _EXPLAINED = 1.5
 _NEGLIGIBLE = 1e-3
 """Model error, as a share of the star, below which annealing ends."""
 
+_COARSE = 0.01
+"""Model error, as a share of the star, above which modes to `_FEW_CYCLES` do as well as all."""
+
+_FEW_CYCLES = 14.0
+
 _ANNEALING = 0.6
 """Factor by which kappa shrinks at least from step to step."""
 
@@ -97,6 +102,7 @@ class GaussNewton:
         several = len(problems) > 1
         self.own_prior = options.drift if several else None
         self.drift = _first_modes(self.basis, options.drift_cycles) if self.own_prior else 0
+        self.few = _first_modes(self.basis, _FEW_CYCLES)
         self.amplitude_deviation = options.prior.amplitude_deviation(self.basis)
         self._prepare_priors(len(problems))
         self.history: list[dict[str, Any]] = []
@@ -180,36 +186,33 @@ class GaussNewton:
     ) -> EvidenceUpdate:
         """Most probable unknowns, as distances from their starts, for the linearised model."""
         curvature = equations.curvature
-        before = joint.where("modes").start
-        with_modes = len(curvature) > joint.where("companions").stop
+        modes = max(0, len(curvature) - joint.where("modes").start)
         fixed = joint.prior_deviation()
-        if with_modes:
+        if modes:
             fixed = torch.cat([fixed, self.amplitude_deviation])
         # Columns differ by many powers of ten (flux against nm): solve in their own units.
         own = torch.ones(len(curvature), dtype=torch.float64)
         own[: len(fixed)] = curvature.diagonal()[: len(fixed)].clamp(min=1e-300) ** -0.5
-        modes = slice(None) if with_modes else slice(0, 0)
-        assert not with_modes or before == len(fixed)
         update = solve_with_evidence(
             curvature * own[:, None] * own,
             equations.gradient * own,
-            self.shape[modes],
-            self.group[modes],
+            self.shape[:modes],
+            self.group[:modes],
             self.scales,
             fixed / own[: len(fixed)],
-            iterations=1 if fit_scales and with_modes else 0,
+            iterations=1 if fit_scales and modes else 0,
             damping=damping,
             current=equations.current / own,
             errors=errors,
         )
         return update.in_units(own)
 
-    def descend(self, state: State, kappa: float, with_modes: bool) -> tuple[State, float]:
+    def descend(self, state: State, kappa: float, modes: int) -> tuple[State, float]:
         """One damped step; returns the new state and by how much chi2 per pixel fell."""
         joint = state.joint
-        equations = self.equations = linearise(self.misfit, state, kappa, with_modes)
+        equations = self.equations = linearise(self.misfit, state, kappa, modes)
         sigmas = [self.misfit.sigma(k, point, kappa) for k, point in enumerate(state.points)]
-        update = self.solve(joint, equations, fit_scales=with_modes and self.fits_scales)
+        update = self.solve(joint, equations, fit_scales=self.fits_scales)
         self.scales = update.scales
         expected = self.predicted_gain(joint, equations, update.step)
         if expected < self.options.tolerance * self.misfit.pixels:
@@ -287,16 +290,18 @@ class GaussNewton:
         kappa = max(self.misfit.model_error(state), options.kappa_floor)
         best, best_error = state, (math.inf, math.inf)
         status = Status.ITERATION_LIMIT
-        with_modes = options.wavefront and (not options.free or options.resume is not None)
+        modes = 0
+        if options.wavefront and (not options.free or options.resume is not None):
+            modes = self.modes_for(kappa)
         bar = tqdm(total=options.max_iterations, desc="refine", disable=not self.progress)
         for iteration in range(options.max_iterations):
-            state, gain = self.descend(state, kappa, with_modes)
+            state, gain = self.descend(state, kappa, modes)
             needed, chi2 = self.misfit.model_error(state), self.misfit.chi2_per_pixel(state)
             if (needed, chi2) < best_error:
                 best, best_error = state, (needed, chi2)
             record = {
                 "iteration": iteration,
-                "wavefront": with_modes,
+                "wavefront": modes > 0,
                 "kappa": kappa,
                 "chi2_per_pixel": chi2,
                 "model_error": needed,
@@ -308,7 +313,7 @@ class GaussNewton:
             bar.update()
             bar.set_postfix(chi2=f"{chi2:.3g}", kappa=f"{kappa:.2g}")
             settled = gain < options.tolerance
-            if not with_modes:
+            if not modes:
                 kappa = max(options.kappa_floor, min(kappa, needed))
                 known = len(state.joint.frames[0].companions)
                 if gain < 0.05 and known < options.companions:
@@ -317,21 +322,28 @@ class GaussNewton:
                         continue
                 if gain < 0.05 and options.wavefront:
                     # What the alignment alone could not follow says nothing about these steps.
-                    with_modes, self.damping = True, 0.0
+                    modes, self.damping = self.modes_for(kappa), 0.0
                 elif settled:
                     status = self.status_of(chi2)
                     break
                 continue
-            if settled and kappa <= options.kappa_floor:
+            if settled and kappa <= options.kappa_floor and modes == len(self.basis):
                 status = self.status_of(chi2)
                 break
             kappa = min(_ANNEALING * kappa, needed / 2)
             if kappa < max(_NEGLIGIBLE, options.kappa_floor):
                 kappa = options.kappa_floor
+            modes = self.modes_for(kappa)
         bar.close()
         if best.flux <= 0:
             status = Status.DIVERGED
         return self.results(best, status, began, seed)
+
+    def modes_for(self, kappa: float) -> int:
+        """How many modes are worth fitting while the model may miss a share kappa of the star."""
+        several = len(self.misfit.forwards) > 1
+        everything = self.options.kappa_floor > 0 or len(self.amplitude_deviation) or several
+        return len(self.basis) if everything or kappa <= _COARSE else self.few
 
     def status_of(self, chi2: float) -> Status:
         """How a fit that has settled ended."""
@@ -341,15 +353,15 @@ class GaussNewton:
         """Errors at the end, and everything in the form that users see."""
         joint, chi2 = state.joint, self.misfit.chi2_per_pixel(state)
         kappa = 0.0 if chi2 < _EXPLAINED else self.misfit.model_error(state)
-        equations, wavefront = self.equations, self.options.wavefront
-        count = joint.size if wavefront else joint.where("companions").stop
+        equations, modes = self.equations, len(self.basis) if self.options.wavefront else 0
+        count = joint.unknowns_with(modes)
         if (
             equations is None
             or equations.state is not state
             or equations.kappa != kappa
             or len(equations.current) != count
         ):
-            equations = linearise(self.misfit, state, kappa, wavefront)
+            equations = linearise(self.misfit, state, kappa, modes)
         frames = equations.frames
         update = self.solve(joint, equations, errors=True)
         assert update.variance is not None

@@ -21,7 +21,7 @@ __all__ = ["gauss_newton"]
 
 _log = logging.getLogger(__name__)
 
-_STRUCTURE = 1.1
+_STRUCTURE = 1.15
 """chi2 per pixel, over what it should be, above which more modes are tried."""
 
 

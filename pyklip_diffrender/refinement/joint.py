@@ -73,6 +73,13 @@ class Joint:
         """Number of unknowns."""
         return self.where("drift").stop
 
+    def unknowns_with(self, modes: int) -> int:
+        """How many unknowns there are when only the first modes are free, or none (0)."""
+        if modes == 0:
+            return self.where("companions").stop
+        every = self.where("modes")
+        return self.size if modes == every.stop - every.start else every.start + modes
+
     def rows(self, frame: int) -> Tensor:
         """For every entry of a frame's vector its place in the joint one, (entries,), int64."""
         unknowns = self.frames[frame]

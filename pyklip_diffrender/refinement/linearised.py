@@ -45,7 +45,7 @@ def _self_product(rows: Tensor) -> Tensor:
     return upper + upper.triu(1).T
 
 
-def linearise(misfit: Misfit, state: State, kappa: float, with_modes: bool) -> Linearised:
+def linearise(misfit: Misfit, state: State, kappa: float, modes: int) -> Linearised:
     """Normal equations about a state.
 
     Parameters
@@ -54,30 +54,31 @@ def linearise(misfit: Misfit, state: State, kappa: float, with_modes: bool) -> L
     state : State
     kappa : float
         Share of the star that the model may miss.
-    with_modes : bool
-        Whether the wavefront is among the unknowns.
+    modes : int
+        How many of the wavefront's modes are free, the first ones: all, or fewer where frames do
+        not drift apart; 0 for none and no amplitude.
     """
     joint = state.joint
-    size = joint.size if with_modes else joint.where("companions").stop
+    size = joint.unknowns_with(modes)
     current = (state.vector - joint.initial())[:size]
     curvature = torch.zeros(size, size, dtype=torch.float64)
     gradient = torch.zeros(size, dtype=torch.float64)
     frames = []
     for k, (forward, point) in enumerate(zip(misfit.forwards, state.points, strict=True)):
         residual, weight = misfit.weighted(k, point, kappa)
-        rendered = forward.jacobian(point, with_modes)
-        modes = point.unknowns.where("modes").start
+        rendered = forward.jacobian(point, modes)
+        first = point.unknowns.where("modes").start
         rows = joint.rows(k)[: len(rendered)]
-        drift = joint.drift_rows(k) if with_modes else torch.zeros(0, dtype=torch.int64)
+        drift = joint.drift_rows(k) if modes else torch.zeros(0, dtype=torch.int64)
         left = torch.where(weight > 0, residual / weight.clamp(min=1e-300), 0.0).cpu()
         slopes = rendered.float().cpu()
-        frames.append(LinearFrame(left, weight.cpu(), slopes, rows, drift, modes))
+        frames.append(LinearFrame(left, weight.cpu(), slopes, rows, drift, first))
         whitened = rendered.mul_(weight).flatten(1).cpu()
         product, pulled = _self_product(whitened), whitened @ residual.flatten().cpu()
         if len(state.points) == 1:
             curvature, gradient = product, pulled
             continue
-        own = slice(modes, modes + len(drift))
+        own = slice(first, first + len(drift))
         for to, which in ((rows, slice(None)), (drift, own)):
             gradient.index_add_(0, to, pulled[which])
             for onto, other in ((rows, slice(None)), (drift, own)):
