@@ -26,6 +26,10 @@ from pyklip_diffrender.opd import resample
 __all__ = ["EvidenceUpdate", "WavefrontPrior", "learn_prior", "solve_with_evidence"]
 
 
+_ROUNDING = 1e-12
+"""Relative error of the curvature's elements."""
+
+
 @dataclass(frozen=True)
 class WavefrontPrior:
     """Standard deviations of wavefront coefficients.
@@ -198,6 +202,7 @@ def solve_with_evidence(
     current: Tensor | None = None,
     errors: bool = False,
     floor: float = 1e-4,
+    ceiling: float = 100.0,
 ) -> EvidenceUpdate:
     """Solve a whitened linear least-squares problem with Gaussian priors about zero.
 
@@ -223,8 +228,10 @@ def solve_with_evidence(
         Where the unknowns are now.
     errors : bool
         Also compute the variances.
-    floor : float
-        Smallest scale, so that an absent group does not end in a division by zero.
+    floor, ceiling : float
+        Smallest and largest scale: an absent group must not end in a division by zero, nor what
+        no wavefront explains (a bright companion that is not in the model) in a prior so wide
+        that the equations cannot be solved.
     """
     others = len(fixed_deviation)
     effective = float("nan")
@@ -232,7 +239,8 @@ def solve_with_evidence(
         deviation = torch.cat([fixed_deviation, scales[group] * shape])
         precision = deviation**-2
         system = curvature.clone()
-        system.diagonal().add_((1 + damping) * precision)
+        # Rounding in the curvature is as large as a wide prior's precision.
+        system.diagonal().mul_(1 + _ROUNDING).add_((1 + damping) * precision)
         factor = torch.linalg.cholesky(system)
         pulled = gradient if current is None else gradient + damping * precision * current
         step = torch.cholesky_solve(pulled[:, None], factor)[:, 0]
@@ -247,7 +255,7 @@ def solve_with_evidence(
         power = (step[others:] / shape) ** 2
         counted = torch.zeros_like(scales).index_add(0, group, determined)
         summed = torch.zeros_like(scales).index_add(0, group, power)
-        scales = torch.sqrt(summed / counted.clamp(min=1e-3)).clamp(min=floor)
+        scales = torch.sqrt(summed / counted.clamp(min=1e-3)).clamp(min=floor, max=ceiling)
     known = torch.isfinite(deviation)
     log_evidence = float(
         0.5 * gradient @ step - factor.diagonal().log().sum() - deviation[known].log().sum()

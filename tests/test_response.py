@@ -268,6 +268,27 @@ def test_an_absent_kind_ends_at_the_floor(linear: dict[str, torch.Tensor]) -> No
     assert torch.isfinite(got.step).all()
 
 
+def test_what_no_wavefront_explains_ends_at_the_ceiling() -> None:
+    """More modes than the data tell apart, and data far larger than their noise."""
+    generator = torch.Generator().manual_seed(4)
+    design = torch.randn(60, 40, dtype=torch.float64, generator=generator)
+    design = torch.cat([design, design + 1e-9 * design.roll(1, 0)], dim=1)
+    observed = 1e8 * torch.randn(60, dtype=torch.float64, generator=generator)
+    got = solve_with_evidence(
+        design.T @ design,
+        design.T @ observed,
+        torch.ones(80, dtype=torch.float64),
+        torch.zeros(80, dtype=torch.int64),
+        torch.tensor([1.0], dtype=torch.float64),
+        torch.zeros(0, dtype=torch.float64),
+        iterations=5,
+        errors=True,
+    )
+    assert float(got.scales[0]) == 100.0
+    assert got.variance is not None
+    assert bool(torch.isfinite(got.step).all() and torch.isfinite(got.variance).all())
+
+
 def test_the_prior_falls_with_frequency() -> None:
     prior = WavefrontPrior(knee=3.0, slope=2.0)
     shape = prior.shape(BASIS)
