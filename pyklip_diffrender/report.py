@@ -128,8 +128,8 @@ def _draw_found(ax: Axes, figure: Figure, result: DemoResult) -> None:
     facts = "nothing above 5 sigma"
     if len(table):
         facts = (
-            f"S/N {table['snr'][0]:.1f}, contrast {table['contrast'][0] / planet.contrast:.2f} "
-            f"± {table['contrast_error'][0] / planet.contrast:.2f} of the true one"
+            f"S/N {table['snr'][0]:.1f}, flux {table['contrast'][0] / planet.contrast:.2f} "
+            f"± {table['contrast_error'][0] / planet.contrast:.2f} of true"
         )
     shown = draw_image(
         ax, found.snr, scale, limits=(-6, 6), cmap="RdBu_r",

@@ -69,6 +69,8 @@ def rms(values: np.ndarray) -> float:
 def about_calibration() -> list[str]:
     """S/N where there is nothing, and the limit."""
     found = tables("calibration")
+    if not found:
+        return []
     rows = []
     for kind, table in found.items():
         for hours in sorted(set(table["hours"])):
@@ -114,6 +116,8 @@ def about_calibration() -> list[str]:
 def about_fluxes() -> list[str]:
     """Bias and coverage."""
     found = tables("fluxes")
+    if not found:
+        return []
     rows = []
     for kind, table in found.items():
         for row in fluxes.summary(table):
@@ -150,6 +154,8 @@ def about_fluxes() -> list[str]:
 def about_mismatch() -> list[str]:
     """The instrument found from the frame."""
     found = tables("mismatch")
+    if not found:
+        return []
     names = {
         "offset_error_mas": "star position, mas",
         "lyot_error_percent": "Lyot stop's shift, % of the pupil",
@@ -185,6 +191,8 @@ def about_mismatch() -> list[str]:
 def about_companions() -> list[str]:
     """Several planets, a bright one, a ring."""
     found = tables("companions")
+    if not found:
+        return []
     rows = []
     for kind, table in found.items():
         for scene in dict.fromkeys(table["scene"]):
@@ -226,6 +234,8 @@ def about_companions() -> list[str]:
 def about_snapshots() -> list[str]:
     """Several frames."""
     found = tables("snapshots")
+    if not found:
+        return []
     rows = []
     for kind, table in found.items():
         single = table[table["snapshots"] == 1]["error"].mean()
@@ -262,10 +272,44 @@ def about_snapshots() -> list[str]:
     ]
 
 
+def about_speed() -> list[str]:
+    """Seconds, beside the paper's recipe."""
+    found = tables("speed")
+    if not found:
+        return []
+    rows = [
+        (
+            str(row["model"]),
+            str(row["run"]),
+            *(
+                "" if math.isnan(row[name]) else f"{row[name]:.1f}"
+                for name in ("refine", "refine_and_curve", "all")
+            ),
+            "" if math.isnan(row["star_error"]) else f"{row['star_error']:.2f}",
+        )
+        for table in found.values()
+        for row in table
+    ]
+    header = (
+        "80 x 80 pixels", "run", "refinement, s", "and contrast curve, s", "and S/N map, s",
+        "star error, sigma",
+    )  # fmt: skip
+    return [
+        "## How long it takes",
+        "",
+        "On all cores with nothing else running. The first run in a process loads libraries and "
+        "builds constants.",
+        "",
+        *markdown(header, rows),
+        *origin(found),
+    ]
+
+
 def draw() -> Figure:
     """S/N calibration, limit, fluxes."""
-    figure = Figure(figsize=(15, 4.4), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
+    panels = 3 if tables("fluxes") else 2
+    figure = Figure(figsize=(5 * panels, 4.4), layout="constrained")
+    left, middle, *rest = figure.subplots(1, panels)
     middles = calibration.RINGS[:-1] + 0.1
     for kind, table in tables("calibration").items():
         for hours, style in ((3.0, ":"), (40.0, "-"), (86.0, "--"), (200.0, "-.")):
@@ -283,14 +327,15 @@ def draw() -> Figure:
     titles = (
         (left, "Deviation of S/N where there is nothing"),
         (middle, "5-sigma limit / photon limit"),
-        (right, "Flux of injected planets / true"),
+        *((ax, "Flux of injected planets / true") for ax in rest),
     )
     for ax, title in titles:
         ax.set_title(title, fontsize=10, loc="left")
         ax.set_xlabel("arcsec", fontsize=9)
     middle.set_ylim(1.0, 1.5)
     left.legend(frameon=False, fontsize=7)
-    _draw_fluxes(right)
+    for ax in rest:
+        _draw_fluxes(ax)
     return figure
 
 
@@ -325,6 +370,7 @@ def main() -> None:
         *about_mismatch(),
         *about_companions(),
         *about_snapshots(),
+        *about_speed(),
     ]
     notes = RESULTS / "inference_notes.md"
     if notes.is_file():
