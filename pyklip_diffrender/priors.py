@@ -23,7 +23,13 @@ from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.geometry import JWST_DIAMETER, PupilGrid
 from pyklip_diffrender.opd import resample
 
-__all__ = ["EvidenceUpdate", "WavefrontPrior", "learn_prior", "solve_with_evidence"]
+__all__ = [
+    "EvidenceUpdate",
+    "WavefrontPrior",
+    "learn_prior",
+    "scale_ratios",
+    "solve_with_evidence",
+]
 
 
 _ROUNDING = 1e-12
@@ -261,3 +267,31 @@ def solve_with_evidence(
         0.5 * gradient @ step - factor.diagonal().log().sum() - deviation[known].log().sum()
     )
     return EvidenceUpdate(step, variance if errors else None, scales, effective, log_evidence)
+
+
+def scale_ratios(
+    step: Tensor, variance: Tensor, deviation: Tensor, group: Tensor, *, enough: float = 20.0
+) -> Tensor:
+    """How large the modes of each group are, relative to what their prior says.
+
+    At the scales of the highest evidence, the sum of (step / deviation)^2 is the number of modes
+    that the data determine.
+
+    Parameters
+    ----------
+    step, variance, deviation : Tensor, (modes,)
+        Most probable values, their variance, and the prior's standard deviation.
+    group : Tensor, (modes,), int64
+    enough : float
+        Groups of which fewer modes are determined are left out.
+
+    Returns
+    -------
+    Tensor, (groups,)
+        1 where all is well or nothing can be said; above 1 for a prior that is too narrow.
+    """
+    count = int(group.max()) + 1
+    determined = torch.zeros(count, dtype=step.dtype)
+    determined.index_add_(0, group, 1 - variance / deviation**2)
+    size = torch.zeros_like(determined).index_add_(0, group, (step / deviation) ** 2)
+    return torch.where(determined > enough, (size / determined).clamp(min=0).sqrt(), 1.0)

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 # Before numpy or torch are imported: thread pools read these once.
@@ -74,3 +78,20 @@ def stpsf_path(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         del os.environ["STPSF_PATH"]
     else:
         os.environ["STPSF_PATH"] = before
+
+
+@pytest.fixture
+def killed() -> Callable[[str, Path], None]:
+    """Runs a program with a path, and kills it as soon as it prints a line."""
+
+    def run(program: str, path: Path) -> None:
+        with subprocess.Popen(
+            [sys.executable, "-c", textwrap.dedent(program), str(path)],
+            stdout=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        ) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"writing\n"
+            process.send_signal(signal.SIGKILL)
+
+    return run

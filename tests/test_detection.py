@@ -139,14 +139,46 @@ def test_flux_of_planets_is_unbiased_and_its_error_right(world: World) -> None:
 
 
 def test_the_subtracted_frame_has_lost_light_that_the_measurement_has_not(world: World) -> None:
-    planet = replace(WHERE, contrast=2e-5)
+    # Too near for the fit to look for it by itself.
+    planet = Planet(2e-5, 0.33, 60.0)
     fit = world.fitted(7, planet)
+    assert not len(fit.companions)
     light = world.expected(planet) - world.expected()
     weight = light / fit.observation.error[0] ** 2
     kept = float((weight * fit.residual[0]).sum() / (weight * light).sum())
     measured = float(dr.measure(fit, [planet.offset])["contrast"][0]) / 2e-5
     assert kept < 0.9
-    assert measured == pytest.approx(1.0, abs=0.15)
+    assert measured == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize("contrast", [3e-5, 1e-3])
+def test_a_bright_companion_gets_parameters_of_its_own(world: World, contrast: float) -> None:
+    """Without them the wavefront bends to it, and nothing converges."""
+    planet = replace(WHERE, contrast=contrast)
+    fit = world.fitted(7, planet)
+    assert fit.status is Status.CONVERGED
+    assert len(fit.companions) == 1
+    measured, error = fit.companions[0], fit.companion_errors[0]
+    assert measured[0] == pytest.approx(contrast, rel=0.02, abs=4 * error[0])
+    assert measured[1:] == pytest.approx(planet.offset, abs=0.005)
+    assert fit.star_image == pytest.approx(world.expected(), rel=0.02, abs=100)
+
+
+def test_what_a_fit_took_for_a_companion_need_not_be_one(world: World) -> None:
+    observation = world.observed(world.expected(), 4)
+    fit = world.refined(observation, planets=(replace(WHERE, contrast=1e-6),))
+    assert len(fit.companions) == 1
+    assert len(dr.detect(fit).table) == 0
+
+
+def test_a_prior_that_is_held_too_narrow_is_noticed(world: World) -> None:
+    observation = world.observed(world.expected(), 4)
+    scales = world.refined(observation).scales
+    for factor, status in ((1.0, Status.CONVERGED), (1 / 3, Status.PRIOR_MISMATCH)):
+        held = WavefrontPrior({k: factor * v for k, v in scales.items()}, fit_scales=False)
+        fit = world.refined(observation, prior=held)
+        assert fit.status is status
+        assert fit.status.calibrated == (factor == 1.0)
 
 
 def test_a_model_that_is_wrong_inflates_the_errors(world: World) -> None:

@@ -27,7 +27,7 @@ from pyklip_diffrender.bench.page import write_page
 from pyklip_diffrender.bench.rows import ROWS, Row, chosen_rows
 from pyklip_diffrender.bench.scaling import SCALING, limits
 from pyklip_diffrender.bench.setting import Setting
-from pyklip_diffrender.bench.timing import exponent, interleaved
+from pyklip_diffrender.bench.timing import exponent, interleaved, processor
 from pyklip_diffrender.files import replacing
 
 __all__ = ["ROWS", "Setting", "run_bench", "write_page", "write_table"]
@@ -111,7 +111,7 @@ def run_bench(
     table.meta = {
         "command": command,
         "date": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}",
-        "machine": f"{os.cpu_count()} cores of {_processor()}",
+        "machine": f"{os.cpu_count()} cores of {processor()}",
         "threads": torch.get_num_threads(),
         "device": _device(here.device),
         "versions": _versions(),
@@ -193,15 +193,6 @@ def _exponents(table: Table) -> dict[str, float]:
         if str(name).startswith(SCALING) and len(here) > 1:
             found[str(name)] = round(exponent(here["size"], here["seconds"]), 2)
     return found
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
 
 
 def _device(name: str) -> str:

@@ -27,7 +27,7 @@ from pyklip_diffrender.detection.relinearise import star_only, with_companions
 from pyklip_diffrender.detection.result import Detection, amplitudes
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.refinement import Refinement, Status
+from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.units import ARCSEC
 
 __all__ = [
@@ -241,10 +241,15 @@ def _search(
     """Candidates, strongest first, and the factor for the errors."""
     grid = maps.groups[0][1].grid
     pixel = float(np.abs(np.diff(grid[:, :, 0], axis=1)).mean())
-    explained = all(fit.status is not Status.MODEL_MISMATCH for fit in fits)
+    explained = all(fit.status.calibrated for fit in fits)
     found = start
     if len(start):
         found = refine_candidates(maps.groups, start, reach=pixel / 2)
+    # A refinement may take something for a companion while its wavefront is still far off.
+    while len(found) and float((snrs := found.contrasts / found.errors[:, 0]).min()) < threshold:
+        found = found.without(int(snrs.argmin()))
+        if len(found):
+            found = refine_candidates(maps.groups, found, reach=pixel / 2)
     while True:
         snr = maps.snr(maps.without(found))
         factor = scatter

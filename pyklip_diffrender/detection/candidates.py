@@ -71,6 +71,14 @@ class Candidates:
             contrasts=torch.cat([self.contrasts, torch.tensor([contrast], dtype=torch.float64)]),
         )
 
+    def without(self, index: int) -> Candidates:
+        """Starting values less one source; the errors of the others are no longer known."""
+        keep = torch.arange(len(self)) != index
+        count = 3 * int(keep.sum())
+        return Candidates(
+            self.offsets[keep], self.contrasts[keep], torch.zeros(count, count).double()
+        )
+
     @property
     def errors(self) -> Tensor:
         """Standard deviations of contrast, x and y, (k, 3)."""

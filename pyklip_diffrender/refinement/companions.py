@@ -1,7 +1,7 @@
 """Bright companions in what a star model leaves: found so that a fit does not bend to them.
 
 A companion as bright as the star's own speckles pulls the wavefront towards itself. One that
-stands out of the residual of the alignment fit is given parameters of its own. This is no search
+stands out of the residual of a fit is given parameters of its own. This is no search
 for planets: faint ones are the business of the detection step, where the wavefront is
 marginalised.
 """
@@ -18,9 +18,10 @@ from scipy.signal import fftconvolve
 from torch import Tensor
 
 from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.refinement.misfit import Misfit, State
 from pyklip_diffrender.scene import Planet
 
-__all__ = ["bright_companions"]
+__all__ = ["bright_companions", "standing_out"]
 
 _INNER = 0.35
 """arcsec; closer in, the occulter distorts and the star's own errors dominate."""
@@ -96,3 +97,40 @@ def bright_companions(
             )
         )
     return found
+
+
+def standing_out(
+    misfit: Misfit, state: State, kappa: float, *, most: int, threshold: float
+) -> list[Planet]:
+    """Companions that stand out of the first science frame, as they stand in the first frame.
+
+    Parameters
+    ----------
+    misfit : Misfit
+    state : State
+    kappa : float
+        Share of the star that the model may miss.
+    most, threshold
+        See `bright_companions`.
+    """
+    joint = state.joint
+    shown = [unknowns.shows_companions for unknowns in joint.frames]
+    if most < 1 or True not in shown:
+        return []
+    k = shown.index(True)
+    point, forward = state.points[k], misfit.forwards[k]
+    problem = forward.problem
+    sigma = misfit.sigma(k, point, kappa)
+    residual = torch.where(problem.valid, problem.data - point.total, 0.0)
+    found = bright_companions(
+        forward.coarse,
+        forward.coarse_opd(point),
+        point.unknowns.values(point.vector),
+        residual.cpu().numpy(),
+        torch.where(problem.valid, sigma, math.inf).cpu().numpy(),
+        point.unknowns.level("flux", point.vector),
+        most=most,
+        threshold=threshold,
+    )
+    turn = joint.frames[k].roll
+    return [Planet(p.contrast, p.separation, p.position_angle - turn) for p in found]

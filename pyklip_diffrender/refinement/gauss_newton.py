@@ -22,8 +22,8 @@ from tqdm import tqdm
 from pyklip_diffrender.bases import Basis
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear_model import LinearModel
-from pyklip_diffrender.priors import EvidenceUpdate, solve_with_evidence
-from pyklip_diffrender.refinement.companions import bright_companions
+from pyklip_diffrender.priors import EvidenceUpdate, scale_ratios, solve_with_evidence
+from pyklip_diffrender.refinement.companions import standing_out
 from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.joint import Joint
 from pyklip_diffrender.refinement.linearised import Linearised, linearise
@@ -49,6 +49,18 @@ _COARSE = 0.01
 """Model error, as a share of the star, above which modes to `_FEW_CYCLES` do as well as all."""
 
 _FEW_CYCLES = 14.0
+
+_BRIGHT = 8.0
+"""How far a companion must stand out, in units of the scatter, when the wavefront's fit stalls.
+
+Without companions, peaks reached 6 (drifts of 40 to 400 h); companions that stalled a fit, 12.
+"""
+
+_MOST_BRIGHT = 8
+"""Companions that a fit may find in this way."""
+
+_IMPROBABLE = 1.5
+"""Ratio of the scale that modes have to the scale held, above which the prior is wrong."""
 
 _ANNEALING = 0.6
 """Factor by which kappa shrinks at least from step to step."""
@@ -255,33 +267,25 @@ class GaussNewton:
         elif ratio < 0.3:
             self.damping = max(2.5 * self.damping, 0.05)
 
-    def add_companions(self, state: State, kappa: float) -> State:
-        """Give companions that stand out of the first science frame parameters of their own."""
-        joint = state.joint
-        shown = [u.shows_companions for u in joint.frames]
-        if True not in shown:
-            return state
-        k = shown.index(True)
-        point, forward = state.points[k], self.misfit.forwards[k]
-        problem = forward.problem
-        sigma = self.misfit.sigma(k, point, kappa)
-        residual = torch.where(problem.valid, problem.data - point.total, 0.0)
-        found = bright_companions(
-            forward.coarse,
-            forward.coarse_opd(point),
-            point.unknowns.values(point.vector),
-            residual.cpu().numpy(),
-            torch.where(problem.valid, sigma, math.inf).cpu().numpy(),
-            point.unknowns.level("flux", point.vector),
-            most=self.options.companions - len(point.unknowns.companions),
-            threshold=self.options.companion_threshold,
-        )
-        if not found:
-            return state
-        _log.info("companions given parameters of their own: %s", found)
-        turn = joint.frames[k].roll
-        there = [Planet(p.contrast, p.separation, p.position_angle - turn) for p in found]
-        return self.misfit.at(*joint.with_companions(there, state.vector))
+    def bright_in(self, state: State, kappa: float, modes: int) -> list[Planet]:
+        """Companions that stand out of what a step left, to be given parameters of their own."""
+        options, known = self.options, len(state.joint.frames[0].companions)
+        if not modes:
+            most, threshold = options.companions - known, options.companion_threshold
+        elif options.kappa_floor > 0 or known >= options.companions + _MOST_BRIGHT:
+            # A model error that is allowed for may be all that stands out.
+            return []
+        else:
+            # One at a time: a bright one's side lobes stand out as well.
+            most, threshold = 1, _BRIGHT
+        found = standing_out(self.misfit, state, kappa, most=most, threshold=threshold)
+        if found:
+            _log.info("companions given parameters of their own: %s", found)
+        return found
+
+    def with_companions(self, state: State, found: Sequence[Planet]) -> State:
+        """A state with parameters for further companions."""
+        return self.misfit.at(*state.joint.with_companions(found, state.vector))
 
     def run(self, seed: int) -> list[Refinement]:
         """Anneal kappa; fit alignment, then alignment and wavefront; return the best iterate."""
@@ -289,18 +293,21 @@ class GaussNewton:
         options, state = self.options, self.state
         kappa = max(self.misfit.model_error(state), options.kappa_floor)
         best, best_error = state, (math.inf, math.inf)
+        aligned, scales = state, self.scales
         status = Status.ITERATION_LIMIT
         modes = 0
         if options.wavefront and (not options.free or options.resume is not None):
             modes = self.modes_for(kappa)
         bar = tqdm(total=options.max_iterations, desc="refine", disable=not self.progress)
-        for iteration in range(options.max_iterations):
+        left = options.max_iterations
+        while left:
+            left -= 1
             state, gain = self.descend(state, kappa, modes)
             needed, chi2 = self.misfit.model_error(state), self.misfit.chi2_per_pixel(state)
             if (needed, chi2) < best_error:
                 best, best_error = state, (needed, chi2)
             record = {
-                "iteration": iteration,
+                "iteration": len(self.history),
                 "wavefront": modes > 0,
                 "kappa": kappa,
                 "chi2_per_pixel": chi2,
@@ -315,17 +322,25 @@ class GaussNewton:
             settled = gain < options.tolerance
             if not modes:
                 kappa = max(options.kappa_floor, min(kappa, needed))
-                known = len(state.joint.frames[0].companions)
-                if gain < 0.05 and known < options.companions:
-                    state = self.add_companions(state, kappa)
-                    if len(state.joint.frames[0].companions) > known:
-                        continue
-                if gain < 0.05 and options.wavefront:
+                bright = self.bright_in(state, kappa, modes) if gain < 0.05 else []
+                if bright:
+                    state = self.with_companions(state, bright)
+                elif gain < 0.05 and options.wavefront:
                     # What the alignment alone could not follow says nothing about these steps.
-                    modes, self.damping = self.modes_for(kappa), 0.0
+                    aligned, modes, self.damping = state, self.modes_for(kappa), 0.0
                 elif settled:
                     status = self.status_of(chi2)
                     break
+                continue
+            stalled = needed > max(kappa, _NEGLIGIBLE)
+            bright = self.bright_in(state, needed, modes) if stalled else []
+            if bright:
+                # The wavefront has bent to it: back to where there was none.
+                best = state = self.with_companions(aligned, bright)
+                best_error, left = (math.inf, math.inf), options.max_iterations
+                self.scales, self.damping, modes = scales, 0.0, 0
+                kappa = max(self.misfit.model_error(state), options.kappa_floor)
+                bar.reset()
                 continue
             if settled and kappa <= options.kappa_floor and modes == len(self.basis):
                 status = self.status_of(chi2)
@@ -349,6 +364,15 @@ class GaussNewton:
         """How a fit that has settled ended."""
         return Status.CONVERGED if chi2 < _EXPLAINED else Status.MODEL_MISMATCH
 
+    def prior_holds(self, update: EvidenceUpdate) -> bool:
+        """Whether modes are about as large as their prior says, where its scales were held."""
+        if self.fits_scales or not self.options.wavefront or update.variance is None:
+            return True
+        deviation = self.scales[self.group] * self.shape
+        last = slice(-len(deviation), None)
+        ratios = scale_ratios(update.step[last], update.variance[last], deviation, self.group)
+        return bool((ratios < _IMPROBABLE).all())
+
     def results(self, state: State, status: Status, began: float, seed: int) -> list[Refinement]:
         """Errors at the end, and everything in the form that users see."""
         joint, chi2 = state.joint, self.misfit.chi2_per_pixel(state)
@@ -366,6 +390,8 @@ class GaussNewton:
         update = self.solve(joint, equations, errors=True)
         assert update.variance is not None
         deviation = torch.sqrt(update.variance)
+        if status is Status.CONVERGED and not self.prior_holds(update):
+            status = Status.PRIOR_MISMATCH
         linear = LinearModel(
             names=joint.names()[:count],
             frames=frames,

@@ -7,9 +7,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pyklip_diffrender.bases import default_basis
 from pyklip_diffrender.refinement.gauss_newton import GaussNewton
 from pyklip_diffrender.refinement.options import GaussNewtonOptions
@@ -48,7 +45,7 @@ def gauss_newton(
             chosen = replace(
                 chosen,
                 prior=replace(options.prior, scales=scales),
-                planets=tuple(_as_planet(each) for each in found[0].companions),
+                planets=_planets(found),
                 resume=found[0].linear,
             )
         before, found = found, GaussNewton(problems, chosen, progress).run(seed)
@@ -62,6 +59,16 @@ def gauss_newton(
     return found
 
 
-def _as_planet(companion: NDArray[np.float64]) -> Planet:
-    contrast, x, y = (float(value) for value in companion)
-    return Planet(contrast, math.hypot(x, y), math.degrees(math.atan2(-x, y)))
+def _planets(fits: Sequence[Refinement]) -> tuple[Planet, ...]:
+    """Fitted companions as they stand in the first frame."""
+    first = fits[0].observation.position_angles
+    for fit in fits:
+        if fit.observation.reference:
+            continue
+        own = fit.observation.position_angles
+        turn = 0.0 if first is None or own is None else float(own[0] - first[0])
+        return tuple(
+            Planet(max(c, 0.0), math.hypot(x, y), math.degrees(math.atan2(-x, y)) + turn)
+            for c, x, y in fit.companions.tolist()
+        )
+    return ()

@@ -29,6 +29,10 @@ class Status(Enum):
     MODEL_MISMATCH = (
         "converged, but the model does not explain the data: errors are inflated by a model error"
     )
+    PRIOR_MISMATCH = (
+        "converged, but the wavefront found is improbable under the prior that was held fixed: "
+        "errors are too small; let its scales be fitted (fit_scales=True), or widen them"
+    )
     ITERATION_LIMIT = "stopped at the limit of iterations, before it converged"
     COMPLETED = "all iterations of a fixed recipe were done"
     DIVERGED = "failed: the fitted star has no light, or the loss is not a number"
@@ -42,6 +46,11 @@ class Status(Enum):
     def usable(self) -> bool:
         """Whether the result may be subtracted."""
         return self is not Status.DIVERGED
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether errors may be believed as they are."""
+        return self not in (Status.MODEL_MISMATCH, Status.PRIOR_MISMATCH, Status.DIVERGED)
 
 
 @dataclass

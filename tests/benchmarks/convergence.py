@@ -12,14 +12,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from compared import Array, largest, timed
 from provenance import provenance
 
 from pyklip_diffrender.geometry import PupilGrid, jwst_pupil, maskrnd_openings, polygon_coverage
@@ -30,26 +28,10 @@ TESTS = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(TESTS))
 reference = import_module("poppy_reference")
 
-Array = NDArray[np.float64]
 WAVELENGTH = 4.5e-6
 SEPARATIONS = (0.0, 0.01, 0.05, 0.3, 0.6, 1.5, 2.3)
 ANGLE = 0.7
 LIMIT = 16
-
-
-def timed(function: Callable[[], Array], repeats: int) -> tuple[Array, float]:
-    """The result and the fastest of several runs, s."""
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        result = function()
-        seconds.append(time.perf_counter() - start)
-    return result, min(seconds)
-
-
-def largest(image: Array, truth: Array) -> float:
-    """Largest difference as a fraction of the peak."""
-    return float(np.abs(image - truth).max() / truth.max())
 
 
 def gradient(model: OpticalSystem, opd: Array, weight: torch.Tensor) -> torch.Tensor:

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from compared import Array, largest, timed
 from provenance import provenance
 
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf, load_wss_opd
@@ -38,7 +38,6 @@ reference = import_module("poppy_reference")
 stpsf_data = import_module("stpsf_data")
 parity = import_module("test_parity_stpsf")
 
-Array = NDArray[np.float64]
 
 # Case of the test suite, what is compared, at most.
 ROWS = (
@@ -55,21 +54,6 @@ ROWS = (
     ("MASKLWB", "MASKLWB", None),
     ("MASKSWB", "MASKSWB, F200W", None),
 )
-
-
-def timed(function: Callable[[], Any], repeats: int = 1) -> tuple[Any, float]:
-    """The result and the fastest of several runs, s."""
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        result = function()
-        seconds.append(time.perf_counter() - start)
-    return result, min(seconds)
-
-
-def error(image: Array, truth: Array) -> float:
-    """Largest difference as a fraction of the peak."""
-    return float(np.abs(image - truth).max() / truth.max())
 
 
 def run(model: OpticalSystem) -> tuple[Array, float]:
@@ -130,14 +114,14 @@ def against_stpsf(folder: Path, npix: int, oversample: int) -> list[str]:
                 f"stpsf, fft_oversample {call['fft_oversample']}",
                 f"image / peak, {words}",
                 most,
-                error(image, truth["DET_SAMP"].data),
+                largest(image, truth["DET_SAMP"].data),
                 theirs,
                 ours,
             )
         )
         if case in ("ND squares", "pupil shift, rotation, offset"):
             distorted, ours = run(from_webbpsf(instrument, add_distortion=True, **call))
-            found = error(distorted, truth["DET_DIST"].data)
+            found = largest(distorted, truth["DET_DIST"].data)
             lines.append(
                 line("stpsf, DET_DIST", f"image / peak, {words}", "1e-05", found, theirs, ours)
             )
@@ -150,7 +134,7 @@ def oversampled_chain(folder: Path, npix: int) -> str:
     call = {"monochromatic": 4.5e-6, "fov_pixels": 80, "oversample": 4}
     truth, theirs = timed(lambda: instrument.calc_psf(**call))
     image, ours = run(from_webbpsf(instrument, add_distortion=True, **call))
-    found = error(image, truth["DET_DIST"].data)
+    found = largest(image, truth["DET_DIST"].data)
     what = "image / peak, calc_psf's defaults (oversample 4)"
     return line("stpsf, DET_DIST", what, "1e-05", found, theirs, ours)
 
@@ -178,7 +162,7 @@ def precision(folder: Path, npix: int) -> list[str]:
     return [
         line(
             "float64", "float32: image / peak, on axis", "reported",
-            error(images[1], images[0]), seconds[0][0], seconds[1][0],
+            largest(images[1], images[0]), seconds[0][0], seconds[1][0],
         ),
         line(
             "float64", "float32: gradient for the OPD, relative L2", "reported", shift,
@@ -231,7 +215,7 @@ def speed(folder: Path, npix: int, oversample: int) -> list[str]:
             torch.set_num_threads(os.cpu_count() or 1)
             squares_word = "on" if squares else "off"
             lines.append(
-                line(squares_word, str(sampling), error(image, truth), wall, ours)[:-1]
+                line(squares_word, str(sampling), largest(image, truth), wall, ours)[:-1]
                 + line(f"{wall / ours:.0f}", busy, alone, f"{busy / alone:.0f}")
             )
     return lines

@@ -6,20 +6,12 @@ import datetime
 import os
 import platform
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 import torch
 
+from pyklip_diffrender.bench.timing import processor
+
 __all__ = ["provenance"]
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
 
 
 def _version(name: str) -> str:
@@ -45,6 +37,6 @@ def provenance(command: str, packages: tuple[str, ...] = ("poppy",)) -> list[str
     )
     return [
         f"- Measured {datetime.datetime.now(datetime.UTC):%Y-%m-%d} by `python {command}`.",
-        f"- {os.cpu_count()} cores of {_processor()}, {torch.get_num_threads()} threads.",
+        f"- {os.cpu_count()} cores of {processor()}, {torch.get_num_threads()} threads.",
         f"- {versions}.",
     ]
