@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pyklip_diffrender.bridges import from_poppy, from_webbpsf
     from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
+    from pyklip_diffrender.fidelity import Plan, plan
     from pyklip_diffrender.linear_model import LinearModel
     from pyklip_diffrender.nircam import nircam_coronagraph
     from pyklip_diffrender.observation import Observation
@@ -36,6 +37,7 @@ __all__ = [
     "LinearModel",
     "Observation",
     "OpticalSystem",
+    "Plan",
     "Planet",
     "Refinement",
     "Scene",
@@ -53,6 +55,7 @@ __all__ = [
     "measure",
     "nircam_coronagraph",
     "observation_from_dataset",
+    "plan",
     "random_opd",
     "read_opd",
     "refine",
@@ -67,6 +70,7 @@ _MODULE_OF = {
     "LinearModel": "linear_model",
     "Observation": "observation",
     "OpticalSystem": "optics",
+    "Plan": "fidelity",
     "Planet": "scene",
     "Refinement": "refinement",
     "Scene": "scene",
@@ -83,6 +87,7 @@ _MODULE_OF = {
     "measure": "detection",
     "nircam_coronagraph": "nircam",
     "observation_from_dataset": "pyklip_backend",
+    "plan": "fidelity",
     "random_opd": "opd",
     "read_opd": "opd",
     "refine": "refinement",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Protocol
 
 import torch
@@ -56,17 +57,12 @@ class SegmentMotions:
     groups = ("segment",)
 
     def __init__(self) -> None:
-        # Half the gap on every side: each point of the gaps belongs to a segment too.
-        self._outlines = [
-            widen_polygon(outline, TABULATED_GAP / 2) for outline in jwst_segments().values()
-        ]
         self.names = tuple(
             f"{name} {motion}" for name in jwst_segments() for motion in ("piston", "tip", "tilt")
         )
-        self._cache: dict[PupilGrid, list[tuple[PupilGrid, Tensor]]] = {}
 
     def __len__(self) -> int:
-        return 3 * len(self._outlines)
+        return len(self.names)
 
     @property
     def group_index(self) -> Tensor:
@@ -76,32 +72,8 @@ class SegmentMotions:
     def frequencies(self) -> Tensor:
         return torch.zeros(len(self), dtype=torch.float64)
 
-    def _sampled(self, grid: PupilGrid) -> list[tuple[PupilGrid, Tensor]]:
-        """For each segment the window that holds it and its three modes there."""
-        # Of the whole segment, whatever part of it `grid` holds: the modes stay the same.
-        full = PupilGrid.full(grid.npix, grid.diameter)
-        if full not in self._cache:
-            self._cache[full] = [self._sample(outline, full) for outline in self._outlines]
-        return self._cache[full]
-
-    @staticmethod
-    def _sample(outline: Tensor, grid: PupilGrid) -> tuple[PupilGrid, Tensor]:
-        pixel = outline / grid.spacing + grid.npix / 2
-        low, high = pixel.min(dim=0).values.floor().int(), pixel.max(dim=0).values.ceil().int()
-        rows = (max(grid.rows[0], int(low[1])), min(grid.rows[1], int(high[1])))
-        columns = (max(grid.columns[0], int(low[0])), min(grid.columns[1], int(high[0])))
-        window = replace(grid, rows=rows, columns=columns)
-        cover = polygon_coverage([outline], window)
-        area = cover.sum()
-        modes = [cover]
-        for axis in (window.x[None, :], window.y[:, None]):
-            ramp = axis - (cover * axis).sum() / area
-            rms = torch.sqrt((cover * ramp**2).sum() / area)
-            modes.append(cover * ramp / rms)
-        return window, torch.stack(modes)
-
     def modes(self, grid: PupilGrid, start: int, stop: int) -> Tensor:
-        segments = self._sampled(grid)
+        segments = _sampled_segments(_whole(grid))
         return torch.stack(
             [segments[k // 3][0].crop(segments[k // 3][1][k % 3], grid) for k in range(start, stop)]
         )
@@ -109,11 +81,42 @@ class SegmentMotions:
     def opd(self, coefficients: Tensor, grid: PupilGrid) -> Tensor:
         total = torch.zeros(grid.shape, dtype=torch.float64)
         for (window, modes), motion in zip(
-            self._sampled(grid), coefficients.reshape(-1, 3), strict=True
+            _sampled_segments(_whole(grid)), coefficients.reshape(-1, 3), strict=True
         ):
             rigid = torch.tensordot(motion, modes, dims=1)
             total = total + window.crop(rigid, grid)
         return total
+
+
+def _whole(grid: PupilGrid) -> PupilGrid:
+    """Of the whole segment, whatever part of it `grid` holds: the modes stay the same."""
+    return PupilGrid.full(grid.npix, grid.diameter)
+
+
+@lru_cache(maxsize=4)
+def _sampled_segments(grid: PupilGrid) -> list[tuple[PupilGrid, Tensor]]:
+    """For each segment the window that holds it and its three modes there."""
+    # Half the gap on every side: each point of the gaps belongs to a segment too.
+    return [
+        _sampled_segment(widen_polygon(outline, TABULATED_GAP / 2), grid)
+        for outline in jwst_segments().values()
+    ]
+
+
+def _sampled_segment(outline: Tensor, grid: PupilGrid) -> tuple[PupilGrid, Tensor]:
+    pixel = outline / grid.spacing + grid.npix / 2
+    low, high = pixel.min(dim=0).values.floor().int(), pixel.max(dim=0).values.ceil().int()
+    rows = (max(grid.rows[0], int(low[1])), min(grid.rows[1], int(high[1])))
+    columns = (max(grid.columns[0], int(low[0])), min(grid.columns[1], int(high[0])))
+    window = replace(grid, rows=rows, columns=columns)
+    cover = polygon_coverage([outline], window)
+    area = cover.sum()
+    modes = [cover]
+    for axis in (window.x[None, :], window.y[:, None]):
+        ramp = axis - (cover * axis).sum() / area
+        rms = torch.sqrt((cover * ramp**2).sum() / area)
+        modes.append(cover * ramp / rms)
+    return window, torch.stack(modes)
 
 
 class FourierModes:

@@ -50,6 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     refine.add_argument("opd", type=Path, help="OPD map (FITS)")
     refine.add_argument("-o", "--output", type=Path, required=True, help="FITS file to write")
     refine.add_argument("--fov-pixels", type=int, default=80)
+    refine.add_argument("--fidelity", choices=("as given", "planned"), help="see refine")
     refine.set_defaults(run=_refine)
 
     detect = commands.add_parser(
@@ -59,6 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     detect.add_argument("opd", type=Path, help="OPD map (FITS)")
     detect.add_argument("-o", "--output", type=Path, required=True, help="folder to write into")
     detect.add_argument("--fov-pixels", type=int, default=80)
+    detect.add_argument("--fidelity", choices=("as given", "planned"), help="see refine")
     detect.add_argument("--threshold", type=float, default=5.0, help="S/N of a candidate")
     detect.set_defaults(run=_detect)
 
@@ -156,7 +158,11 @@ def _fitted(options: argparse.Namespace) -> Refinement:
     model = nircam_coronagraph(
         observation.filter or "", fov_pixels=options.fov_pixels, **NIRCAM_MODEL
     )
-    return refine(model, observation, options.opd, progress=True, **NIRCAM_FIT)
+    fidelity = options.fidelity
+    fit = refine(model, observation, options.opd, progress=True, fidelity=fidelity, **NIRCAM_FIT)
+    if fit.plan is not None:
+        print(f"{fit.plan}\n")
+    return fit
 
 
 def _detect(options: argparse.Namespace) -> None:

@@ -119,11 +119,16 @@ def internal_wavefront_error(flip: bool = False) -> Tensor:
     Tensor, (36,), float64
         For the entrance-pupil orientation used here.
     """
-    table = embedded_table("nircam_si_zernikes")
-    exit_pupil = torch.tensor(table["coefficient"].tolist(), dtype=torch.float64) * 1e-9
+    exit_pupil = torch.tensor(_internal_zernikes(), dtype=torch.float64) * 1e-9
     if flip:
         return exit_pupil
     return exit_pupil * _parity_in_y(len(exit_pupil))
+
+
+@lru_cache(maxsize=1)
+def _internal_zernikes() -> tuple[float, ...]:
+    """The tabulated coefficients, nm; reading the table takes longer than an image."""
+    return tuple(embedded_table("nircam_si_zernikes")["coefficient"].tolist())
 
 
 def _parity_in_y(count: int) -> Tensor:

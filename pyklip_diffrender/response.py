@@ -28,6 +28,7 @@ __all__ = [
     "Responses",
     "WavefrontResponse",
     "coarse_copy",
+    "coarse_npix",
     "downsample",
     "parameter_jacobian",
 ]
@@ -42,6 +43,20 @@ IMAGE_PARAMETERS = ("blur",)
 
 _BATCH_BYTES = 2.5e7
 
+_PIECE = 16
+"""Modes whose images are made at a time."""
+
+
+def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
+    """Pupil samples that `coarse_copy` has; those of the model where it serves itself."""
+    detector = model.detector
+    field = max(n * s for n, s in zip(detector.shape[::-1], detector.pixelscale, strict=True))
+    while npix < samples_for_field(field, min(model.bandpass.wavelengths), model.diameter):
+        npix *= 2
+    if not model.recipe or model.npix <= npix or model.npix % npix:
+        return model.npix
+    return npix
+
 
 def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     """A cheaper copy of a model for derivatives: 2 cells per lambda/D, single precision.
@@ -49,11 +64,8 @@ def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     A model without a recipe, or one that is already as coarse, serves itself. A wide field takes
     more samples, by powers of two, so that the image does not repeat inside it.
     """
-    detector = model.detector
-    field = max(n * s for n, s in zip(detector.shape[::-1], detector.pixelscale, strict=True))
-    while npix < samples_for_field(field, min(model.bandpass.wavelengths), model.diameter):
-        npix *= 2
-    if not model.recipe or model.npix <= npix or model.npix % npix:
+    npix = coarse_npix(model, npix)
+    if npix == model.npix:
         return model
     return model.with_fidelity(npix=npix, occulter_sampling=2.0, dtype=torch.float32)
 
@@ -180,13 +192,18 @@ class WavefrontResponse:
         modes = len(self.fields[0]) if modes is None else modes
         shape = (modes + amplitude_modes, *self.fields[0].shape[1:])
         total = torch.zeros(shape, device=self.model.device)
-        for field, change, weight in zip(
-            fields, self.fields, self.model.bandpass.weights, strict=True
-        ):
-            conjugate = (2 * weight) * field.to(change.dtype).conj()
-            product = change[: max(modes, amplitude_modes)] * conjugate
-            total[:modes] += product[:modes].real
-            total[modes:] += product[:amplitude_modes].imag
+        conjugates = [
+            (2 * weight) * field.to(torch.complex64).conj()
+            for field, weight in zip(fields, self.model.bandpass.weights, strict=True)
+        ]
+        # In pieces that stay in the processor's cache: the whole product is never held.
+        for start in range(0, max(modes, amplitude_modes), _PIECE):
+            piece = slice(start, start + _PIECE)
+            real, imaginary = total[:modes][piece], total[modes:][piece]
+            for conjugate, change in zip(conjugates, self.fields, strict=True):
+                product = change[piece] * conjugate
+                real += product[: len(real)].real
+                imaginary += product[: len(imaginary)].imag
         return self.coarse.detector.image(total, values)
 
     def parameters(self, fields: Sequence[Tensor], values: dict[str, Tensor]) -> Tensor:

@@ -28,6 +28,7 @@ LAYERS = (
     ("observation", "scene", "simulation"),
     ("bases", "opd", "priors"),
     ("response", "multifidelity", "linear_file", "linear_model"),
+    ("fidelity",),
     ("refinement",),
     ("metrics", "detection"),
     ("pyklip_backend",),

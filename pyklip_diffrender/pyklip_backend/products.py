@@ -126,6 +126,10 @@ def provenance(made: Sequence[Made]) -> fits.Header:
                 f"diffrender: frames {', '.join(map(str, fit.frames))}: {fit.status}, "
                 f"chi2/N {fit.chi2:.4g}"
             )
+            plan = getattr(fit.result, "plan", None)
+            if plan is not None:
+                facts = ", ".join(f"{k[5:]} {v}" for k, v in plan.summary().items())
+                header.add_history(f"diffrender: planned: {facts}")
     return header
 
 

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from pyklip_diffrender.errors import IncompatibleSetupError
 
 if TYPE_CHECKING:
+    from pyklip_diffrender.fidelity import Plan
     from pyklip_diffrender.opd import OPDMap
     from pyklip_diffrender.pyklip_backend.subtract import Subtractor
 
@@ -45,6 +46,7 @@ class Options(TypedDict, total=False):
     unit: u.UnitBase
     method: str
     seed: int
+    fidelity: Plan | str
     refine_options: Mapping[str, Any]
     model_options: Mapping[str, Any]
     subtractor: Subtractor
@@ -81,6 +83,9 @@ class DiffrenderSettings:
         Passed to `refine`; "gauss-newton" by default.
     seed : int, optional
         Passed to `refine`; 0 by default.
+    fidelity : Plan or str, optional
+        Passed to `refine`: "as given", "planned", or a plan that was made before, which serves
+        for all fits of a reduction.
     refine_options : mapping, optional
         Further keywords of `refine`, such as ``free`` and ``prior``.
     model_options : mapping, optional
@@ -98,6 +103,7 @@ class DiffrenderSettings:
     unit: u.UnitBase | None = None
     method: str | None = None
     seed: int | None = None
+    fidelity: Plan | str | None = None
     refine_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Subtractor | None = None

@@ -133,6 +133,8 @@ def subtract_by_refinement(
     for frames, group in _alike(observation):
         window = Window.about(group.center[0], model.detector.shape)
         options = {**_defaults(observation, method), **settings.refine_options}
+        if settings.fidelity is not None:
+            options["fidelity"] = settings.fidelity
         result = refine(model, window.of(group), opd, method=method, seed=seed, **options)
         status = result.status.name.lower()
         if not result.status.usable:

@@ -14,16 +14,19 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
     ShapeError,
 )
+from pyklip_diffrender.fidelity import Plan
 from pyklip_diffrender.observation import Observation
 from pyklip_diffrender.opd import as_opd_map
 from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.refinement.gradient import AdamOptions, LBFGSOptions, adam, lbfgs
 from pyklip_diffrender.refinement.growth import gauss_newton
 from pyklip_diffrender.refinement.options import GaussNewtonOptions
+from pyklip_diffrender.refinement.planned import make_plan, refine_by_plan, require_plan_for
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement, Status
 
 __all__ = [
+    "FIDELITY",
     "METHODS",
     "AdamOptions",
     "GaussNewtonOptions",
@@ -33,6 +36,9 @@ __all__ = [
     "refine",
     "refine_again",
 ]
+
+FIDELITY = "planned"
+"""Of `refine` by the default method, where nothing is said: "as given" or "planned"."""
 
 METHODS = {
     "gauss-newton": GaussNewtonOptions,
@@ -50,6 +56,7 @@ def refine(
     *,
     method: str = ...,
     start: dict[str, Any] | None = ...,
+    fidelity: Plan | str | None = ...,
     seed: int = ...,
     progress: bool = ...,
     **options: Any,
@@ -64,6 +71,7 @@ def refine(
     *,
     method: str = ...,
     start: dict[str, Any] | Sequence[dict[str, Any]] | None = ...,
+    fidelity: Plan | str | None = ...,
     seed: int = ...,
     progress: bool = ...,
     **options: Any,
@@ -77,6 +85,7 @@ def refine(
     *,
     method: str = "gauss-newton",
     start: dict[str, Any] | Sequence[dict[str, Any]] | None = None,
+    fidelity: Plan | str | None = None,
     seed: int = 0,
     progress: bool = False,
     **options: Any,
@@ -102,8 +111,14 @@ def refine(
     start : dict or sequence of dict, optional
         Starting values by parameter name, for all observations or one by one; "detector_shift"
         follows from the observation's star position unless given.
+    fidelity : "planned", "as given" or Plan, optional
+        "planned" first finds out, with `pyklip_diffrender.plan`, what can be made cheaper without
+        an error that could be seen; a plan that was made before is used as it is. "as given" fits
+        with the model as it is. Either way the result is on the model as given, and its star
+        rendered with that. Default "planned", but as given where the options bring a basis of
+        their own or fit no wavefront. The recipes "adam" and "lbfgs" are always done as given.
     seed : int
-        Recorded with the result. The methods themselves draw no random numbers.
+        Recorded with the result. The methods themselves draw no random numbers; a plan does.
     progress : bool
         Show a bar.
     **options
@@ -149,8 +164,17 @@ def refine(
         for each, begin in zip(observations, starts, strict=True)
     ]
     if isinstance(chosen, GaussNewtonOptions):
-        found = gauss_newton(problems, chosen, seed=seed, progress=progress)
+        planned = _plan(fidelity, problems, chosen, seed)
+        if planned is None:
+            found = gauss_newton(problems, chosen, seed=seed, progress=progress)
+        else:
+            found = refine_by_plan(planned, problems, chosen, seed=seed, progress=progress)
         return found if several else found[0]
+    if fidelity not in (None, "as given"):
+        raise IncompatibleSetupError(
+            f"refine(method={method!r}): fidelity: got {fidelity!r}, but this recipe is done with "
+            'the model as given; use method="gauss-newton"'
+        )
     if several:
         raise IncompatibleSetupError(
             f"refine(method={method!r}) takes one observation, got {len(observations)}: several "
@@ -159,6 +183,30 @@ def refine(
     if isinstance(chosen, AdamOptions):
         return adam(problems[0], chosen, seed=seed, progress=progress)
     return lbfgs(problems[0], chosen, seed=seed, progress=progress)
+
+
+def _plan(
+    fidelity: Plan | str | None, problems: Sequence[Problem], options: GaussNewtonOptions, seed: int
+) -> Plan | None:
+    """The plan to follow; None for the model as given."""
+    first = problems[0]
+    # Own modes, or none, say how fine a fit is meant to be.
+    decided = options.basis is not None or options.resume is not None or not options.wavefront
+    if fidelity is None and decided:
+        return None
+    wanted = FIDELITY if fidelity is None else fidelity
+    if isinstance(wanted, Plan):
+        require_plan_for(first.model, wanted)
+        return wanted
+    if wanted == "as given":
+        return None
+    if wanted != "planned":
+        raise IncompatibleSetupError(
+            f"fidelity: got {wanted!r}, expected 'as given', 'planned' or a Plan"
+        )
+    science = next((p for p in problems if not p.observation.reference), first)
+    observations = [problem.observation for problem in problems]
+    return make_plan(first.model, observations, science.initial, options, science.start, seed)
 
 
 def refine_again(
@@ -189,6 +237,8 @@ def refine_again(
         drift = replace(drift, scales=found)
     settings = replace(old, **{"prior": prior, "drift": drift, "resume": first.linear, **changes})
     problems = [Problem(f.model, f.observation, f.initial, f.start) for f in fits]
+    if first.plan is not None and not first.plan.abandoned:
+        return refine_by_plan(first.plan, problems, settings, seed=first.seed, progress=progress)
     return gauss_newton(problems, settings, seed=first.seed, progress=progress)
 
 

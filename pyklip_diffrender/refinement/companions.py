@@ -26,6 +26,9 @@ __all__ = ["bright_companions", "standing_out"]
 _INNER = 0.35
 """arcsec; closer in, the occulter distorts and the star's own errors dominate."""
 
+_APART = 0.15
+"""arcsec, about lambda/D; nearer to a known companion, what stands out is what is left of it."""
+
 
 def bright_companions(
     model: OpticalSystem,
@@ -37,6 +40,7 @@ def bright_companions(
     *,
     most: int,
     threshold: float,
+    known: NDArray[np.float64] | None = None,
 ) -> list[Planet]:
     """Find point sources that stand out of a residual image.
 
@@ -57,6 +61,8 @@ def bright_companions(
         How many at most, brightest first.
     threshold : float
         In units of the scatter (median absolute deviation) of the matched-filter map.
+    known : ndarray, (k, 2), optional
+        Offsets x, y from the star of companions that are in the model already, arcsec.
 
     Returns
     -------
@@ -83,6 +89,8 @@ def bright_companions(
     y_sky = (y - middle[1]) * scale_y - float(axis[1] + star[1])
     distance = np.hypot(x_sky, y_sky)
     allowed = (distance > _INNER) & np.isfinite(sigma)
+    for x_known, y_known in () if known is None else known.tolist():
+        allowed &= np.hypot(x_sky - x_known, y_sky - y_known) > _APART
     scatter = 1.4826 * float(np.median(np.abs(snr[allowed] - np.median(snr[allowed]))))
     peaks = (snr == maximum_filter(snr, size=7)) & allowed & (snr > threshold * scatter)
     order = np.argsort(-snr[peaks])[:most]
@@ -131,6 +139,7 @@ def standing_out(
         point.unknowns.level("flux", point.vector),
         most=most,
         threshold=threshold,
+        known=(point.unknowns.sources(point.vector)[:, 1:] @ point.unknowns.turn.T).numpy(),
     )
     turn = joint.frames[k].roll
     return [Planet(p.contrast, p.separation, p.position_angle - turn) for p in found]

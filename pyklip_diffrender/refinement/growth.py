@@ -60,15 +60,9 @@ def gauss_newton(
 
 
 def _planets(fits: Sequence[Refinement]) -> tuple[Planet, ...]:
-    """Fitted companions as they stand in the first frame."""
-    first = fits[0].observation.position_angles
-    for fit in fits:
-        if fit.observation.reference:
-            continue
-        own = fit.observation.position_angles
-        turn = 0.0 if first is None or own is None else float(own[0] - first[0])
-        return tuple(
-            Planet(max(c, 0.0), math.hypot(x, y), math.degrees(math.atan2(-x, y)) + turn)
-            for c, x, y in fit.companions.tolist()
-        )
-    return ()
+    """Fitted companions; they are given as the first frame has them."""
+    science = next((fit for fit in fits if not fit.observation.reference), fits[0])
+    return tuple(
+        Planet(max(contrast, 0.0), math.hypot(x, y), math.degrees(math.atan2(-x, y)))
+        for contrast, x, y in science.companions.tolist()
+    )

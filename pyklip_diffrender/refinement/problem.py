@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,12 +38,18 @@ class Problem:
     start : dict
         Starting values of optical parameters (numbers in the units of the parameter table, or
         Quantities), and of "flux" and "background" where known.
+    informative : Tensor of bool, (ny, nx), optional
+        Pixels that say something about the wavefront; default all.
+    given : Problem, optional
+        The same with the model as it was given, where a plan has put a cheaper one in its place.
     """
 
     model: OpticalSystem
     observation: Observation
     initial: OPDMap
     start: dict[str, Any] = field(default_factory=dict)
+    informative: Tensor | None = None
+    given: Problem | None = None
 
     def __post_init__(self) -> None:
         if self.observation.shape != self.model.detector.shape:
@@ -88,21 +94,30 @@ class Problem:
                 )
 
     def flux_and_background(
-        self, image: Tensor, sigma: Tensor, names: tuple[str, ...]
+        self,
+        image: Tensor,
+        sigma: Tensor,
+        names: tuple[str, ...],
+        *,
+        data: Tensor | None = None,
+        start: Mapping[str, Any] | None = None,
     ) -> tuple[float, float]:
         """Weighted least-squares flux and background for a rendered star.
 
         A parameter that is not in `names` keeps its start (flux must then have been given).
+        `data` and `start` take the place of the problem's own.
         """
         weight = torch.where(self.valid, sigma**-2, 0.0)
-        flux = float(self.start.get("flux", 0.0))
-        level = float(self.start.get("background", 0.0))
+        begin = self.start if start is None else start
+        flux = float(begin.get("flux", 0.0))
+        level = float(begin.get("background", 0.0))
         columns = []
         if "flux" in names:
             columns.append(image)
         if "background" in names:
             columns.append(torch.ones_like(image))
-        target = self.data - (0 if "flux" in names else flux) * image
+        target = self.data if data is None else data
+        target = target - (0 if "flux" in names else flux) * image
         target = target - (0 if "background" in names else level)
         if columns:
             design = torch.stack(columns).flatten(1)

@@ -13,6 +13,7 @@ from astropy.table import QTable, Table
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pyklip_diffrender.fidelity import Plan
 from pyklip_diffrender.linear_model import LinearModel
 from pyklip_diffrender.observation import Observation
 from pyklip_diffrender.opd import OPDMap
@@ -104,6 +105,8 @@ class Refinement:
         How it was made.
     start : dict
         Starting values that were given.
+    plan : Plan, optional
+        By which the fit was made cheaper, and what that cost.
     """
 
     model: OpticalSystem
@@ -131,6 +134,7 @@ class Refinement:
     frame: int = 0
     settings: Any = None
     start: dict[str, Any] = field(default_factory=dict)
+    plan: Plan | None = None
 
     def __repr__(self) -> str:
         return (
@@ -218,4 +222,5 @@ class Refinement:
             "seed": self.seed,
             "opd": self.initial.name,
             "opd_sha256": self.initial.sha256,
+            **({} if self.plan is None else self.plan.summary()),
         }
