@@ -9,61 +9,18 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from astropy.table import Table
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).parent))
 import calibration
 import fluxes
+from inference_figure import draw, rms
+from pages import KINDS, RESULTS, markdown, origin, tables
 
 from pyklip_diffrender.files import replacing
 from pyklip_diffrender.report import save
-
-RESULTS = Path("docs/results")
-KINDS = {"measured": "measured maps", "generator": "embedded generator"}
-COLOURS = {"measured": "#5b3f95", "generator": "#c0631a"}
-
-
-def read(study: str, kind: str) -> Table | None:
-    """A study's table, if it has been run."""
-    path = RESULTS / f"{study}_{kind}.ecsv"
-    return Table.read(path, format="ascii.ecsv") if path.is_file() else None
-
-
-def tables(study: str) -> dict[str, Table]:
-    """Of all kinds of wavefront that the study was run on."""
-    found = {kind: read(study, kind) for kind in KINDS}
-    return {kind: table for kind, table in found.items() if table is not None}
-
-
-def markdown(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    """A table."""
-    head = list(header)
-    return [
-        "| " + " | ".join(head) + " |",
-        "|" + "---|" * len(head),
-        *("| " + " | ".join(row) + " |" for row in rows),
-        "",
-    ]
-
-
-def origin(found: dict[str, Table]) -> list[str]:
-    """Where tables come from."""
-    return [
-        f"- {KINDS[kind]}: `{table.meta['command']}`, {table.meta['date']}, "
-        f"{table.meta['seconds'] / 60:.0f} min ({table.meta['machine']})."
-        for kind, table in found.items()
-    ] + [""]
-
-
-def rms(values: np.ndarray) -> float:
-    """Root mean square over frames."""
-    return float(np.sqrt(np.nanmean(np.asarray(values) ** 2)))
 
 
 def about_calibration() -> list[str]:
@@ -272,6 +229,43 @@ def about_snapshots() -> list[str]:
     ]
 
 
+def about_failures() -> list[str]:
+    """What goes wrong, and whether it is said."""
+    found = tables("failures")
+    if not found:
+        return []
+    rows = []
+    for kind, table in found.items():
+        for case in dict.fromkeys(table["case"]):
+            part = table[table["case"] == case]
+            rows.append(
+                (
+                    KINDS[kind],
+                    str(case),
+                    ", ".join(sorted(set(part["status"]))),
+                    f"{np.mean(part['chi2'] / part['expected_chi2']):.3g}",
+                    f"{np.mean(part['null'] * part['scatter']):.2f}",
+                    f"{np.mean(part['scatter']):.2f}",
+                    f"{np.mean(part['null']):.2f}",
+                    f"{np.mean(part['limit']):.2f}",
+                )
+            )
+    header = (
+        "wavefronts", "what is wrong", "status", "chi2 / expected", "S/N deviation, unscaled",
+        "errors scaled by", "S/N deviation", "limit / photon limit",
+    )  # fmt: skip
+    return [
+        "## Where it breaks, and whether it says so",
+        "",
+        "Frames without a planet, one thing wrong in each that the fit does not know of. "
+        "Calibrated is what ends with a deviation near 1; honest is what has a status other than "
+        "CONVERGED where the unscaled deviation is not.",
+        "",
+        *markdown(header, rows),
+        *origin(found),
+    ]
+
+
 def about_speed() -> list[str]:
     """Seconds, beside the paper's recipe."""
     found = tables("speed")
@@ -305,54 +299,6 @@ def about_speed() -> list[str]:
     ]
 
 
-def draw() -> Figure:
-    """S/N calibration, limit, fluxes."""
-    panels = 3 if tables("fluxes") else 2
-    figure = Figure(figsize=(5 * panels, 4.4), layout="constrained")
-    left, middle, *rest = figure.subplots(1, panels)
-    middles = calibration.RINGS[:-1] + 0.1
-    for kind, table in tables("calibration").items():
-        for hours, style in ((3.0, ":"), (40.0, "-"), (86.0, "--"), (200.0, "-.")):
-            part = table[table["hours"] == hours]
-            if not len(part):
-                continue
-            label = f"{KINDS[kind]}, {hours:g} h"
-            nulls = [rms(part[f"null_{r:.1f}"]) for r in calibration.RINGS[:-1]]
-            limits = [part[f"limit_{r:.1f}"].mean() for r in calibration.RINGS[:-1]]
-            left.plot(middles, nulls, style, color=COLOURS[kind], label=label)
-            middle.plot(middles, limits, style, color=COLOURS[kind], label=label)
-    left.axhspan(0.85, 1.2, color="0.93", zorder=0)
-    left.axhline(1, color="0.5", lw=0.8)
-    left.set_ylim(0.6, 1.5)
-    titles = (
-        (left, "Deviation of S/N where there is nothing"),
-        (middle, "5-sigma limit / photon limit"),
-        *((ax, "Flux of injected planets / true") for ax in rest),
-    )
-    for ax, title in titles:
-        ax.set_title(title, fontsize=10, loc="left")
-        ax.set_xlabel("arcsec", fontsize=9)
-    middle.set_ylim(1.0, 1.5)
-    left.legend(frameon=False, fontsize=7)
-    for ax in rest:
-        _draw_fluxes(ax)
-    return figure
-
-
-def _draw_fluxes(ax: Axes) -> None:
-    for kind, table in tables("fluxes").items():
-        part = table[table["contrast"] / table["error"] > 4]
-        # Set apart a little, so that they do not hide each other.
-        place = part["separation"] + np.linspace(-0.1, 0.1, len(part))
-        ratio, error = part["measured"] / part["contrast"], part["error"] / part["contrast"]
-        ax.errorbar(
-            place, ratio, error, fmt=".", ms=3, lw=0.6, color=COLOURS[kind], label=KINDS[kind]
-        )
-    ax.axhline(1, color="0.5", lw=0.8)
-    ax.set_ylim(0.4, 1.6)
-    ax.legend(frameon=False, fontsize=8)
-
-
 def main() -> None:
     """Write page and figure."""
     lines = [
@@ -370,6 +316,7 @@ def main() -> None:
         *about_mismatch(),
         *about_companions(),
         *about_snapshots(),
+        *about_failures(),
         *about_speed(),
     ]
     notes = RESULTS / "inference_notes.md"

@@ -21,12 +21,16 @@ _log = logging.getLogger(__name__)
 _STRUCTURE = 1.15
 """chi2 per pixel, over what it should be, above which more modes are tried."""
 
+_FOREIGN = 5.0
+"""The same, above which it is not for lack of modes: something else is in the frame."""
+
 
 def _leaves_structure(fits: Sequence[Refinement]) -> bool:
-    """Whether chi2 is larger than noise and the fitted freedom make it."""
+    """Whether chi2 is larger than noise and the fitted freedom make it, as for want of modes."""
     pixels = sum(int(fit.observation.combined().valid.sum()) for fit in fits)
     expected = 1 - fits[0].effective_parameters / pixels
-    return fits[0].status.usable and fits[0].chi2_per_pixel > _STRUCTURE * expected
+    share = fits[0].chi2_per_pixel / expected
+    return fits[0].status.usable and _STRUCTURE < share < _FOREIGN
 
 
 def gauss_newton(

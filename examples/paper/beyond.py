@@ -1,0 +1,256 @@
+"""Beyond the paper: what it did not try, one thing wrong or new at a time.
+
+    python examples/paper/beyond.py --opd BEFORE AFTER --seeds 10
+
+A planet of 1e-6 at 0.6 arcsec, the wavefront map 40 h old unless said otherwise. Cases that cost
+more than a single fit (nine wavelengths, KLIP on refined residuals), and Adam, take a fifth of
+the seeds. "null" is the standard deviation of S/N where there is no planet: 1 if errors are right.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+from matplotlib.figure import Figure
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.files import embedded_table
+from pyklip_diffrender.metrics import annulus_snr
+from pyklip_diffrender.priors import WavefrontPrior
+
+sys.path.insert(0, str(Path(__file__).parent))
+from companions import ring_photons
+from failures import FITTED
+from judging import COLOURS, chosen, photon_snr, pixel, spread, star_error
+from methods import QUICK, STEPS, Subtracted, all_of, klip, references
+from scene import Frame, Image, Planet, Scene, Setting, frame, mapped, options, setting, timed_table
+
+PLANET = Planet(1e-6, 0.6, 54.0)
+HOURS = 40.0
+NON_COMMON_PATH = 5e-9
+"""Rms of the error of the instrument's internal wavefront, m, over Noll terms 4 to 15."""
+NINE = {"monochromatic": None, "nlambda": 9}
+FREE = ("star_offset", "lyot_shift", "lyot_rotation", "flux", "background")
+METHODS = ("initial", "KLIP", "Adam", "Gauss-Newton", "KLIP on residuals", "optimal")
+
+
+def _held(factor: float) -> dict[str, Any]:
+    scales = {name: factor * scale for name, scale in FITTED.items()}
+    return {"prior": WavefrontPrior(scales=scales, fit_scales=False)}
+
+
+@dataclass(frozen=True)
+class Case:
+    """What differs.
+
+    Attributes
+    ----------
+    name : str
+    fit : dict
+        Options of the fit.
+    truth : dict
+        Settings of the model that makes the frames, and not of the one that is fitted.
+    both : dict
+        Settings of both models.
+    offset : tuple of float
+        Of the star behind the occulter, arcsec.
+    internal, later, disk, combined : bool
+        Internal wavefront wrong; map taken after the frame; a ring; KLIP on residuals.
+    few : bool
+        Too expensive for all seeds.
+    """
+
+    name: str
+    fit: dict[str, Any] = field(default_factory=dict)
+    truth: dict[str, Any] = field(default_factory=dict)
+    both: dict[str, Any] = field(default_factory=dict)
+    offset: tuple[float, float] = (0.0, 0.0)
+    internal: bool = False
+    later: bool = False
+    disk: bool = False
+    combined: bool = False
+    few: bool = False
+
+
+CASES = (
+    Case("as in the paper"),
+    Case("star 20 mas off", offset=(0.016, -0.012)),
+    Case("map measured after the frame", later=True),
+    Case("internal wavefront 5 nm off", internal=True),
+    Case(
+        "internal wavefront 5 nm off, fitted", internal=True, fit={"free": (*FREE, "si_zernikes")}
+    ),
+    Case("a ring of 3e-5 beside the planet", disk=True),
+    Case("prior 3 times too narrow, held", fit=_held(1 / 3)),
+    Case("prior 3 times too wide, held", fit=_held(3.0)),
+    Case("nine wavelengths, fitted with nine", both=NINE, few=True),
+    Case("nine wavelengths, fitted with one", truth=NINE, few=True),
+    Case("KLIP on refined residuals", combined=True, few=True),
+)
+
+
+def makers(here: Setting, case: Case, seed: int) -> tuple[Setting, Setting]:
+    """What makes the frames, and what is known of it."""
+    known = replace(here, model=here.model.with_fidelity(**case.both)) if case.both else here
+    settings = {**case.both, **case.truth}
+    if case.internal:
+        table = 1e-9 * np.asarray(embedded_table("nircam_si_zernikes")["coefficient"], dtype=float)
+        wrong = np.random.default_rng([seed, 99]).normal(0, NON_COMMON_PATH / 12**0.5, 12)
+        table[3:15] += wrong
+        settings["si_wfe"] = table
+    true = replace(here, model=here.model.with_fidelity(**settings)) if settings else here
+    if case.later:
+        known = replace(known, measured=here.drifted(HOURS))
+    return true, known
+
+
+def with_ring(here: Setting, shot: Frame, seed: int) -> Frame:
+    """The frame, and a ring from 0.9 to 1.2 arcsec."""
+    light = np.random.default_rng([seed, 88]).poisson(ring_photons(here, shot.opd))
+    counts = shot.observation.data[0] + light
+    return replace(shot, observation=seen(here, counts))
+
+
+def seen(here: Setting, counts: Image) -> dr.Observation:
+    """Counts as an observer has them."""
+    error = np.sqrt(np.maximum(counts, 0) + Scene().read_noise ** 2)
+    scale = here.model.detector.pixelscale
+    return dr.Observation.from_arrays(counts, error, unit="photon", pixelscale=scale)
+
+
+def klip_on_residuals(known: Setting, left: Subtracted, frames: Image) -> Subtracted:
+    """KLIP on what refinement leaves of the target and of each of the nine references."""
+    remains = [
+        dr.refine(known.model, seen(known, counts), known.measured).residual[0] for counts in frames
+    ]
+    blank = np.zeros_like(left.image)
+    target = Frame(seen(known, left.image), blank, blank, (), blank)
+    return klip(target, np.stack(remains))
+
+
+def one_frame(here: Setting, number: int, steps: int, seed: int) -> Table:
+    """One row a method of the case with this number."""
+    case = CASES[number]
+    true, known = makers(here, case, seed)
+    hours = 0.0 if case.later else HOURS
+    shot = frame(true, hours, seed, [PLANET], star_offset=case.offset)
+    if case.disk:
+        shot = with_ring(true, shot, seed)
+    frames = references(true, hours, seed)
+    left = all_of(known, shot, frames, steps, **case.fit)
+    if case.combined:
+        left["KLIP on residuals"] = klip_on_residuals(known, left["Gauss-Newton"], frames)
+    fit = left["Gauss-Newton"].fit
+    assert fit is not None
+    found = dr.detect(fit, threshold=math.inf)
+    planet = found.measure([PLANET.offset])[0]
+    x, y = found.grid[..., 0], found.grid[..., 1]
+    radius = np.hypot(x, y)
+    away = np.hypot(x - PLANET.offset[0], y - PLANET.offset[1]) > 0.4
+    null = found.snr[away & (radius > 0.3) & (radius < 2.3)]
+    star = pixel(here, case.offset)
+    place = pixel(here, (PLANET.offset[0] + case.offset[0], PLANET.offset[1] + case.offset[1]))
+    facts = {
+        "case": case.name,
+        "seed": seed,
+        "status": fit.status.name,
+        "chi2": fit.chi2_per_pixel,
+        "photon_snr": photon_snr(shot),
+        "marginalised_snr": float(planet["snr"]),
+        "marginalised_throughput": float(planet["contrast"]) / PLANET.contrast,
+        "null": float(null.std()),
+        "fit_seconds": fit.seconds,
+    }
+    rows = [
+        {
+            **facts,
+            "method": name,
+            "annulus_snr": annulus_snr(result.image, place, star),
+            "star_error": star_error(here, shot, result.image),
+        }
+        for name, result in left.items()
+    ]
+    return Table(rows=rows)
+
+
+def draw(table: Table) -> Figure:
+    """S/N relative to the photon limit, measured contrast, and star error, case by case."""
+    names = list(dict.fromkeys(table["case"]))
+    figure = Figure(figsize=(14, 1.4 + 0.36 * len(names)), layout="constrained")
+    panels = figure.subplots(1, 3, sharey=True)
+    place = np.arange(len(names))
+    one = [chosen(table, case=name, method="Gauss-Newton") for name in names]
+    for ax, title, column in (
+        (panels[0], "Marginalised S/N / photon limit", "share"),
+        (panels[1], "Measured / true contrast", "marginalised_throughput"),
+    ):
+        spreads = [
+            spread(
+                part["marginalised_snr"] / part["photon_snr"] if column == "share" else part[column]
+            )
+            for part in one
+        ]
+        middle, low, high = np.transpose(spreads)
+        ax.errorbar(middle, place, xerr=np.stack([middle - low, high - middle]), fmt="o", ms=4,
+                    color=COLOURS["marginalised"])  # fmt: skip
+        ax.axvline(1, color="0.7", lw=0.8, zorder=0)
+        ax.set_title(title, fontsize=10, loc="left")
+    for name in ("initial", "KLIP", "Adam", "Gauss-Newton"):
+        spreads = [spread(chosen(table, case=c, method=name)["star_error"]) for c in names]
+        panels[2].plot(np.transpose(spreads)[0], place, "o", ms=4, color=COLOURS[name], label=name)
+    panels[2].set_xscale("log")
+    panels[2].set_title("Star error, sigma", fontsize=10, loc="left")
+    panels[2].legend(frameon=False, fontsize=7)
+    panels[0].set_yticks(place, names, fontsize=8)
+    panels[0].invert_yaxis()
+    return figure
+
+
+def main() -> None:
+    """Run the study."""
+    parser = options(__doc__.splitlines()[0])
+    parser.set_defaults(seeds=10)
+    parser.add_argument("--cases", type=int, nargs="+", help="numbers, from 0; default all")
+    given = parser.parse_args()
+    here = setting(tuple(given.opd) if given.opd else None, **(QUICK if given.quick else {}))
+    numbers = given.cases or range(len(CASES))
+    if given.quick:
+        jobs = [(here, number, 200, 0) for number in given.cases or (1,)]
+    else:
+        few = (given.seeds + 4) // 5
+        jobs = [
+            (here, number, STEPS if seed < few else 0, seed)
+            for seed in range(given.seeds)
+            for number in numbers
+            if seed < few or not CASES[number].few
+        ]
+    name = "beyond_measured" if given.opd else "beyond_generator"
+    table = timed_table(
+        lambda: mapped(one_frame, jobs, given.processes), given.output / f"{name}.ecsv"
+    )
+    for case in dict.fromkeys(table["case"]):
+        part = chosen(table, case=case)
+        share = spread(part["marginalised_snr"] / part["photon_snr"])[0]
+        print(
+            f"{case}: {', '.join(sorted(set(part['status'])))}, chi2 {np.mean(part['chi2']):.2f}, "
+            f"S/N {spread(part['marginalised_snr'])[0]:.1f} ({share:.2f} of the photon limit), "
+            f"contrast {spread(part['marginalised_throughput'])[0]:.2f} of true, null "
+            f"{spread(part['null'])[0]:.2f}"
+        )
+        for method in METHODS:
+            mine = chosen(part, method=method)
+            if len(mine):
+                print(
+                    f"  {method:17s} annulus SNR {spread(mine['annulus_snr'])[0]:6.2f}, star error "
+                    f"{spread(mine['star_error'])[0]:7.2f}"
+                )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""Contrast of a 5-sigma detection against separation, the paper's figure 6.
+
+    python examples/paper/contrast_boundary.py --opd BEFORE AFTER --seeds 10
+
+The wavefront map is 40 h old. For a method that leaves an image, the contrast is 5 times the noise
+over the light of a planet of contrast 1, both as the paper's annulus SNR takes them. The noise is
+the scatter of the pixels of the planet's annulus (3 pixels wide) over the root of the pixels in the
+aperture (radius 1.5 pixels), in a frame without planets. The light is the mean over the aperture,
+times the share that the method keeps of planets of photon-limited S/N 5: their light in the
+subtracted frame with them less that without them, over the same with the true star. A second column
+has the same by matched filters: the scatter of the amplitudes on the ring, not below the photon
+noise, over the share of the planet that was kept. For the marginalised estimate it is the closed
+form, the median of the ring. The noise limit is the paper's: 5 times the mean photon noise of the
+annulus, over the star's peak photons and the occulter's transmission; the photon limit is that of a
+matched filter that knows the star. No small-sample correction, for no method. Adam takes half the
+seeds.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from astropy.table import Table
+from matplotlib.figure import Figure
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.detection.relinearise import star_only
+from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.metrics import aperture_sum
+from pyklip_diffrender.nircam import mask335r_complement
+from pyklip_diffrender.refinement import Refinement
+
+sys.path.insert(0, str(Path(__file__).parent))
+import published
+from judging import COLOURS, Ring, chosen, kept, pixel, separations, spread
+from methods import QUICK, STEPS, all_of, references, with_planets
+from scene import (
+    Frame,
+    Image,
+    Planet,
+    Scene,
+    Setting,
+    Star,
+    frame,
+    mapped,
+    options,
+    planet_photons,
+    setting,
+    timed_table,
+)
+
+HOURS = 40.0
+INJECTED = 5.0
+"""S/N of the injected planets if the star were known."""
+APERTURE, HALF_WIDTH = 1.5, 1.5
+"""Pixels."""
+LIMITS = ("noise limit", "photon limit")
+SUBTRACTIONS = ("initial", "KLIP", "Adam", "Gauss-Newton", "optimal")
+
+
+def at_limit(here: Setting, shot: Frame, separation: float, angle: float) -> Planet:
+    """A planet of the photon-limited S/N `INJECTED`."""
+    unit = Planet(1.0, separation, angle)
+    light = planet_photons(here.model, Scene(), unit, shot.opd)
+    return Planet(INJECTED / float(np.linalg.norm(light / shot.noise)), separation, angle)
+
+
+def paper_noise(here: Setting, image: Image, separation: float) -> float:
+    """Scatter of an annulus, for the mean of an aperture."""
+    pixelscale = here.model.detector.pixelscale[0]
+    ring = np.abs(separations(here) - separation) <= HALF_WIDTH * pixelscale
+    return float(np.nanstd(image[ring]))
+
+
+def noise_limit(here: Setting, shot: Frame, separation: float) -> float:
+    """The paper's fundamental limit (its appendix A)."""
+    ring = np.abs(separations(here) - separation) <= HALF_WIDTH * here.model.detector.pixelscale[0]
+    where = torch.tensor(separation, dtype=torch.float64)
+    passed = (1 - float(mask335r_complement(where, torch.zeros_like(where)))) ** 2
+    return 5 * float(shot.noise[ring].mean()) / Star().peak_photons / passed
+
+
+def one_seed(here: Setting, places: tuple[float, ...], steps: int, seed: int) -> Table:
+    """One row a separation and method."""
+    shot = frame(here, HOURS, seed)
+    frames = references(here, HOURS, seed)
+    empty = all_of(here, shot, frames, steps)
+    curve = dr.contrast_curve(empty["Gauss-Newton"].fit, places, angles=60)
+    closed = {round(float(row["separation"].value), 3): row for row in curve}
+    rows = []
+    # Neighbours in separation are in different frames, and on other sides of the star.
+    for group in filter(None, (places[::2], places[1::2])):
+        planets = [at_limit(here, shot, s, (54 + 150 * places.index(s)) % 360) for s in group]
+        seen = with_planets(here, shot, planets, seed)
+        full = all_of(here, seen, frames, steps)
+        measured = together(full["Gauss-Newton"].fit, planets)
+        for k, planet in enumerate(planets):
+            row = closed[round(planet.separation, 3)]
+            facts = {"separation": planet.separation, "seed": seed, "injected": planet.contrast}
+            for values in one_place(here, seen, k, empty, full):
+                rows.append({**facts, **values})
+            for name, limit in (
+                ("noise limit", noise_limit(here, shot, planet.separation)),
+                ("photon limit", float(row["known_star"])),
+                ("marginalised", float(row["contrast"])),
+            ):
+                share = measured[k] / planet.contrast if name == "marginalised" else math.nan
+                values = {"method": name, "contrast": limit, "matched": limit, "throughput": share}
+                rows.append({**facts, **values})
+    return Table(rows=rows)
+
+
+def together(fit: Refinement, planets: list[Planet]) -> Image:
+    """Contrasts of planets measured together, for their wings overlap."""
+    templates = Templates([fit], fit).at(torch.tensor([p.offset for p in planets]).double())
+    matrix, vector = star_only([fit]).normal_equations(templates)
+    return torch.linalg.solve(matrix, vector).numpy()
+
+
+def one_place(
+    here: Setting, seen: Frame, which: int, empty: dict[str, Any], full: dict[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """The 5-sigma contrasts of the methods that leave an image."""
+    planet = seen.planets[which][0]
+    where = pixel(here, planet.offset)
+    ring = Ring(here, seen, which)
+    count = aperture_sum(np.ones_like(seen.star), where, APERTURE)
+    unit = aperture_sum(seen.planets[which][1], where, APERTURE) / count / planet.contrast
+    # With the true star: 1, but for the planet's own noise and the wings of the other planets.
+    true = full["optimal"].image - empty["optimal"].image
+    whole = kept(here, seen, true, np.zeros_like(true), which)
+    for name, without in empty.items():
+        share = kept(here, seen, full[name].image, without.image, which) / whole
+        noise = paper_noise(here, without.image, planet.separation) / math.sqrt(count)
+        yield {
+            "method": name,
+            # Where a method removed the planet altogether there is no contrast to be seen.
+            "contrast": 5 * noise / unit / share if share > 0 else math.inf,
+            "matched": 5 * ring.noise(without.image) / share if share > 0 else math.inf,
+            "throughput": share,
+        }
+
+
+def medians(table: Table, method: str, column: str = "contrast") -> tuple[Image, Image]:
+    """Separations, and the median, 16 and 84 percentile there, (3, k)."""
+    part = chosen(table, method=method)
+    places = np.unique(part["separation"])
+    return places, np.transpose([spread(chosen(part, separation=s)[column]) for s in places])
+
+
+def draw(table: Table) -> Figure:
+    """The curves, the paper's beside them; and how much of the planets was kept."""
+    figure = Figure(figsize=(15, 5), layout="constrained")
+    panels = figure.subplots(1, 3)
+    styles = {"noise limit": ("#b03030", ":"), "photon limit": ("#1b1f24", "--")}
+    for ax, column in zip(panels, ("contrast", "matched", "throughput"), strict=True):
+        for name in (*LIMITS, *SUBTRACTIONS, "marginalised"):
+            places, (middle, low, high) = medians(table, name, column)
+            if not len(places) or not np.isfinite(middle).any():
+                continue
+            colour, style = styles.get(name, (COLOURS.get(name, "k"), "-"))
+            ax.plot(places, middle, style, color=colour, label=name)
+            ax.fill_between(places, low, high, color=colour, alpha=0.15, lw=0)
+        ax.set_xlabel("arcsec", fontsize=9)
+    for name, colour in (("noise limit", "#b03030"), ("theirs", COLOURS["Adam"]),
+                         ("KLIP", COLOURS["KLIP"])):  # fmt: skip
+        panels[0].plot(
+            published.SEPARATIONS, published.BOUNDARY[name], "o", ms=3.5, mfc="none", color=colour,
+            label=f"{name}, published",
+        )  # fmt: skip
+    titles = ("5-sigma contrast, annulus SNR", "5-sigma contrast, matched filters",
+              "Planet's light kept")  # fmt: skip
+    for ax, title in zip(panels, titles, strict=True):
+        ax.set_title(title, fontsize=10, loc="left")
+        ax.set_yscale("log")
+    panels[2].set_yscale("linear")
+    panels[2].axhline(1, color="0.7", lw=0.8, zorder=0)
+    panels[2].set_ylim(0, 1.5)
+    panels[0].legend(frameon=False, fontsize=7)
+    return figure
+
+
+def main() -> None:
+    """Run the study."""
+    parser = options(__doc__.splitlines()[0])
+    parser.set_defaults(seeds=10)
+    given = parser.parse_args()
+    here = setting(tuple(given.opd) if given.opd else None, **(QUICK if given.quick else {}))
+    if given.quick:
+        jobs = [(here, published.SEPARATIONS[2:3], 200, 0)]
+    else:
+        jobs = [
+            (here, published.SEPARATIONS, STEPS if seed < (given.seeds + 1) // 2 else 0, seed)
+            for seed in range(given.seeds)
+        ]
+    name = "contrast_boundary_measured" if given.opd else "contrast_boundary_generator"
+    table = timed_table(
+        lambda: mapped(one_seed, jobs, given.processes), given.output / f"{name}.ecsv"
+    )
+    for method in (*LIMITS, *SUBTRACTIONS, "marginalised"):
+        for column in ("contrast", "matched", "throughput"):
+            _, (middle, _, _) = medians(table, method, column)
+            print(f"{method:13s} {column:10s}", *(f"{value:.2e}" for value in middle))
+
+
+if __name__ == "__main__":
+    main()

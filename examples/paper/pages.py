@@ -1,0 +1,44 @@
+"""What the pages made from committed tables have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from astropy.table import Table
+
+RESULTS = Path("docs/results")
+KINDS = {"measured": "measured maps", "generator": "embedded generator"}
+"""Name in a table's file, name for readers."""
+
+
+def read(study: str, kind: str) -> Table | None:
+    """A study's table, if it has been run."""
+    path = RESULTS / f"{study}_{kind}.ecsv"
+    return Table.read(path, format="ascii.ecsv") if path.is_file() else None
+
+
+def tables(study: str) -> dict[str, Table]:
+    """Of all kinds of wavefront that the study was run on."""
+    found = {kind: read(study, kind) for kind in KINDS}
+    return {kind: table for kind, table in found.items() if table is not None}
+
+
+def markdown(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """A table."""
+    head = list(header)
+    return [
+        "| " + " | ".join(head) + " |",
+        "|" + "---|" * len(head),
+        *("| " + " | ".join(row) + " |" for row in rows),
+        "",
+    ]
+
+
+def origin(found: dict[str, Table]) -> list[str]:
+    """Where tables come from."""
+    return [
+        f"- {KINDS[kind]}: `{table.meta['command']}`, {table.meta['date']}, "
+        f"{table.meta['seconds'] / 60:.0f} min ({table.meta['machine']})."
+        for kind, table in found.items()
+    ] + [""]

@@ -1,0 +1,164 @@
+"""How the optimisation goes, and the estimated wavefront against the true one.
+
+    python examples/paper/progress.py --opd BEFORE AFTER --seeds 10
+
+A planet of 1e-6 at 0.6 arcsec, the wavefront map 80 h old. After some steps of the paper's recipe
+and of Gauss-Newton: the annulus SNR, the star-model error, and how much of the wavefront's true
+change the estimate has: rms of what is left over the rms of the change, inside the Lyot stop's
+openings, piston aside. Adam takes a fifth of the seeds. Maps are those of the first seed.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+from matplotlib.figure import Figure
+
+from pyklip_diffrender.geometry import PupilGrid, maskrnd_openings, polygon_coverage
+from pyklip_diffrender.opd import resample
+from pyklip_diffrender.refinement import Refinement
+
+sys.path.insert(0, str(Path(__file__).parent))
+from judging import COLOURS, chosen, paper_snr, spread, star_error
+from methods import QUICK, STEPS, Subtracted, adam, gauss_newton, initial
+from pictures import beside, show, write_images
+from scene import Frame, Image, Planet, Setting, frame, mapped, options, setting, timed_table
+
+PLANET = Planet(1e-6, 0.6, 54.0)
+HOURS = 80.0
+ADAM_STEPS = (1, 10, 30, 100, 300, STEPS)
+NEWTON_STEPS = (2, 3, 5, 8, 40)
+"""The last one is the limit: it stops by itself before."""
+SAMPLES = 128
+"""Of the maps."""
+LIMIT = 20.0
+"""nm."""
+
+
+def seen_change(here: Setting, opd: Image) -> Image:
+    """Change since the map, nm, coarse, NaN outside the Lyot stop's openings, mean 0."""
+    grid = PupilGrid.full(SAMPLES, here.model.diameter)
+    stop = polygon_coverage(maskrnd_openings(), grid).numpy() > 0.5
+    change = 1e9 * (resample(opd, SAMPLES) - resample(here.measured, SAMPLES))
+    return np.where(stop, change - change[stop].mean(), np.nan)
+
+
+def judge(here: Setting, shot: Frame, step: Subtracted, fit: Refinement | None) -> dict[str, Any]:
+    """Numbers of one stage."""
+    true = seen_change(here, shot.opd)
+    found = seen_change(here, here.measured if fit is None else np.real(fit.opd))
+    return {
+        "annulus_snr": paper_snr(here, step.image, PLANET),
+        "star_error": star_error(here, shot, step.image),
+        "opd_left": float(np.nanstd(true - found) / np.nanstd(true)),
+        "opd_change_nm": float(np.nanstd(true)),
+        "seconds": step.seconds,
+    }
+
+
+def one_seed(here: Setting, counts: tuple[int, ...], steps: tuple[int, ...], seed: int) -> Table:
+    """One row a stage."""
+    shot = frame(here, HOURS, seed, [PLANET])
+    began = time.perf_counter()
+    start = judge(here, shot, initial(here, shot), None)
+    maps = {"true": seen_change(here, shot.opd)}
+    rows = [
+        {"method": method, "step": 0, "seed": seed, **start} for method in ("Adam", "Gauss-Newton")
+    ]
+    stages = [("Gauss-Newton", n) for n in counts] + [("Adam", n) for n in steps]
+    for method, count in stages:
+        if method == "Adam":
+            left = adam(here, shot, count)
+        else:
+            # One basis for all stages: it would grow where the first one is not done.
+            left = gauss_newton(here, shot, max_iterations=count, cycles=(24.0,))
+        assert left.fit is not None
+        # Those that stop by themselves have fewer.
+        taken = count if method == "Adam" else min(count, len(left.fit.history))
+        rows.append(
+            {"method": method, "step": taken, "seed": seed, **judge(here, shot, left, left.fit)}
+        )
+        maps[method] = seen_change(here, np.real(left.fit.opd))
+    found = Table(rows=rows)
+    found.meta = {"seconds": time.perf_counter() - began}
+    for name in ("true", "Gauss-Newton", "Adam"):
+        blank = np.zeros((SAMPLES, SAMPLES))
+        image = np.nan_to_num(maps[name]) if seed == 0 and name in maps else blank
+        found[f"map {name}"] = np.broadcast_to(image, (len(found), SAMPLES, SAMPLES)).copy()
+    return found
+
+
+def draw(table: Table, images: dict[str, Image]) -> Figure:
+    """Error against steps and against seconds; maps of the wavefront's change."""
+    figure = Figure(figsize=(14, 7), layout="constrained")
+    panels = figure.subplots(2, 3)
+    for ax, column, title in zip(
+        panels[0],
+        ("star_error", "annulus_snr", "opd_left"),
+        ("Star-model error, sigma", "Annulus SNR of the planet", "Wavefront change not found"),
+        strict=True,
+    ):
+        for name in ("Adam", "Gauss-Newton"):
+            mine = chosen(table, method=name)
+            steps = np.unique(mine["step"])
+            if not len(steps):
+                continue
+            spreads = [spread(chosen(mine, step=step)[column]) for step in steps]
+            middle, low, high = np.transpose(spreads)
+            ax.plot(steps, middle, ".-", color=COLOURS[name], label=name)
+            ax.fill_between(steps, low, high, color=COLOURS[name], alpha=0.15, lw=0)
+        ax.set_xscale("symlog", linthresh=1)
+        ax.set_title(title, fontsize=10, loc="left")
+        ax.set_xlabel("steps", fontsize=9)
+    panels[0, 0].set_yscale("log")
+    panels[0, 0].legend(frameon=False, fontsize=8)
+    titles = {"true": "True change of the wavefront", "Adam": "found by Adam",
+              "Gauss-Newton": "found by Gauss-Newton"}  # fmt: skip
+    for ax, (name, title) in zip(panels[1], titles.items(), strict=True):
+        if name in images:
+            show(ax, images[name], f"{title}, +-{LIMIT:.0f} nm", LIMIT, "PuOr_r")
+    return figure
+
+
+def main() -> None:
+    """Run the study."""
+    parser = options(__doc__.splitlines()[0])
+    parser.set_defaults(seeds=10)
+    given = parser.parse_args()
+    here = setting(tuple(given.opd) if given.opd else None, **(QUICK if given.quick else {}))
+    if given.quick:
+        jobs = [(here, (2, 5), (30, 200), 0)]
+    else:
+        jobs = [
+            (here, NEWTON_STEPS, ADAM_STEPS if seed < (given.seeds + 4) // 5 else (), seed)
+            for seed in range(given.seeds)
+        ]
+    name = "progress_measured" if given.opd else "progress_generator"
+    path = given.output / f"{name}.ecsv"
+
+    def work() -> Table:
+        table = mapped(one_seed, jobs, given.processes)
+        maps = {n.removeprefix("map "): table[n][0] for n in table.colnames if n[:4] == "map "}
+        write_images(beside(path), maps, LIMIT)
+        table.remove_columns([f"map {name}" for name in maps])
+        return table
+
+    table = timed_table(work, path)
+    for method in ("Adam", "Gauss-Newton"):
+        mine = chosen(table, method=method)
+        for step in np.unique(mine["step"]):
+            part = chosen(mine, step=step)
+            print(
+                f"{method:13s} {step:5d} steps: star error {spread(part['star_error'])[0]:7.2f}, "
+                f"annulus SNR {spread(part['annulus_snr'])[0]:6.2f}, change not found "
+                f"{spread(part['opd_left'])[0]:.2f}, {spread(part['seconds'])[0]:.1f} s"
+            )
+
+
+if __name__ == "__main__":
+    main()

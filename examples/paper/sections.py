@@ -1,0 +1,165 @@
+"""Tables of the page on the paper's experiments, in Markdown; see `experiments.py`."""
+
+from __future__ import annotations
+
+import beyond
+import contrast_boundary
+import location
+import misalignment
+import numpy as np
+import published
+from astropy.table import Table
+from judging import chosen, methods_in, shown
+from pages import markdown
+
+Lines = list[str]
+
+
+def grid(table: Table, keys: tuple[str, ...], columns: dict[str, str], form: str) -> Lines:
+    """Markdown with a row a setting, a column a method, median and spread in each cell."""
+    found: Lines = []
+    names = methods_in(table)
+    settings = list(dict.fromkeys(tuple(row[key] for key in keys) for row in table))
+    for column, title in columns.items():
+        with_values = [n for n in names if np.isfinite(chosen(table, method=n)[column]).any()]
+        rows = []
+        for setting in settings:
+            part = chosen(table, **dict(zip(keys, setting, strict=True)))
+            cells = [shown(chosen(part, method=name)[column], form) for name in with_values]
+            rows.append([", ".join(_short(value) for value in setting), *cells])
+        found += [f"{title}:", "", *markdown((", ".join(keys), *with_values), rows)]
+    return found
+
+
+def _short(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def about_boundary(table: Table) -> Lines:
+    """Contrast by separation."""
+    names = [*contrast_boundary.LIMITS, "KLIP", "Adam", "Gauss-Newton", "marginalised"]
+    rows = []
+    for separation in np.unique(table["separation"]):
+        part = chosen(table, separation=separation)
+        cells = [shown(chosen(part, method=name)["contrast"], ".2g") for name in names]
+        theirs = dict(zip(published.SEPARATIONS, published.BOUNDARY["theirs"], strict=True))
+        rows.append([f"{separation:g}", *cells, f"{theirs[round(float(separation), 3)]:.2g}"])
+    kept = grid(table, ("separation",), {"throughput": "Planet's light kept"}, ".2f")
+    return [*markdown(("arcsec", *names, "published, theirs"), rows), *kept]
+
+
+def about_klip(table: Table) -> Lines:
+    """Six planets."""
+    columns = {
+        "annulus_snr": "Annulus SNR, the paper's (no significance, see the limits)",
+        "matched_snr": "Matched-filter S/N",
+        "throughput": "Planet's light kept; for the marginalised estimate, measured / true",
+        "star_error": "Star-model error, sigma (for KLIP with what it took of the planet)",
+    }
+    rows = [
+        [f"{separation:g}, {contrast:g}", *(f"{value:g}" for value in values)]
+        for (separation, contrast), values in published.TABLE.items()
+    ]
+    return [
+        *grid(table, ("separation", "contrast"), columns, ".2f"),
+        f"Annulus SNR as published ({published.TABLE_SOURCE}):",
+        "",
+        *markdown(("separation, contrast", "KLIP", "theirs", "optimal"), rows),
+    ]
+
+
+def about_misalignment(table: Table) -> Lines:
+    """PSNR."""
+    rows = []
+    for axis, amount in dict.fromkeys((row["axis"], row["amount"]) for row in table):
+        part = chosen(table, axis=axis, amount=amount)
+        cells = [shown(chosen(part, method=m)["psnr"]) for m in misalignment.STYLES]
+        share = shown(part["marginalised_throughput"], ".3f")
+        rows.append([f"{axis}: {amount:g}", *cells, shown(part["marginalised_snr"]), share])
+    header = ("misalignment", *misalignment.STYLES, "marginalised S/N", "its contrast / true")
+    return ["PSNR in dB over 11 x 11 pixels about the planet:", "", *markdown(header, rows)]
+
+
+def about_drift(table: Table) -> Lines:
+    """SNR, and S/N of the marginalised estimate."""
+    lines = grid(table, ("contrast", "hours"), {"annulus_snr": "Annulus SNR"}, ".1f")
+    one = chosen(table, method="Gauss-Newton")
+    rows = []
+    for contrast in np.unique(one["contrast"]):
+        for hours in np.unique(one["hours"]):
+            part = chosen(one, contrast=contrast, hours=hours)
+            values = shown(part["marginalised_snr"]), shown(part["marginalised_throughput"], ".2f")
+            rows.append([f"{contrast:g}", f"{hours:g}", *values])
+    header = ("contrast", "drift, h", "marginalised S/N", "contrast / true")
+    return [*lines, *markdown(header, rows)]
+
+
+def about_location(table: Table) -> Lines:
+    """Positions."""
+    rows = []
+    for separation in np.unique(table["separation"]):
+        part = chosen(table, separation=separation)
+        seen = part[part["found"]]
+        rows.append(
+            [
+                f"{separation:g}",
+                f"{len(seen)} of {len(part)}",
+                str(int(part["false_candidates"].sum())),
+                shown(location.distance(seen), ".2f"),
+                shown(1e3 * np.hypot(seen["x_error"], seen["y_error"]), ".2f"),
+                shown(seen["flux_ratio"], ".3f"),
+                shown(seen["snr"]),
+                shown(part["photon_snr"]),
+                *(shown(part[f"snr_{name}"]) for name in location.SNRS),
+            ]
+        )
+    header = (
+        "arcsec", "found", "false", "off by, mas", "expected, mas", "contrast / true", "S/N",
+        "photon limit", *(f"annulus SNR, {name}" for name in location.SNRS),
+    )  # fmt: skip
+    return markdown(header, rows)
+
+
+def about_grid(table: Table) -> Lines:
+    """SNR against three things."""
+    keys = ("contrast", "hours", "separation")
+    columns = {"annulus_snr": "Annulus SNR", "matched_snr": "Matched-filter S/N",
+               "throughput": "Planet's light kept"}  # fmt: skip
+    return grid(table, keys, columns, ".2f")
+
+
+def about_progress(table: Table) -> Lines:
+    """Stages."""
+    columns = {"star_error": ".2f", "annulus_snr": ".1f", "opd_left": ".2f", "seconds": ".1f"}
+    rows = []
+    for method in ("Adam", "Gauss-Newton"):
+        for step in np.unique(chosen(table, method=method)["step"]):
+            part = chosen(table, method=method, step=step)
+            cells = (shown(part[column], form) for column, form in columns.items())
+            rows.append([method, str(step), *cells])
+    header = ("method", "steps", "star error, sigma", "annulus SNR", "change not found", "seconds")
+    return markdown(header, rows)
+
+
+def about_beyond(table: Table) -> Lines:
+    """Case by case."""
+    methods = [m for m in beyond.METHODS if m in set(table["method"]) and m != "optimal"]
+    rows = []
+    for case in dict.fromkeys(table["case"]):
+        part = chosen(table, case=case, method="Gauss-Newton")
+        every = chosen(table, case=case)
+        rows.append(
+            [
+                str(case),
+                str(len(part)),
+                ", ".join(sorted(set(part["status"]))),
+                shown(part["marginalised_snr"]),
+                shown(part["marginalised_snr"] / part["photon_snr"], ".2f"),
+                shown(part["marginalised_throughput"], ".2f"),
+                shown(part["null"], ".2f"),
+                *(shown(chosen(every, method=m)["star_error"], ".2f") for m in methods),
+            ]
+        )
+    header = ("case", "frames", "status", "S/N", "/ photon limit", "contrast / true", "null",
+              *(f"star error, {m}" for m in methods))  # fmt: skip
+    return markdown(header, rows)
