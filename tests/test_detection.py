@@ -250,6 +250,21 @@ def test_a_bright_planet_is_measured_right_after_the_star_is_refined_again(world
     assert np.abs(found.residual_snr[away]).max() < 6
 
 
+def test_a_bright_ring_keeps_its_light(world: World) -> None:
+    """Of known shape, though no wavefront explains it; what is merely subtracted loses some."""
+    angles = np.arange(0, 360, 9.0)
+    places = [Planet(1.0, 0.75, angle).offset for angle in angles]
+    light = sum(world.model(world.later, place).numpy() for place in places) * FLUX / len(places)
+    observation = world.observed(world.expected() + 1e-4 * light, 17)
+    fit = world.refined(observation)
+    assert fit.status is not Status.CONVERGED
+    amplitude, error = dr.detect(fit, threshold=math.inf).measure_shape(1e-4 * light)
+    assert abs(amplitude - 1) < max(0.02, 4 * error)
+    assert error < 0.05
+    weight = light / observation.error[0] ** 2
+    assert (weight * fit.residual[0]).sum() / (weight * 1e-4 * light).sum() < 0.95
+
+
 def test_a_planet_on_the_edge_of_the_field_is_measured(world: World) -> None:
     planet = Planet(1e-4, 1.2, 90.0)
     table = dr.measure(world.fitted(14, planet), [planet.offset])

@@ -30,6 +30,7 @@ COLUMNS = {
     "misalignment": ("psnr", "star_error", "marginalised_snr"),
     "mismatch": ("snr", "contrast", "null", "lyot_error_percent"),
     "progress": ("annulus_snr", "star_error", "opd_left"),
+    "ring": ("measured", "error", "kept_by_subtraction"),
     "snapshots": ("measured", "error"),
     "snr_grid": ("matched_snr", "throughput", "photon_snr"),
     "speed": ("refine",),

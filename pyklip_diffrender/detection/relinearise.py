@@ -6,12 +6,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.linear_model import LinearModel
 from pyklip_diffrender.refinement import Refinement, refine_again
 from pyklip_diffrender.scene import Planet
 
-__all__ = ["star_only", "with_companions"]
+__all__ = ["star_only", "with_companions", "without_light"]
 
 
 def with_companions(
@@ -55,3 +58,15 @@ def star_only(fits: Sequence[Refinement]) -> LinearModel:
     assert linear is not None
     light = {fit.frame: fit.companion_image for fit in fits if len(fit.companions)}
     return linear.without("companions", light) if light else linear
+
+
+def without_light(fit: Refinement, light: NDArray[np.float64]) -> Refinement:
+    """The star refined anew, from the start, with some light (ny, nx) taken off all frames.
+
+    The light's own noise stays in their errors.
+    """
+    observation = replace(fit.observation, data=fit.observation.data - light)
+    (found,) = refine_again(
+        [replace(fit, observation=observation)], resume=None, prior=fit.settings.prior
+    )
+    return found

@@ -16,6 +16,7 @@ from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.relinearise import star_only, without_light
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.files import replacing, write_fits
@@ -25,6 +26,12 @@ from pyklip_diffrender.refinement import Refinement
 __all__ = ["Detection", "amplitudes"]
 
 Image = NDArray[np.float64]
+
+_ROUNDS = 5
+"""How often the star is refined anew for a bright extended source, at most."""
+
+_SETTLED = 0.2
+"""Changes of its amplitude by less than so many of its errors end that."""
 
 
 def amplitudes(
@@ -51,6 +58,12 @@ def amplitudes(
             "snr": contrast / error,
         }
     )
+
+
+def _amplitude(linear: LinearModel, frame: int, shape: torch.Tensor) -> tuple[float, float]:
+    weighed = linear.weigh({frame: shape[None]})
+    information = float(weighed.information[0])
+    return float(weighed.numerator[0]) / information, information**-0.5
 
 
 @dataclass(frozen=True)
@@ -166,13 +179,17 @@ class Detection:
         """
         return amplitudes(self.groups, offsets, self.scatter)
 
-    def measure_shape(self, image: ArrayLike) -> tuple[float, float]:
+    def measure_shape(self, image: ArrayLike, *, relinearise: float = 25.0) -> tuple[float, float]:
         """Amplitude of an extended source of known shape in the first frame, such as a ring.
 
         Parameters
         ----------
         image : (ny, nx)
             What it looks like at amplitude 1, in the data's unit, behind the coronagraph.
+        relinearise : float
+            When it is brighter than so many of its errors (before `scatter`), the star of a single
+            frame is refined anew without it, until its amplitude has settled: no wavefront
+            explains its light.
 
         Returns
         -------
@@ -181,9 +198,17 @@ class Detection:
         shape = torch.as_tensor(np.asarray(image, dtype=float))
         if shape.shape != self.snr.shape:
             raise ShapeError(f"image: got {tuple(shape.shape)}, expected {self.snr.shape}")
-        weighed = self.groups[0][0].weigh({self.fits[0].frame: shape[None]})
-        information = float(weighed.information[0])
-        return float(weighed.numerator[0]) / information, self.scatter * information**-0.5
+        fit, linear, scatter = self.fits[0], self.groups[0][0], self.scatter
+        amplitude, error = _amplitude(linear, fit.frame, shape)
+        total, bright = amplitude, amplitude > relinearise * error
+        for _ in range(_ROUNDS if bright and len(self.fits) == 1 else 0):
+            fit = without_light(self.fits[0], total * shape.numpy())
+            amplitude, error = _amplitude(star_only([fit]), fit.frame, shape)
+            total += amplitude
+            scatter = 1.0 if fit.status.calibrated else self.scatter
+            if abs(amplitude) < _SETTLED * error:
+                break
+        return total, scatter * error
 
     @cached_property
     def left_out(self) -> tuple[Image, Image]:
