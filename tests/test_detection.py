@@ -101,7 +101,8 @@ def test_snr_scatters_by_one_where_there_is_nothing(empty: list[Detection]) -> N
     # Some 40 independent positions a frame: the deviation of six is known to 5 %.
     assert values.std() == pytest.approx(1.0, abs=0.12)
     assert abs(values.mean()) < 0.15
-    assert all(found.scatter == 1.0 for found in empty)
+    # chi2 of 1600 pixels is known to 3.5 %.
+    assert all(1.0 <= found.scatter < 1.06 for found in empty)
     assert all(len(found.candidates) == 0 for found in empty)
 
 

@@ -9,6 +9,7 @@ unbiased, with an error that contains the price of the wavefront's freedom.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -70,8 +71,8 @@ def detect(
     inner : float
         Candidates are not looked for nearer to the star, arcsec.
     scatter : float, optional
-        Factor for all errors. Default 1 where every fit explains its data, else the scatter of
-        S/N away from candidates, if that is larger than 1.
+        Factor for all errors. Default, where every fit explains its data, the square root of what
+        chi2 is to what noise makes it; else the scatter of S/N away from candidates. Never below 1.
     separations : array, optional
         Of the contrast curve, arcsec. Default every 0.1 from 0.2 to the nearest edge.
     relinearise : float
@@ -124,7 +125,7 @@ def measure(
     fits: Refinement | Sequence[Refinement],
     offsets: ArrayLike,
     *,
-    scatter: float = 1.0,
+    scatter: float | None = None,
     relinearise: float = 25.0,
 ) -> QTable:
     """Contrast of a point source at given positions, each as if it were the only one.
@@ -134,8 +135,9 @@ def measure(
     fits : Refinement or sequence of Refinement
     offsets : (k, 2)
         x, y from the star, arcsec, image orientation of the first frame.
-    scatter : float
-        Factor for the errors.
+    scatter : float, optional
+        Factor for the errors. Default as for `detect`, or 1 for fits that do not explain their
+        data.
     relinearise : float
         See `detect`.
 
@@ -149,13 +151,16 @@ def measure(
     IncompatibleSetupError, ShapeError
     """
     given = [fits] if isinstance(fits, Refinement) else list(fits)
-    table = amplitudes(_groups(given), offsets, scatter)
+    factor = _excess(given) if scatter is None else scatter
+    table = amplitudes(_groups(given), offsets, factor)
     bright = table[table["snr"] > relinearise]
     if len(bright):
         places = torch.from_numpy(np.stack([bright["x"].value, bright["y"].value], axis=1))
         contrasts = torch.from_numpy(np.asarray(bright["contrast"]))
         known = Candidates(places, contrasts, torch.zeros(3 * len(bright), 3 * len(bright)))
-        table = amplitudes(_groups(with_companions(given, known)), offsets, scatter)
+        given = with_companions(given, known)
+        factor = _excess(given) if scatter is None else scatter
+        table = amplitudes(_groups(given), offsets, factor)
     return table
 
 
@@ -164,7 +169,7 @@ def contrast_curve(
     separations: ArrayLike | None = None,
     *,
     angles: int = 12,
-    scatter: float = 1.0,
+    scatter: float | None = None,
 ) -> QTable:
     """The 5-sigma contrast curve alone, from a few positions at each separation.
 
@@ -175,8 +180,8 @@ def contrast_curve(
         arcsec; as for `detect`.
     angles : int
         Positions per separation, at most.
-    scatter : float
-        Factor for the errors.
+    scatter : float, optional
+        Factor for the errors; see `measure`.
 
     Returns
     -------
@@ -198,7 +203,8 @@ def contrast_curve(
         information += weighed.information
         photon += weighed.photon
     ends = np.cumsum([len(ring[0]) for ring in rings])[:-1]
-    errors = np.split(scatter * information.numpy() ** -0.5, ends)
+    factor = _excess(given) if scatter is None else scatter
+    errors = np.split(factor * information.numpy() ** -0.5, ends)
     known = np.split(photon.numpy() ** -0.5, ends)
     return contrast_table(wanted, errors, known, _resolution(given[0]))
 
@@ -241,7 +247,7 @@ def _search(
     """Candidates, strongest first, and the factor for the errors."""
     grid = maps.groups[0][1].grid
     pixel = float(np.abs(np.diff(grid[:, :, 0], axis=1)).mean())
-    explained = all(fit.status.calibrated for fit in fits)
+    explained, excess = all(fit.status.calibrated for fit in fits), _excess(fits)
     found = start
     if len(start):
         found = refine_candidates(maps.groups, start, reach=pixel / 2)
@@ -254,7 +260,7 @@ def _search(
         snr = maps.snr(maps.without(found))
         factor = scatter
         if factor is None:
-            factor = 1.0 if explained else max(1.0, _scatter(snr, grid, found, inner))
+            factor = excess if explained else max(1.0, _scatter(snr, grid, found, inner))
         peak = strongest_peak(
             snr / factor, grid, found.offsets, threshold=threshold, inner=inner, apart=pixel
         )
@@ -265,6 +271,17 @@ def _search(
             maps.groups, found.with_one_more(grid[peak], amplitude), reach=pixel / 2
         )
         _log.info("candidates at %s arcsec", found.offsets.tolist())
+
+
+def _excess(fits: Sequence[Refinement]) -> float:
+    """By how much residuals are larger than noise makes them, at least 1.
+
+    A few percent of structure that no mode explains are in the star's place in a planet's filter,
+    too. Where fits do not explain their data at all, their model error says so instead.
+    """
+    if not all(fit.status.calibrated for fit in fits):
+        return 1.0
+    return max(1.0, math.sqrt(np.mean([fit.reduced_chi2 for fit in fits])))
 
 
 def _scatter(

@@ -27,10 +27,7 @@ _FOREIGN = 5.0
 
 def _leaves_structure(fits: Sequence[Refinement]) -> bool:
     """Whether chi2 is larger than noise and the fitted freedom make it, as for want of modes."""
-    pixels = sum(int(fit.observation.combined().valid.sum()) for fit in fits)
-    expected = 1 - fits[0].effective_parameters / pixels
-    share = fits[0].chi2_per_pixel / expected
-    return fits[0].status.usable and _STRUCTURE < share < _FOREIGN
+    return fits[0].status.usable and _STRUCTURE < fits[0].reduced_chi2 < _FOREIGN
 
 
 def gauss_newton(

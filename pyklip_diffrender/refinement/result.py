@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -141,6 +142,17 @@ class Refinement:
             f"<Refinement by {self.method}: {self.status.name}, chi2/pixel "
             f"{self.chi2_per_pixel:.3g}, {self.seconds:.1f} s>"
         )
+
+    @property
+    def reduced_chi2(self) -> float:
+        """chi2 per pixel over what noise and the number of fitted modes make it.
+
+        Of all frames that were refined together. NaN for methods that do not count modes.
+        """
+        if self.linear is None:
+            return math.nan
+        pixels = sum(int((frame.weight > 0).sum()) for frame in self.linear.frames)
+        return self.chi2_per_pixel / max(1 - self.effective_parameters / pixels, 1e-3)
 
     @property
     def residual(self) -> NDArray[np.float64]:
