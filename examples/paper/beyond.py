@@ -25,10 +25,10 @@ from pyklip_diffrender.metrics import annulus_snr
 from pyklip_diffrender.priors import WavefrontPrior
 
 sys.path.insert(0, str(Path(__file__).parent))
-from companions import ring_photons
 from failures import FITTED
 from judging import COLOURS, chosen, photon_snr, pixel, spread, star_error
 from methods import QUICK, STEPS, Subtracted, all_of, klip, references
+from ring import ring_photons
 from scene import Frame, Image, Planet, Scene, Setting, frame, mapped, options, setting, timed_table
 
 PLANET = Planet(1e-6, 0.6, 54.0)
