@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -26,26 +26,12 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pyklip_diffrender.arrays import Gain, PupilOptic
 from pyklip_diffrender.detector import Detector
-from pyklip_diffrender.geometry import PupilGrid
-from pyklip_diffrender.planes import (
-    CompactOcculter,
-    EntrancePupil,
-    InternalAberration,
-    LyotStop,
-    Plane,
-    PupilStop,
-    Values,
-    Wavefront,
-)
-from pyklip_diffrender.propagation import MatrixFourier, tilt_phases
-from pyklip_diffrender.streaming import Branch, PupilStream, is_plain
+from pyklip_diffrender.planes import CompactOcculter, Wavefront
+from pyklip_diffrender.propagation import MatrixFourier
 from pyklip_diffrender.units import ARCSEC
 
-__all__ = ["LatticeRoute", "OcculterLattice", "is_pointwise"]
-
-_POINTWISE = (Gain, InternalAberration, LyotStop, PupilOptic, PupilStop)
+__all__ = ["DEFAULT_SAMPLING", "OcculterLattice", "finest_spacing"]
 
 DEFAULT_SAMPLING = 2.0
 """Cells per lambda/D, at least, where nobody asks for more: 4e-9 of the star's peak at 4.5 um."""
@@ -59,13 +45,6 @@ pupils use (0.87 D / lambda) and the one that aliases onto it are well to either
 
 _MARGIN = 4
 """Cells beyond the mask's edge that are kept of its band-limited form."""
-
-
-def is_pointwise(plane: Plane) -> bool:
-    """Whether a plane multiplies the field in the pupil, each sample by its own fixed factor."""
-    return isinstance(plane, _POINTWISE) and not (
-        isinstance(plane, PupilOptic) and plane.opd is not None
-    )
 
 
 @dataclass(frozen=True)
@@ -150,6 +129,23 @@ def _axes(
         for count, scale in zip(detector.shape[::-1], detector.pixelscale, strict=True)
     )
     return x, y
+
+
+def finest_spacing(
+    occulter: CompactOcculter, detector: Detector, wavelength: float, sampling: float
+) -> float:
+    """Of the cells that fit the detector, the smaller of the two, radians.
+
+    Parameters
+    ----------
+    occulter : CompactOcculter
+    detector : Detector
+    wavelength : float
+        m.
+    sampling : float
+        Cells per lambda/D, at least.
+    """
+    return min(axis.spacing for axis in _axes(occulter, detector, wavelength, sampling))
 
 
 class OcculterLattice:
@@ -252,163 +248,3 @@ class OcculterLattice:
         # (phase y, phase x, y, x) to (y, phase y, x, phase x)
         field = field.movedim((-4, -3), (-3, -1))
         return field.reshape(*light.shape[:-2], y.samples, x.samples)
-
-
-class LatticeRoute:
-    """The way through planes with one round occulter by `OcculterLattice`.
-
-    Parameters
-    ----------
-    planes : sequence of Plane
-        See `serves`.
-    detector : Detector
-    """
-
-    def __init__(self, planes: Sequence[Plane], detector: Detector) -> None:
-        self.planes, self.detector = tuple(planes), detector
-        (self._place,) = (k for k, p in enumerate(planes) if isinstance(p, CompactOcculter))
-        behind = planes[self._place + 1 :]
-        self._moving = {name for plane in behind for name in plane.parameters}
-        self._lattices: dict[float, OcculterLattice] = {}
-        self._stops: dict[float, Wavefront] = {}
-        self._kernels: dict[float, Tensor] = {}
-        self._branches: dict[float, list[Branch]] = {}
-        self._stream: PupilStream | None = None
-
-    @staticmethod
-    def serves(planes: Sequence[Plane]) -> bool:
-        """Whether there is one `CompactOcculter`, and nothing but factors in pupils."""
-        others = [plane for plane in planes if not isinstance(plane, CompactOcculter)]
-        return len(planes) - len(others) == 1 and all(is_pointwise(plane) for plane in others)
-
-    @property
-    def occulter(self) -> CompactOcculter:
-        """The occulter among the planes."""
-        plane = self.planes[self._place]
-        assert isinstance(plane, CompactOcculter)
-        return plane
-
-    @property
-    def sampling(self) -> float:
-        """Cells per lambda/D, at least."""
-        return self.occulter.sampling or DEFAULT_SAMPLING
-
-    def pays(self, wavelengths: Sequence[float]) -> bool:
-        """Whether the cells are not much finer than asked for, to fit a detector that is."""
-        for wavelength in wavelengths:
-            wanted = wavelength / self.occulter.diameter / self.sampling
-            axes = _axes(self.occulter, self.detector, wavelength, self.sampling)
-            if min(axis.spacing for axis in axes) < wanted / 2.5:
-                return False
-        return True
-
-    def lattice(self, wavelength: float) -> OcculterLattice:
-        """The cells at a wavelength."""
-        if wavelength not in self._lattices:
-            self._lattices[wavelength] = OcculterLattice(
-                self.occulter, self.detector, wavelength, self.sampling
-            )
-        return self._lattices[wavelength]
-
-    def _stop(self, onto: Sequence[PupilGrid], wavelength: float, values: Values) -> Wavefront:
-        """What the planes behind the occulter make of a field of ones.
-
-        A shift of the detector is a tilt there, so that the rest does not see it.
-        """
-        moves = not self._moving.isdisjoint(values)
-        stop = None if moves else self._stops.get(wavelength)
-        if stop is None:
-            grid = onto[self._place]
-            ones = torch.ones(
-                grid.shape, dtype=self.detector.dtype.to_complex(), device=self.detector.device
-            )
-            stop = Wavefront(ones, wavelength, grid)
-            for plane, window in zip(
-                self.planes[self._place + 1 :], onto[self._place + 1 :], strict=True
-            ):
-                stop = plane.apply(stop, values, window)
-            if not moves:
-                self._stops[wavelength] = stop
-        if "detector_shift" not in values:
-            return stop
-        x, y = values["detector_shift"].unbind(-1)
-        shift = torch.stack([x, y + self.detector.shear * x], dim=-1) * ARCSEC
-        factors = [
-            torch.polar(torch.ones_like(phase), phase).to(stop.field.dtype)
-            for phase in tilt_phases(shift, stop.grid, wavelength)
-        ]
-        return replace(stop, field=stop.field * factors[0][None, :] * factors[1][:, None])
-
-    def _kernel(self, stop: Wavefront, values: Values) -> Tensor:
-        moves = not {*self._moving, "detector_shift"}.isdisjoint(values)
-        kernel = None if moves else self._kernels.get(stop.wavelength)
-        if kernel is None:
-            kernel = self.lattice(stop.wavelength).kernel(stop, self.detector.axes({}))
-            if not moves:
-                self._kernels[stop.wavelength] = kernel
-        return kernel
-
-    def field(self, wavefront: Wavefront, values: Values, onto: Sequence[PupilGrid]) -> Tensor:
-        """Field on the detector's samples from that behind the entrance pupil.
-
-        Parameters
-        ----------
-        wavefront : Wavefront
-        values : mapping of str to Tensor
-        onto : sequence of PupilGrid
-            For every plane, the window to hand on (`OpticalSystem.windows`).
-        """
-        for plane, window in zip(self.planes[: self._place], onto, strict=False):
-            wavefront = plane.apply(wavefront, values, window)
-        lattice = self.lattice(wavefront.wavelength)
-        stop = self._stop(onto, wavefront.wavelength, values)
-        passed = wavefront.grid.crop(wavefront.field, stop.grid) * stop.field
-        direct = self.detector.field(replace(stop, field=passed), {})
-        light = lattice.focus(wavefront) * lattice.blocked
-        return direct - lattice.convolve(light, self._kernel(stop, values))
-
-    def star(
-        self,
-        entrance: EntrancePupil,
-        opd: Tensor,
-        wavelength: float,
-        values: Values,
-        onto: Sequence[PupilGrid],
-    ) -> Tensor | None:
-        """The same as `field`, for one star and without derivatives, in a third of the time.
-
-        Returns
-        -------
-        Tensor or None
-            None where derivatives, several stars or moving planes are asked for.
-        """
-        offset = values.get("star_offset")
-        if (
-            self._place > 0
-            or type(entrance) is not EntrancePupil
-            or opd.device.type != "cpu"
-            or opd.ndim > 2
-            or (offset is not None and offset.ndim > 1)
-            or not {*self._moving, "detector_shift"}.isdisjoint(values)
-            or not all(is_plain(t) for t in (opd, *values.values()))
-        ):
-            return None
-        lattice = self.lattice(wavelength)
-        with torch.no_grad():
-            stop = self._stop(onto, wavelength, values)
-            kernel = self._kernel(stop, values)
-            if self._stream is None:
-                self._stream = PupilStream(entrance.amplitude, entrance.grid)
-            if wavelength not in self._branches:
-                cells = lattice.x.positions, lattice.y.positions
-                self._branches[wavelength] = [
-                    Branch(grid, factor, *axes, wavelength, self.detector.dtype, lattice.shear)
-                    for grid, factor, axes in (
-                        (entrance.grid, None, cells),
-                        (stop.grid, stop.field, self.detector.axes(values)),
-                    )
-                ]
-            offset = None if offset is None else offset * ARCSEC
-            focus, direct = self._stream.images(opd, offset, wavelength, self._branches[wavelength])
-            light = focus * lattice.blocked
-            return self.detector.per_sample * direct - lattice.convolve(light, kernel)

@@ -16,12 +16,13 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from pyklip_diffrender.cells import LatticeRoute, OcculterLattice, is_pointwise
+from pyklip_diffrender.cells import OcculterLattice
 from pyklip_diffrender.detector import Detector
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.optics import OpticalSystem, Value
 from pyklip_diffrender.planes import CompactOcculter, Wavefront
 from pyklip_diffrender.propagation import MatrixFourier
+from pyklip_diffrender.route import LatticeRoute, is_pointwise
 from pyklip_diffrender.units import ARCSEC
 
 __all__ = ["PointSources"]

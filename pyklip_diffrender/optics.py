@@ -11,7 +11,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from pyklip_diffrender.cells import LatticeRoute
 from pyklip_diffrender.detector import Detector
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.geometry import PupilGrid
@@ -24,6 +23,7 @@ from pyklip_diffrender.planes import (
     Wavefront,
 )
 from pyklip_diffrender.psf_file import recipe_psf
+from pyklip_diffrender.route import LatticeRoute
 from pyklip_diffrender.spectrum import Bandpass
 from pyklip_diffrender.units import (
     require_finite,

@@ -1,4 +1,4 @@
-"""From the pupil to images in blocks of rows, where no derivatives are asked for.
+"""From the pupil to images in blocks of rows, and the derivative in reverse mode the way back.
 
 A megapixel field and the arrays on the way to it do not fit into a processor's cache, and making
 room for them takes longer than filling them. Here the field exists for some rows at a time, and
@@ -10,7 +10,7 @@ take half-size products with cosines and sines.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -20,21 +20,27 @@ from torch.autograd.forward_ad import unpack_dual
 from pyklip_diffrender.geometry import PupilGrid
 from pyklip_diffrender.propagation import RowTransform, centred, kernel, symmetric, tilt_phases
 
-__all__ = ["Branch", "PupilStream", "is_plain"]
+__all__ = ["Branch", "PupilStream", "has_memory", "is_plain"]
 
 _ROWS = 128
 """Rows of a block, for each thread: about 2 MB an array for 1024 samples across the pupil."""
 
 
-def is_plain(tensor: Tensor) -> bool:
-    """Whether a tensor takes part in no differentiation and in no transform of `torch.func`."""
-    if tensor.requires_grad and torch.is_grad_enabled():
-        return False
+def has_memory(tensor: Tensor) -> bool:
+    """Whether a tensor is itself, and takes part in no transform of `torch.func`.
+
+    Those of reverse mode by `backward` or `torch.autograd.grad` do, whether they need it or not.
+    """
     try:
         tensor.data_ptr()
     except RuntimeError:
         return False  # It stands for others, and has no memory of its own.
     return unpack_dual(tensor).tangent is None
+
+
+def is_plain(tensor: Tensor) -> bool:
+    """Whether a tensor takes part in no differentiation at all."""
+    return has_memory(tensor) and not (tensor.requires_grad and torch.is_grad_enabled())
 
 
 def _sides(array: Tensor) -> Tensor:
@@ -113,6 +119,11 @@ class Branch:
             self._turn = turn.contiguous().to(complex_type)
         self.scale = window.spacing**2 / self.wavelength
 
+    def room(self, dtype: torch.dtype) -> Tensor:
+        """Zeros for the products along x: (even and odd, k, real and imaginary, rows)."""
+        shape = 2, len(self.products[0]), 2, self.grid.shape[0]
+        return torch.zeros(shape, dtype=dtype, device=self.x.device)
+
     def finish(self, along_x: Tensor) -> Tensor:
         """The image (y, x) from products of shape (even and odd, k, real and imaginary, rows)."""
         even = torch.complex(along_x[0, :, 0], along_x[0, :, 1]).mT
@@ -141,10 +152,15 @@ class PupilStream:
         self._amplitude = _sides(grid.crop(amplitude, self.grid))
         self._reach = _reach(self._amplitude != 0)
 
-    def images(
-        self, opd: Tensor, offset: Tensor | None, wavelength: float, branches: Sequence[Branch]
+    @property
+    def dtype(self) -> torch.dtype:
+        """Real type of the computation."""
+        return self._amplitude.dtype
+
+    def products(
+        self, opd: Tensor, offset: Tensor | None, branches: Sequence[Branch]
     ) -> list[Tensor]:
-        """Images of the field times the factor of each branch.
+        """The field times the factor of each branch, after the product along x.
 
         Parameters
         ----------
@@ -152,33 +168,87 @@ class PupilStream:
             m; see `EntrancePupil.field`.
         offset : Tensor, (2,), or None
             Of the source, radians.
-        wavelength : float
-            m.
         branches : sequence of Branch
-            At that wavelength.
+            All at one wavelength.
+
+        Returns
+        -------
+        list of Tensor, (even and odd, k, real and imaginary, rows)
+            What `Branch.finish` takes.
         """
-        device, dtype = self._amplitude.device, self._amplitude.dtype
-        half = self._amplitude.shape[-1]
+        found = [branch.room(self.dtype) for branch in branches]
+        for rows, field, room in self._blocks(opd, offset, branches[0].wavelength):
+            for branch, product in zip(branches, found, strict=True):
+                self._along_x(field, rows, branch, product, room)
+        return found
+
+    def slopes(
+        self,
+        opd: Tensor,
+        offset: Tensor | None,
+        branches: Sequence[Branch],
+        along_x: Sequence[Tensor],
+    ) -> tuple[Tensor, Tensor | None]:
+        """Derivatives of a real number with respect to the OPD and the offset.
+
+        Parameters
+        ----------
+        opd, offset, branches
+            See `products`; the OPD is real.
+        along_x : sequence of Tensor
+            Its derivative with respect to what `products` gives.
+
+        Returns
+        -------
+        Tensor, (npix, npix)
+            Per m.
+        Tensor, (2,), or None
+            Per radian.
+        """
+        wavelength = branches[0].wavelength
+        by_phase = torch.zeros(opd.shape, dtype=self.dtype, device=opd.device)
+        window = PupilGrid.full(self.grid.npix, self.grid.diameter).crop(by_phase, self.grid)
+        middle = self.grid.shape[1] // 2
+        for rows, field, room in self._blocks(opd, offset, wavelength):
+            count, width = field.shape[-2:]
+            back = _part(room[:2].view(-1), 2, 2, count, width).zero_()
+            for branch, slope in zip(branches, along_x, strict=True):
+                self._back_along_x(back, rows, branch, slope, room[2:])
+            # d(field) = i field d(phase)
+            right, left = back[1].mul_(field[0]).addcmul_(back[0], field[1], value=-1)
+            window[rows, middle : middle + width] += right
+            before = self.grid.shape[1] - middle
+            window[rows, before - width : before] += left.flip(-1)
+        by_offset = None
+        if offset is not None:
+            turns = 2 * math.pi / wavelength
+            x, y = (axis.to(opd.device) for axis in (self.grid.x, self.grid.y))
+            by_offset = torch.stack(
+                [
+                    -turns * (window.sum(dim=0).to(x.dtype) @ x),
+                    turns * (window.sum(dim=1).to(y.dtype) @ y),
+                ]
+            )
+        return by_phase.mul_(2 * math.pi / wavelength), by_offset
+
+    def _blocks(
+        self, opd: Tensor, offset: Tensor | None, wavelength: float
+    ) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Rows, the field on them (real and imaginary, sides, rows, width), room for work."""
         opd = PupilGrid.full(self.grid.npix, self.grid.diameter).crop(opd, self.grid)
         tilt = None
         if offset is not None:
             x, y = tilt_phases(offset, self.grid, wavelength)
-            tilt = _sides(x[None, :]).to(dtype), y[:, None].to(dtype)
-        products = [
-            torch.zeros(2, len(b.products[0]), 2, b.grid.shape[0], dtype=dtype, device=device)
-            for b in branches
-        ]
+            tilt = _sides(x[None, :]).to(self.dtype), y[:, None].to(self.dtype)
         block = min(_ROWS * torch.get_num_threads(), len(self._reach))
-        room = torch.empty(8, 2 * block * half, dtype=dtype, device=device)
+        size = 2 * block * self._amplitude.shape[-1]
+        room = torch.empty(8, size, dtype=self.dtype, device=self._amplitude.device)
         for start in range(0, len(self._reach), block):
             rows = slice(start, min(start + block, len(self._reach)))
             width = max(self._reach[rows])
-            if not width:
-                continue
-            field = self._block(opd, 2 * math.pi / wavelength, tilt, rows, width, room)
-            for branch, product in zip(branches, products, strict=True):
-                self._along_x(field, rows, branch, product, room[3:])
-        return [b.finish(p) for b, p in zip(branches, products, strict=True)]
+            if width:
+                wavenumber = 2 * math.pi / wavelength
+                yield rows, self._block(opd, wavenumber, tilt, rows, width, room), room[3:]
 
     def _block(
         self,
@@ -215,16 +285,12 @@ class PupilStream:
         self, field: Tensor, rows: slice, branch: Branch, product: Tensor, room: Tensor
     ) -> None:
         """Put the product along x of a branch, on some rows, into `product`."""
-        first = self.grid.rows[0] - branch.grid.rows[0]  # Row 0 of this grid in the branch's.
-        top, stop = max(rows.start + first, 0), min(rows.stop + first, branch.grid.shape[0])
-        if top >= stop:
+        part = self._overlap(rows, branch, field.shape[-1])
+        if part is None:
             return
-        width = field.shape[-1]
-        here = field[:, :, top - rows.start - first : stop - rows.start - first]
+        inside, top, stop, width = part
+        here = field[:, :, inside]
         if branch.parts is not None:
-            width = min(width, max(branch.reach[top:stop]))
-            if not width:
-                return
             factor = branch.parts[:, :, top:stop, :width]
             passed = _part(room[:2].view(-1), 2, 2, stop - top, width)
             real, imaginary = here[0, ..., :width], here[1, ..., :width]
@@ -237,3 +303,56 @@ class PupilStream:
             # In this order: a product of few columns takes twice as long as one of few rows.
             found = branch.products[k][:, :width] @ folded.view(-1, width).T
             product[k, :, :, top:stop] = found.view(-1, 2, stop - top)
+
+    def _overlap(
+        self, rows: slice, branch: Branch, width: int
+    ) -> tuple[slice, int, int, int] | None:
+        """Which of some rows a branch has, its first and last of them, and how wide they are."""
+        first = self.grid.rows[0] - branch.grid.rows[0]  # Row 0 of this grid in the branch's.
+        top, stop = max(rows.start + first, 0), min(rows.stop + first, branch.grid.shape[0])
+        if top >= stop:
+            return None
+        if branch.parts is not None:
+            width = min(width, max(branch.reach[top:stop]))
+        if not width:
+            return None
+        start = rows.start + first
+        return slice(top - start, stop - start), top, stop, width
+
+    def _back_along_x(
+        self, back: Tensor, rows: slice, branch: Branch, slope: Tensor, room: Tensor
+    ) -> None:
+        """Add the derivative with respect to the field on some rows to `back`.
+
+        Parameters
+        ----------
+        back : Tensor, (real and imaginary, sides, rows, width)
+        rows : slice
+        branch : Branch
+        slope : Tensor, (even and odd, k, real and imaginary, rows)
+            With respect to the products along x.
+        room : Tensor
+        """
+        part = self._overlap(rows, branch, back.shape[-1])
+        if part is None:
+            return
+        inside, top, stop, width = part
+        even, odd = (
+            torch.mm(
+                slope[k, :, :, top:stop].flatten(1).T,
+                branch.products[k][:, :width],
+                out=_part(room[k], 2 * (stop - top), width),
+            ).view(2, stop - top, width)
+            for k in range(2)
+        )
+        here = back[:, :, inside, :width]
+        if branch.parts is None:
+            here[:, 0].add_(even).add_(odd)
+            here[:, 1].add_(even).sub_(odd)
+            return
+        factor = branch.parts[:, :, top:stop, :width]
+        for side, combine in enumerate((torch.add, torch.sub)):
+            real, imaginary = combine(even, odd, out=_part(room[2], 2, stop - top, width))
+            here[0, side].addcmul_(real, factor[0, side]).addcmul_(imaginary, factor[1, side])
+            here[1, side].addcmul_(imaginary, factor[0, side])
+            here[1, side].addcmul_(real, factor[1, side], value=-1)

@@ -154,6 +154,10 @@ def options(description: str) -> argparse.ArgumentParser:
     return parser
 
 
+_JOBS_OF_A_PROCESS = 20
+"""Then it makes room for another one, for the memory of a long-lived one is in fragments."""
+
+
 def _one_thread() -> None:
     torch.set_num_threads(1)
 
@@ -162,7 +166,10 @@ def mapped(work: Callable[..., Table], jobs: list[tuple[Any, ...]], processes: i
     """Run jobs, in processes of one thread each, and stack their tables in order."""
     if processes == 1:
         return vstack([work(*job) for job in jobs], metadata_conflicts="silent")
-    with ProcessPoolExecutor(processes, get_context("spawn"), _one_thread) as pool:
+    pool = ProcessPoolExecutor(
+        processes, get_context("spawn"), _one_thread, max_tasks_per_child=_JOBS_OF_A_PROCESS
+    )
+    with pool:
         tables = list(pool.map(work, *zip(*jobs, strict=True)))
     return vstack(tables, metadata_conflicts="silent")
 
