@@ -207,9 +207,9 @@ def refinement(here: Setting) -> list[Case]:
         Case(
             REFINEMENT,
             "this package, the wavefront alone, 20 cycles",
-            lambda: partial(_fit, here, free=(), start=known, basis=lean, tolerance=0.01),
+            lambda: partial(_fit, here, free=(), start=known, basis=lean, tolerance=0.1),
             judge,
-            note="fewer modes, and a tolerance of 0.01",
+            note="fewer modes, and a tolerance of 0.1",
         ),
         Case(
             REFINEMENT,
