@@ -206,9 +206,12 @@ class PupilStream:
             Per radian.
         """
         wavelength = branches[0].wavelength
-        by_phase = torch.zeros(opd.shape, dtype=self.dtype, device=opd.device)
-        window = PupilGrid.full(self.grid.npix, self.grid.diameter).crop(by_phase, self.grid)
+        # Of the phase, 2 pi / lambda times the OPD; put here, where arrays are small.
+        along_x = [slope * (2 * math.pi / wavelength) for slope in along_x]
+        by_opd = torch.zeros(opd.shape, dtype=self.dtype, device=opd.device)
+        window = PupilGrid.full(self.grid.npix, self.grid.diameter).crop(by_opd, self.grid)
         middle = self.grid.shape[1] // 2
+        before = self.grid.shape[1] - middle
         for rows, field, room in self._blocks(opd, offset, wavelength):
             count, width = field.shape[-2:]
             back = _part(room[:2].view(-1), 2, 2, count, width).zero_()
@@ -216,20 +219,17 @@ class PupilStream:
                 self._back_along_x(back, rows, branch, slope, room[2:])
             # d(field) = i field d(phase)
             right, left = back[1].mul_(field[0]).addcmul_(back[0], field[1], value=-1)
-            window[rows, middle : middle + width] += right
-            before = self.grid.shape[1] - middle
+            window[rows, middle : middle + width] = right
+            # Added, for of an odd number of columns the middle one is on both sides.
             window[rows, before - width : before] += left.flip(-1)
         by_offset = None
         if offset is not None:
-            turns = 2 * math.pi / wavelength
+            # A tilt in OPD: by -x of the pupil for the source's x, by y for its y.
             x, y = (axis.to(opd.device) for axis in (self.grid.x, self.grid.y))
             by_offset = torch.stack(
-                [
-                    -turns * (window.sum(dim=0).to(x.dtype) @ x),
-                    turns * (window.sum(dim=1).to(y.dtype) @ y),
-                ]
+                [-(window.sum(dim=0).to(x.dtype) @ x), window.sum(dim=1).to(y.dtype) @ y]
             )
-        return by_phase.mul_(2 * math.pi / wavelength), by_offset
+        return by_opd, by_offset
 
     def _blocks(
         self, opd: Tensor, offset: Tensor | None, wavelength: float

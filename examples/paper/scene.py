@@ -154,8 +154,8 @@ def options(description: str) -> argparse.ArgumentParser:
     return parser
 
 
-_JOBS_OF_A_PROCESS = 20
-"""Then it makes room for another one, for the memory of a long-lived one is in fragments."""
+_JOBS_OF_A_POOL = 20
+"""For each process; then come new ones, for the memory of a long-lived one is in fragments."""
 
 
 def _one_thread() -> None:
@@ -166,11 +166,11 @@ def mapped(work: Callable[..., Table], jobs: list[tuple[Any, ...]], processes: i
     """Run jobs, in processes of one thread each, and stack their tables in order."""
     if processes == 1:
         return vstack([work(*job) for job in jobs], metadata_conflicts="silent")
-    pool = ProcessPoolExecutor(
-        processes, get_context("spawn"), _one_thread, max_tasks_per_child=_JOBS_OF_A_PROCESS
-    )
-    with pool:
-        tables = list(pool.map(work, *zip(*jobs, strict=True)))
+    tables: list[Table] = []
+    for start in range(0, len(jobs), _JOBS_OF_A_POOL * processes):
+        some = jobs[start : start + _JOBS_OF_A_POOL * processes]
+        with ProcessPoolExecutor(processes, get_context("spawn"), _one_thread) as pool:
+            tables += pool.map(work, *zip(*some, strict=True))
     return vstack(tables, metadata_conflicts="silent")
 
 
