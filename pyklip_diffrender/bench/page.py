@@ -94,7 +94,7 @@ def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> list[str]:
     return ["| " + " | ".join(line) + " |" for line in lines] + [""]
 
 
-def page(table: Table, figure: str = "results/performance.png") -> str:
+def page(table: Table, figure: str = "results/performance.png", notes: str = "") -> str:
     """The page, in Markdown.
 
     Parameters
@@ -103,6 +103,8 @@ def page(table: Table, figure: str = "results/performance.png") -> str:
         What `run_bench` gave.
     figure : str
         Where the Pareto plot is, from the page.
+    notes : str
+        What is to be said about these numbers, in Markdown.
     """
     meta = table.meta
     lines = [
@@ -130,6 +132,7 @@ def page(table: Table, figure: str = "results/performance.png") -> str:
         "## What was asked for",
         "",
         *_table(("", "times faster", "found", "error", "at most", "met"), targets(table)),
+        *([notes.strip(), ""] if notes else []),
     ]
     for name in dict.fromkeys(str(row) for row in table["row"]):
         if not name.startswith("scaling"):
@@ -228,7 +231,12 @@ def _limits(limits: list[dict[str, Any]]) -> list[str]:
 
 
 def write_page(table: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Path:
-    """Write performance.md into a folder, from a table in a file; returns the path."""
+    """Write performance.md into a folder, from a table in a file; returns the path.
+
+    Notes in a file beside it, NAME_notes.md for NAME.ecsv, go onto the page.
+    """
+    remarks = Path(table).with_name(f"{Path(table).stem}_notes.md")
+    notes = remarks.read_text(encoding="utf-8") if remarks.is_file() else ""
     found = Table.read(table, format="ascii.ecsv")
     path = Path(folder) / "performance.md"
     try:
@@ -236,5 +244,5 @@ def write_page(table: str | os.PathLike[str], folder: str | os.PathLike[str]) ->
     except ValueError:
         figure = Path("results/performance.png")
     with replacing(path) as temporary:
-        Path(temporary).write_text(page(found, figure.as_posix()), encoding="utf-8")
+        Path(temporary).write_text(page(found, figure.as_posix(), notes), encoding="utf-8")
     return path
