@@ -9,14 +9,12 @@ A study that has not been run has no section.
 from __future__ import annotations
 
 import argparse
-import math
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from astropy.table import Table
 from matplotlib.figure import Figure
 
@@ -28,10 +26,9 @@ import klip_table
 import location
 import misalignment
 import progress
-import published
 import snr_grid
-from judging import chosen, spread
-from pages import KINDS, RESULTS
+from overview import in_short, sentences, where_others_lead
+from pages import RESULTS, preferred
 from pictures import beside, read_images
 from sections import (
     Lines,
@@ -74,69 +71,10 @@ STUDIES = (
 TITLES = {study.name: study.title for study in STUDIES}
 
 
-def read(results: Path, name: str) -> tuple[Table, Path, str] | None:
-    """A study's table: on the measured maps if there is one."""
-    for kind, label in KINDS.items():
-        path = results / f"{name}_{kind}.ecsv"
-        if path.is_file():
-            return Table.read(path, format="ascii.ecsv"), path, label
-    return None
-
-
 def said(module: Any) -> str:
     """The script's own account of itself: its docstring after title and command."""
     parts = str(module.__doc__).strip().split("\n\n")
     return "\n\n".join(parts[2:])
-
-
-def sentences(results: Path) -> Lines:
-    """The result, in three sentences."""
-    found: Lines = []
-    planets, curves = read(results, "klip_table"), read(results, "contrast_boundary")
-    if planets:
-        table = planets[0]
-        won = chosen(table, method="marginalised")
-        share = [
-            spread(part["matched_snr"] / part["photon_snr"])[0]
-            for part in _cases(won, ("separation", "contrast"))
-        ]
-        flux = [spread(part["throughput"])[0] for part in _cases(won, ("separation", "contrast"))]
-        found.append(
-            "Over the planets of the paper's comparison with KLIP, the marginalised estimate has "
-            f"{min(share):.2f} to {max(share):.2f} of the S/N of a matched filter that knows the "
-            f"star, and {min(flux):.2f} to {max(flux):.2f} of the planets' light."
-        )
-    if curves:
-        table = curves[0]
-        gain, below, of = [], [], 0
-        for k, separation in enumerate(published.SEPARATIONS):
-            part = chosen(table, separation=separation)
-            if not len(part) or not 0.3 <= separation <= 2.2:
-                continue
-            ours = spread(chosen(part, method="marginalised")["contrast"])[0]
-            gain.append(spread(chosen(part, method="KLIP")["contrast"])[0] / ours)
-            limits = (published.BOUNDARY["theirs"][k], published.BOUNDARY["noise limit"][k])
-            below.append([ours < limit for limit in limits])
-            of += 1
-        curve, limit = np.sum(below, axis=0)
-        found.append(
-            f"Its 5-sigma contrast from 0.3 to 2.2 arcsec is {min(gain):.0f} to {max(gain):.0f} "
-            f"times lower than KLIP's; it is below the paper's published curve at {curve} of {of} "
-            f"separations, and below the paper's published noise limit at {limit}."
-        )
-    if planets:
-        errors = {
-            name: spread(chosen(planets[0], method=name)["star_error"])[0]
-            for name in ("Gauss-Newton", "Adam", "KLIP", "KLIP, library")
-        }
-        text = ", ".join(f"{n} {e:.2f}" for n, e in errors.items() if math.isfinite(e))
-        found.append(f"Median error of the subtracted star, in units of the noise: {text}.")
-    return [" ".join(found), ""]
-
-
-def _cases(table: Table, keys: tuple[str, ...]) -> Iterable[Table]:
-    for setting in dict.fromkeys(tuple(row[key] for key in keys) for row in table):
-        yield chosen(table, **dict(zip(keys, setting, strict=True)))
 
 
 LIMITS = """\
@@ -145,7 +83,9 @@ LIMITS = """\
 - The annulus SNR is no significance. Light of the planet outside its aperture counts as noise, so
   that it saturates near 30 and faint remains of the star may raise it; it knows nothing of lost
   light. The matched filter's S/N of a subtracted frame takes the scatter on the planet's ring, not
-  below the photon noise; at 0.2 arcsec there are too few places on the ring.
+  below the photon noise; at 0.2 arcsec there are too few places on the ring. The photon limit
+  counts the planet's own photons as noise, the ring does not: a bright planet that is subtracted
+  well comes out above it.
 - The paper's recipe is given the star's flux, its position and the alignment; Gauss-Newton and the
   marginalised estimate find them. Its steps are taken on 256 instead of 1024 pupil samples, which
   changed the star-model error of one frame by 0.2 %.
@@ -168,12 +108,14 @@ def write(results: Path, docs: Path) -> Path:
         "![Contrast against separation](images/paper_contrast_boundary.png)",
         "",
         *sentences(results),
+        *in_short(results),
+        *where_others_lead(results),
         "## Limits",
         "",
         LIMITS,
     ]
     for study in STUDIES:
-        found = read(results, study.name)
+        found = preferred(results, study.name)
         if found is None:
             continue
         table, path, label = found

@@ -42,3 +42,12 @@ def origin(found: dict[str, Table]) -> list[str]:
         f"{table.meta['seconds'] / 60:.0f} min ({table.meta['machine']})."
         for kind, table in found.items()
     ] + [""]
+
+
+def preferred(results: Path, name: str) -> tuple[Table, Path, str] | None:
+    """A study's table: on the measured maps if there is one."""
+    for kind, label in KINDS.items():
+        path = results / f"{name}_{kind}.ecsv"
+        if path.is_file():
+            return Table.read(path, format="ascii.ecsv"), path, label
+    return None

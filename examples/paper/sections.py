@@ -44,7 +44,8 @@ def about_boundary(table: Table) -> Lines:
         cells = [shown(chosen(part, method=name)["contrast"], ".2g") for name in names]
         theirs = dict(zip(published.SEPARATIONS, published.BOUNDARY["theirs"], strict=True))
         rows.append([f"{separation:g}", *cells, f"{theirs[round(float(separation), 3)]:.2g}"])
-    kept = grid(table, ("separation",), {"throughput": "Planet's light kept"}, ".2f")
+    ordered = table[np.argsort(table["separation"], kind="stable")]
+    kept = grid(ordered, ("separation",), {"throughput": "Planet's light kept"}, ".2f")
     return [*markdown(("arcsec", *names, "published, theirs"), rows), *kept]
 
 

@@ -1,0 +1,141 @@
+"""The top of the page on the paper's experiments: three sentences, a table, the exceptions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import published
+from astropy.table import Table
+from judging import chosen, methods_in, spread
+from pages import markdown, preferred
+from sections import Lines
+
+__all__ = ["in_short", "sentences", "where_others_lead"]
+
+NEAR, FAR = 0.6, 1.6
+"""Separations whose contrasts the table shows, arcsec."""
+
+
+def sentences(results: Path) -> Lines:
+    """The result, in three sentences."""
+    found: Lines = []
+    planets, curves = preferred(results, "klip_table"), preferred(results, "contrast_boundary")
+    if planets:
+        table = planets[0]
+        won = chosen(table, method="marginalised")
+        share = [
+            spread(part["matched_snr"] / part["photon_snr"])[0]
+            for part in _cases(won, ("separation", "contrast"))
+        ]
+        flux = [spread(part["throughput"])[0] for part in _cases(won, ("separation", "contrast"))]
+        found.append(
+            "Over the planets of the paper's comparison with KLIP, the marginalised estimate has "
+            f"{min(share):.2f} to {max(share):.2f} of the S/N of a matched filter that knows the "
+            f"star, and {min(flux):.2f} to {max(flux):.2f} of the planets' light."
+        )
+    if curves:
+        table = curves[0]
+        gain, below, of = [], [], 0
+        for k, separation in enumerate(published.SEPARATIONS):
+            part = chosen(table, separation=separation)
+            if not len(part) or not 0.3 <= separation <= 2.2:
+                continue
+            ours = spread(chosen(part, method="marginalised")["contrast"])[0]
+            gain.append(spread(chosen(part, method="KLIP")["contrast"])[0] / ours)
+            limits = (published.BOUNDARY["theirs"][k], published.BOUNDARY["noise limit"][k])
+            below.append([ours < limit for limit in limits])
+            of += 1
+        curve, limit = np.sum(below, axis=0)
+        found.append(
+            f"Its 5-sigma contrast from 0.3 to 2.2 arcsec is {min(gain):.0f} to {max(gain):.0f} "
+            f"times lower than KLIP's; it is below the paper's published curve at {curve} of {of} "
+            f"separations, and below the paper's published noise limit at {limit}."
+        )
+    if planets:
+        errors = {
+            name: spread(chosen(planets[0], method=name)["star_error"])[0]
+            for name in ("Gauss-Newton", "Adam", "KLIP", "KLIP, library")
+        }
+        text = ", ".join(f"{n} {e:.2f}" for n, e in errors.items() if math.isfinite(e))
+        found.append(f"Median error of the subtracted star, in units of the noise: {text}.")
+    return [" ".join(found), ""]
+
+
+def _cases(table: Table, keys: tuple[str, ...]) -> Iterable[Table]:
+    for setting in dict.fromkeys(tuple(row[key] for key in keys) for row in table):
+        yield chosen(table, **dict(zip(keys, setting, strict=True)))
+
+
+def in_short(results: Path) -> Lines:
+    """One row a method: medians over the six planets, and the contrast at two separations."""
+    planets, curves = preferred(results, "klip_table"), preferred(results, "contrast_boundary")
+    if not planets or not curves:
+        return []
+    rows = []
+    for method in methods_in(planets[0]):
+        part = chosen(planets[0], method=method)
+        line = chosen(curves[0], method=method)
+        # The library was given in the first study only.
+        contrasts = [
+            spread(chosen(line, separation=separation)["contrast"])[0] if len(line) else math.nan
+            for separation in (NEAR, FAR)
+        ]
+        cells = [
+            (spread(part["annulus_snr"])[0], ".1f"),
+            (spread(part["matched_snr"] / part["photon_snr"])[0], ".2f"),
+            (spread(part["throughput"])[0], ".2f"),
+            (spread(part["star_error"])[0], ".2f"),
+            *((contrast, ".2g") for contrast in contrasts),
+        ]
+        rows.append([method, *("" if math.isnan(v) else f"{v:{form}}" for v, form in cells)])
+    header = (
+        "method", "annulus SNR", "matched-filter S/N / photon limit", "planet's light kept",
+        "star error, sigma", f'5-sigma contrast at {NEAR}"', f'at {FAR}"',
+    )  # fmt: skip
+    return [
+        "Medians over the six planets of the comparison with KLIP, and over noise:",
+        "",
+        *markdown(header, rows),
+    ]
+
+
+def where_others_lead(results: Path) -> Lines:
+    """Rows in which KLIP or Adam is ahead of Gauss-Newton by the medians."""
+    found = []
+    planets, curves = preferred(results, "klip_table"), preferred(results, "contrast_boundary")
+    if planets:
+        for part in _cases(planets[0], ("separation", "contrast")):
+            where = f'{part["separation"][0]:g}", {part["contrast"][0]:g}'
+            found += _ahead(part, "annulus_snr", where, "annulus SNR", larger=True)
+            found += _ahead(part, "star_error", where, "star error", larger=False)
+    if curves:
+        for part in _cases(curves[0], ("separation",)):
+            where = f'{part["separation"][0]:g}"'
+            found += _ahead(part, "contrast", where, "contrast", larger=False)
+    if not planets and not curves:
+        return []
+    if not found:
+        return ["No other method is ahead of Gauss-Newton in any row of these two studies.", ""]
+    return [
+        "Where another method's median is ahead of Gauss-Newton's (in these two studies): "
+        + "; ".join(found)
+        + ".",
+        "",
+    ]
+
+
+def _ahead(part: Table, column: str, where: str, what: str, *, larger: bool) -> Lines:
+    sign = 1 if larger else -1
+    ours = spread(chosen(part, method="Gauss-Newton")[column])
+    words = []
+    for method in ("KLIP", "KLIP, library", "Adam"):
+        theirs = spread(chosen(part, method=method)[column])
+        if sign * theirs[0] > sign * ours[0]:
+            words.append(
+                f"{where}: {what} {theirs[0]:.3g} ({method}) against {ours[0]:.3g} "
+                f"({ours[1]:.3g} to {ours[2]:.3g})"
+            )
+    return words
