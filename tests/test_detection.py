@@ -225,6 +225,20 @@ def test_measuring_at_a_pixel_gives_the_maps_value(one: Detection) -> None:
     assert float(table["contrast_error"][0]) == pytest.approx(one.error[row, column], rel=1e-4)
 
 
+def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world: World) -> None:
+    """A contrast is relative to the star's light; whether there is a source at all is not."""
+    fit = world.fitted(14, Planet(1e-5, 0.7, 60.0))
+    row = dr.measure(fit, [WHERE.offset])[0]
+    flux = fit.values["flux"]
+    assert 0 < fit.errors["flux"][0] < 0.05 * flux[0]
+    for relative in (0.0, 0.1):
+        known = replace(fit, errors={**fit.errors, "flux": relative * flux})
+        other = dr.measure(known, [WHERE.offset])[0]
+        assert other["snr"] == pytest.approx(row["snr"])
+        expected = other["contrast"] * math.hypot(relative, 1 / other["snr"])
+        assert other["contrast_error"] == pytest.approx(expected, rel=1e-6)
+
+
 def test_two_planets_closer_than_a_beam_are_fitted_together(world: World) -> None:
     pair = (Planet(1.5e-4, 0.80, 60.0), Planet(1e-4, 0.80, 51.0))
     found = dr.detect(world.fitted(12, *pair))

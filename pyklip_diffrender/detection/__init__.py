@@ -144,7 +144,7 @@ def measure(
     Returns
     -------
     QTable
-        x, y, contrast, contrast_error, snr.
+        x, y, contrast, contrast_error (with that of the star's flux), snr (without it).
 
     Raises
     ------

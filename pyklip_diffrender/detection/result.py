@@ -54,10 +54,23 @@ def amplitudes(
             "x": places[:, 0].numpy() * u.arcsec,
             "y": places[:, 1].numpy() * u.arcsec,
             "contrast": contrast,
-            "contrast_error": error,
+            "contrast_error": np.hypot(error, contrast * star_flux_error(groups)),
             "snr": contrast / error,
         }
     )
+
+
+def star_flux_error(groups: Sequence[tuple[LinearModel, Templates]]) -> float:
+    """Relative error of the light that contrasts are relative to; of several frames, of the mean.
+
+    It is integrated out of a source's amplitude as all else is; but a contrast is the source's
+    light over the star's. It does not make a source more or less significant.
+    """
+    fits = [fit for _, templates in groups for fit in templates.fits]
+    relative = [
+        float(fit.errors["flux"][0] / fit.values["flux"][0]) for fit in fits if "flux" in fit.errors
+    ]
+    return float(np.sqrt(np.nansum(np.square(relative)))) / len(fits)
 
 
 def _amplitude(linear: LinearModel, frame: int, shape: torch.Tensor) -> tuple[float, float]:
@@ -124,7 +137,8 @@ class Detection:
         """The candidates, brightest in S/N first.
 
         x, y, separation and position angle (counter-clockwise from +y of the image), contrast,
-        their errors, and S/N.
+        their errors, and S/N. The error of the contrast knows of that of the star's flux; S/N,
+        which asks whether there is a source at all, does not.
         """
         found = self.candidates
         x, y = found.offsets.T.numpy()
@@ -155,7 +169,7 @@ class Detection:
                 "position_angle": np.rad2deg(np.arctan2(-x, y)) % 360 * u.deg,
                 "position_angle_error": np.rad2deg(angular) * u.deg,
                 "contrast": contrast,
-                "contrast_error": errors[:, 0],
+                "contrast_error": np.hypot(errors[:, 0], contrast * star_flux_error(self.groups)),
                 "snr": contrast / errors[:, 0] if count else np.zeros(0),
             }
         )
@@ -175,7 +189,8 @@ class Detection:
         Returns
         -------
         QTable
-            x, y, contrast, contrast_error, snr. The other candidates stay in the data.
+            x, y, contrast, contrast_error, snr; errors as in `table`. The other candidates stay
+            in the data.
         """
         return amplitudes(self.groups, offsets, self.scatter)
 
