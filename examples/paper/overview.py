@@ -138,7 +138,7 @@ def where_others_lead(results: Path) -> Lines:
         "",
         *(f"- {words}" for words in found),
         "",
-        "Why: a closer fit takes more of a faint planet for wavefront (see the light that is kept); "
+        "Why: a closer fit takes more of a faint planet for wavefront (see the light kept); "
         "Adam, stopped after its 1000 steps, has not got as far, with the planet as with the star. "
         "The marginalised estimate knows what is taken.",
         "",
