@@ -38,8 +38,8 @@ COLUMNS = {
 """Of each study's table, those that must be finite in all rows."""
 
 NO_SCRIPTS = {
-    "experiments", "inference_figure", "judging", "methods", "pages", "pictures", "published",
-    "scene", "sections", "summary",
+    "experiments", "inference_figure", "judging", "methods", "overview", "pages", "pictures",
+    "published", "scene", "sections", "summary",
 }  # fmt: skip
 
 # torch 2.13 loads its own scripted functions at the first forward-mode derivative.
