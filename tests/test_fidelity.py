@@ -290,9 +290,11 @@ def test_a_faint_star_is_several_times_cheaper_and_inside_the_budget() -> None:
 
 
 def test_plans_of_the_same_seed_are_the_same() -> None:
-    again = plan(model(), frame(), before(), **SETTINGS)
-    assert again.choice == faint_plan().choice
-    assert again.verified_error == faint_plan().verified_error
+    """But for rounding, which changes with where arrays come to lie in memory."""
+    again, first = plan(model(), frame(), before(), **SETTINGS), faint_plan()
+    assert again.choice == first.choice
+    assert again.verified_error.rms == pytest.approx(first.verified_error.rms, rel=1e-9)
+    assert again.verified_error.worst == pytest.approx(first.verified_error.worst, rel=1e-9)
 
 
 def test_a_plan_explains_itself() -> None:
