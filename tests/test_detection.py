@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -284,6 +285,23 @@ def test_a_planet_on_the_edge_of_the_field_is_measured(world: World) -> None:
     planet = Planet(1e-4, 1.2, 90.0)
     table = dr.measure(world.fitted(14, planet), [planet.offset])
     assert abs(float(table["contrast"][0]) - 1e-4) < 4 * float(table["contrast_error"][0])
+
+
+def test_a_fit_that_is_gone_holds_no_memory(world: World) -> None:
+    """Its responses are its largest part; the collector would come for them much too late."""
+    dr.detect(world.fitted(14))  # torch keeps some of its first derivative.
+    gc.collect()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        dr.detect(world.fitted(15, Planet(1e-4, 0.7, 60.0)))
+        gc.collect()
+        left = [each for each in gc.garbage if isinstance(each, torch.Tensor)]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+    assert sum(tensor.untyped_storage().nbytes() for tensor in left) < 1e5
 
 
 # -- several frames --------------------------------------------------------------------------

@@ -66,7 +66,13 @@ class Forward:
         self.basis, self.responses = responses.basis, responses
         self.coarse = coarse_copy(problem.model, responses.npix)
         self.grid = PupilGrid.full(problem.model.npix, problem.model.diameter)
-        self.exact = Forward(problem.given, responses) if problem.given else self
+        # None and not itself: a cycle would keep the responses until the collector comes by.
+        self._given = Forward(problem.given, responses) if problem.given else None
+
+    @property
+    def exact(self) -> Forward:
+        """By the model as given."""
+        return self._given or self
 
     def opd(self, unknowns: Unknowns, vector: Tensor) -> Tensor:
         """The wavefront, (npix, npix), m; complex where the pupil's amplitude is free."""
