@@ -154,10 +154,6 @@ def options(description: str) -> argparse.ArgumentParser:
     return parser
 
 
-_JOBS_OF_A_POOL = 20
-"""For each process; then come new ones, for the memory of a long-lived one is in fragments."""
-
-
 def _one_thread() -> None:
     torch.set_num_threads(1)
 
@@ -166,11 +162,8 @@ def mapped(work: Callable[..., Table], jobs: list[tuple[Any, ...]], processes: i
     """Run jobs, in processes of one thread each, and stack their tables in order."""
     if processes == 1:
         return vstack([work(*job) for job in jobs], metadata_conflicts="silent")
-    tables: list[Table] = []
-    for start in range(0, len(jobs), _JOBS_OF_A_POOL * processes):
-        some = jobs[start : start + _JOBS_OF_A_POOL * processes]
-        with ProcessPoolExecutor(processes, get_context("spawn"), _one_thread) as pool:
-            tables += pool.map(work, *zip(*some, strict=True))
+    with ProcessPoolExecutor(processes, get_context("spawn"), _one_thread) as pool:
+        tables = list(pool.map(work, *zip(*jobs, strict=True)))
     return vstack(tables, metadata_conflicts="silent")
 
 
