@@ -57,7 +57,8 @@ class DemoResult:
     Attributes
     ----------
     images : dict of str to ndarray
-        Star-subtracted frames, photons: "initial", "KLIP", "refined", "optimal".
+        Star-subtracted frames, photons: "initial", "KLIP", "refined", "detected" (the star once
+        more, with what was detected in the model), "optimal".
     table : Table
         One row an image: annulus SNR, planet throughput, star-model error, seconds.
     detection : Detection
@@ -126,7 +127,10 @@ def run_demo(
     seconds = {"initial": time.perf_counter() - began}
     fit = refine(model, observation, measured, seed=seed, progress=progress)
     seconds["refined"] = fit.seconds
+    began = time.perf_counter()
     found = detect(fit, progress=progress)
+    without_star = found.subtracted[0]
+    seconds["detected"] = fit.seconds + time.perf_counter() - began
     drift_later = measured.data + random_drift(seed + 1000, hours + 3).data
     references = simulate_references(model, drift_later, seed=seed + 2000)
     began = time.perf_counter()
@@ -138,6 +142,7 @@ def run_demo(
         "initial": frame - outdated,
         "KLIP": klip,
         "refined": fit.residual[0],
+        "detected": without_star,
         "optimal": frame - star,
     }
     ny, nx = frame.shape

@@ -80,12 +80,12 @@ def draw_demo(result: DemoResult) -> Figure:
 
     planet = result.scene.planets[0]
     axes[0, 0].plot(*planet.offset, "o", mfc="none", mec="white", ms=13, mew=1.2)
-    places = ((0, 1, "initial"), (0, 2, "KLIP"), (0, 3, "optimal"), (1, 0, "refined"))
+    places = ((0, 1, "initial"), (0, 2, "KLIP"), (0, 3, "optimal"), (1, 0, "detected"))
     titles = {
         "initial": f"Star from the {result.table.meta['hours']:.0f} h old wavefront",
         "KLIP": "KLIP, nine dithered references",
         "optimal": "True star (the best there is)",
-        "refined": "Star from the refined wavefront",
+        "detected": "Star refined, the planet found in the model",
     }
     for row, column, name in places:
         ax = axes[row, column]

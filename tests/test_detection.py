@@ -19,6 +19,7 @@ from scipy import stats
 import pyklip_diffrender as dr
 from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.detection import Detection, small_sample_factor
+from pyklip_diffrender.detection.relinearise import with_companions
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.geometry import PupilGrid
 from pyklip_diffrender.observation import Observation
@@ -425,6 +426,8 @@ def test_products_can_be_read_by_others(one: Detection, tmp_path: Path) -> None:
     with astropy_fits.open(paths[0]) as hdus:
         np.testing.assert_allclose(hdus["SNR"].data, one.snr, rtol=1e-6)
         assert hdus["OFFSET_X"].header["BUNIT"] == "arcsec"
+        np.testing.assert_allclose(hdus["SUBTRACTED", 1].data, one.subtracted[0], rtol=1e-6)
+        assert Unit(hdus["SUBTRACTED"].header["BUNIT"]) == Unit("photon")
         assert Unit(hdus["LEFT_OUT"].header["BUNIT"]) == Unit("photon")
         assert hdus[0].header["status"] == "CONVERGED"
         assert "pyklip_diffrender" in hdus[0].header["software"]
@@ -433,6 +436,63 @@ def test_products_can_be_read_by_others(one: Detection, tmp_path: Path) -> None:
     assert table.meta["scatter"] == 1.0
     curve = QTable.read(paths[2], format="ascii.ecsv")
     assert len(curve) == len(one.contrast_curve)
+
+
+def kept(image: Image, star: Image, light: Image, error: Image) -> float:
+    """Share of a planet's light that is in a subtracted frame, and not its noise's or star's."""
+    good = np.isfinite(image)
+    weight = (light / error**2)[good]
+    return float((weight * (image - star)[good]).sum() / (weight * light[good]).sum())
+
+
+def test_a_frame_keeps_the_light_of_candidates(world: World) -> None:
+    planet = replace(WHERE, contrast=2.5e-6)  # Too faint for the star to be refined again.
+    light = world.expected(planet) - world.expected()
+    found = dr.detect(world.fitted(14, planet))
+    assert len(found.candidates) == 1
+    fit = found.fits[0]
+    assert not len(fit.companions)
+    # What is left of the star and its noise, were it known.
+    noise = fit.observation.data[0] - world.expected() - light
+    error = fit.observation.error[0]
+    assert kept(fit.residual[0], noise, light, error) < 0.9
+    (image,) = found.subtracted
+    assert kept(image, noise, light, error) == pytest.approx(1.0, abs=0.06)
+    # A fit that has the planet from the start leaves the same.
+    (renewed,) = with_companions(found.fits, found.candidates)
+    away = radius(found) > 0.25
+    difference = ((image - renewed.residual[0]) / error)[away]
+    closed = ((fit.residual[0] - renewed.residual[0]) / error)[away]
+    assert difference.std() < 0.05
+    assert difference.std() < 0.2 * closed.std()
+
+
+def test_without_candidates_a_frame_is_left_as_the_fit_left_it(empty: list[Detection]) -> None:
+    fit = empty[0].fits[0]
+    difference = (empty[0].subtracted[0] - fit.residual[0]) / fit.observation.error[0]
+    assert difference.std() < 0.05
+
+
+def test_every_frame_is_subtracted_as_it_was_taken(world: World) -> None:
+    """A roll, a masked pixel and a reference star, refined together."""
+    planets = [Planet(2e-5, 0.7, 60.0 - turned) for turned in (0.0, 90.0)]
+    frames = [
+        world.observed(world.expected(planet), 70 + k, position_angles=np.array([90.0 * k]))
+        for k, planet in enumerate(planets)
+    ]
+    frames[1].valid[0, 3, 4] = False
+    frames.append(replace(world.observed(4 * world.expected(), 72), reference=True))
+    found = dr.detect(world.refined(frames))  # type: ignore[arg-type]
+    assert len(found.candidates) == 1
+    assert len(found.subtracted) == 3
+    for frame, planet, image in zip(frames, planets, found.subtracted, strict=False):
+        light = world.expected(planet) - world.expected()
+        noise = frame.data[0] - world.expected() - light
+        assert kept(image, noise, light, frame.error[0]) == pytest.approx(1.0, abs=0.06)
+    assert np.argwhere(np.isnan(found.subtracted[1])).tolist() == [[3, 4]]
+    assert np.abs(found.subtracted[2] / frames[2].error[0]).std() < 1.1
+    apart = dr.detect([world.refined(frame) for frame in (frames[0], frames[2])])
+    np.testing.assert_allclose(apart.subtracted[1], apart.fits[1].residual[0], atol=1e-9)
 
 
 def test_left_out_patches_are_larger_than_the_fits_own_residual(empty: list[Detection]) -> None:

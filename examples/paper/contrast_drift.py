@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).parent))
 from judging import chosen, marginalised, methods_in, paper_snr, pixel, shown, spread, star_error
-from methods import QUICK, STEPS, all_of, references
+from methods import QUICK, STEPS, Subtracted, all_of, references
 from pictures import beside, show, write_images
 from scene import Image, Planet, Setting, frame, mapped, options, setting, timed_table
 
@@ -28,7 +28,7 @@ PLACE = (0.6, 54.0)
 HALF = 16
 """Images show so many pixels to each side of the star."""
 LIMIT = 6.0
-SHOWN = ("initial", "KLIP", "Adam", "Gauss-Newton", "optimal")
+SHOWN = ("initial", "KLIP", "Adam", "Gauss-Newton", "marginalised", "optimal")
 
 
 def one_frame(here: Setting, contrast: float, hours: float, steps: int, seed: int) -> Table:
@@ -38,7 +38,8 @@ def one_frame(here: Setting, contrast: float, hours: float, steps: int, seed: in
     left = all_of(here, shot, references(here, hours, seed), steps)
     fit = left["Gauss-Newton"].fit
     assert fit is not None
-    found = marginalised(planet, fit)
+    found, image = marginalised(here, shot, fit)
+    left["marginalised"] = Subtracted(image, found["seconds"])
     x, y = (round(c) for c in pixel(here, (0.0, 0.0)))
     window = (slice(y - HALF, y + HALF), slice(x - HALF, x + HALF))
     rows: list[dict[str, Any]] = []

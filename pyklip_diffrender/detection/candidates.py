@@ -79,6 +79,15 @@ class Candidates:
             self.offsets[keep], self.contrasts[keep], torch.zeros(count, count).double()
         )
 
+    def light(self, templates: Templates) -> dict[int, Tensor]:
+        """All of them together, (1, ny, nx) by frame, in the data's unit."""
+        if not len(self):
+            return {}
+        return {
+            frame: torch.tensordot(self.contrasts, images, dims=1)[None]
+            for frame, images in templates.at(self.offsets).items()
+        }
+
     @property
     def errors(self) -> Tensor:
         """Standard deviations of contrast, x and y, (k, 3)."""

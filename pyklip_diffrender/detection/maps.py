@@ -66,13 +66,10 @@ class Maps:
         left = self.numerator.copy().reshape(-1)
         if not len(candidates):
             return left.reshape(self.shape)
-        cleaned = {}
-        for linear, templates in self.groups:
-            light = {
-                frame: torch.tensordot(candidates.contrasts, images, dims=1)[None]
-                for frame, images in templates.at(candidates.offsets).items()
-            }
-            cleaned[id(linear)] = linear.clean(light)
+        cleaned = {
+            id(linear): linear.clean(candidates.light(templates))
+            for linear, templates in self.groups
+        }
         for linear, where, images in self._batches("candidates"):
             for frame, planets in images.items():
                 whitened = (linear.frames[frame].weight * cleaned[id(linear)][frame][0]).float()

@@ -79,6 +79,12 @@ def _amplitude(linear: LinearModel, frame: int, shape: torch.Tensor) -> tuple[fl
     return float(weighed.numerator[0]) / information, information**-0.5
 
 
+def _less_star(fit: Refinement) -> Image:
+    """What a fit leaves of its frame; for reference stars that share nothing with the others."""
+    combined = fit.observation.combined()
+    return np.where(combined.valid[0], combined.data[0] - fit.star_image, np.nan)
+
+
 @dataclass(frozen=True)
 class Detection:
     """Where there may be planets, how bright they are, and how bright they would have to be.
@@ -226,6 +232,30 @@ class Detection:
         return total, scatter * error
 
     @cached_property
+    def subtracted(self) -> tuple[Image, ...]:
+        """Every fit's frame less the star, when the candidates are part of the model.
+
+        A fit that knows nothing of a companion takes some of its light for the star's: what
+        `Refinement.residual` leaves has lost it. Here candidates lose nothing, only sources below
+        the threshold do. In the order of `fits`, (ny, nx) each, in the data's unit; frames that
+        were refined as one observation are averaged; NaN where the data are masked.
+        """
+        images: dict[int, Image] = {}
+        for linear, templates in self.groups:
+            light = self.candidates.light(templates)
+            # Taken out before the star is found, and put back afterwards.
+            imitated = linear.clean(light) if len(self.candidates) else {}
+            for fit in self.fits:
+                if fit.linear is not templates.fits[0].linear:
+                    continue
+                frame, left = linear.frames[fit.frame], linear.cleaned[fit.frame]
+                if imitated:
+                    left = left - imitated[fit.frame][0]
+                image = left / frame.weight + light.get(fit.frame, torch.zeros(1))[0]
+                images[id(fit)] = torch.where(frame.weight > 0, image, torch.nan).numpy()
+        return tuple(images.get(id(fit), _less_star(fit)) for fit in self.fits)
+
+    @cached_property
     def left_out(self) -> tuple[Image, Image]:
         """Residual of every 5 x 5 patch of the first frame as a fit that never saw it leaves it.
 
@@ -268,6 +298,10 @@ class Detection:
         ):
             hdu = fits.ImageHDU(image.astype(np.float32), name=name)
             hdu.header["BUNIT"] = image_unit
+            hdus.append(hdu)
+        for k, image in enumerate(self.subtracted):
+            hdu = fits.ImageHDU(image.astype(np.float32), name="SUBTRACTED", ver=k + 1)
+            hdu.header["BUNIT"] = unit
             hdus.append(hdu)
         maps = folder / "detection.fits"
         write_fits(hdus, maps)
