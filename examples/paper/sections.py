@@ -85,8 +85,8 @@ def about_misalignment(table: Table) -> Lines:
     return [
         "PSNR in dB over 11 x 11 pixels about the planet. A stop that is not where it should be "
         "lets more of the star past, and that the true star does not undo; with the alignment "
-        f"fitted the median PSNR is at most {max(max(behind), 0):.1f} dB below that of the true star "
-        f"(and up to {max(-min(behind), 0):.1f} dB above it: the fit follows some of the noise).",
+        f"fitted the median PSNR is at most {max(*behind, 0):.1f} dB below that of the true star "
+        f"(and up to {-min(*behind, 0):.1f} dB above it: the fit follows some of the noise).",
         "",
         *markdown(header, rows),
     ]
