@@ -6,7 +6,8 @@ One row of the table a frame: the standard deviation of S/N where there is no pl
 positions, and for the rings), that of the matched filter that knows the star, on the same noise,
 and the ratio of the 5-sigma contrast to the matched filter's photon limit. About a hundred
 positions of a frame are independent: one frame's standard deviation scatters by 7 %. The longest
-drift, extrapolated from the others, takes many times longer and gets a quarter of the seeds.
+drift, extrapolated from the others, takes many times longer and gets a quarter of the seeds. On the
+embedded generator each seed has a wavefront and a drift of its own.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ def known_star_snr(found: Detection, shot: Frame) -> NDArray[np.float64]:
 
 def one_frame(here: Setting, hours: float, seed: int) -> Table:
     """One row of the table."""
+    here = here.redrawn(seed)
     shot = frame(here, hours, seed)
     fit = dr.refine(here.model, shot.observation, here.measured)
     found = dr.detect(fit, threshold=math.inf)

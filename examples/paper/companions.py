@@ -36,6 +36,7 @@ SYSTEMS = {
 def one_system(here: Setting, name: str, seed: int) -> Table:
     """One row a planet."""
     planets = SYSTEMS[name]
+    here = here.redrawn(seed)
     shot = frame(here, HOURS, seed, planets)
     found = dr.detect(dr.refine(here.model, shot.observation, here.measured))
     table = found.table

@@ -3,7 +3,8 @@
     python examples/paper/fluxes.py --opd BEFORE AFTER --seeds 20
 
 Each frame has one planet at a known place: contrasts 3e-7 to 1e-4, separations 0.3 to 2.3 arcsec,
-and planets at the closed-form 5-sigma limit of that place, which must come out at S/N 5.
+and planets at the closed-form 5-sigma limit of that place, which must come out at S/N 5. On the
+embedded generator each frame has a wavefront and a drift of its own.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ LIMIT = 0.0
 
 def one_frame(here: Setting, contrast: float, separation: float, seed: int) -> Table:
     """One row of the table."""
+    here = here.redrawn(seed)
     angle = float(np.random.default_rng(1000 + seed).uniform(0, 360))
     limit = contrast == LIMIT
     if limit:

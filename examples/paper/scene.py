@@ -65,6 +65,16 @@ class Setting:
         change = random_drift(self.seed + 1000, hours, npix=self.model.npix).data
         return self.measured + change
 
+    def redrawn(self, seed: int) -> Setting:
+        """With another wavefront of the generator and another drift; measured maps stay.
+
+        Errors hold what is not known of the wavefront. Frames that share one wavefront share one
+        draw of that part, however different their noise.
+        """
+        if self.before:
+            return self
+        return replace(self, measured=random_opd(seed, npix=self.model.npix).data, seed=seed)
+
     @property
     def name(self) -> str:
         """Which wavefronts these are."""

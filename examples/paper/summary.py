@@ -33,7 +33,11 @@ def about_calibration() -> list[str]:
         for hours in sorted(set(table["hours"])):
             part = table[table["hours"] == hours]
             rings = [rms(part[f"null_{r:.1f}"]) for r in calibration.RINGS[:-1]]
-            expected = part["positions"].sum() * 2 * 3.167e-5
+            beyond = part["beyond_4"]
+            expected = [
+                part["positions"].sum() * math.erfc(4 / width / math.sqrt(2))
+                for width in (1.0, rms(part["null"]))
+            ]
             rows.append(
                 (
                     KINDS[kind],
@@ -42,7 +46,8 @@ def about_calibration() -> list[str]:
                     f"{rms(part['null']):.3f}",
                     f"{min(rings):.2f} to {max(rings):.2f}",
                     f"{rms(part['known_star_null']):.3f}",
-                    f"{part['beyond_4'].sum()} ({expected:.1f})",
+                    f"{beyond.sum()} ± {math.sqrt(len(part)) * np.std(beyond, ddof=1):.0f} "
+                    f"({expected[0]:.1f}; {expected[1]:.1f})",
                     f"{part['highest'].max():.1f}",
                     f"{part['limit_mean'].mean():.3f}",
                     f"{max(part[f'limit_{r:.1f}'].mean() for r in calibration.RINGS[:-1]):.3f}",
@@ -53,7 +58,7 @@ def about_calibration() -> list[str]:
             )
     header = (
         "wavefronts", "drift, h", "frames", "S/N deviation", "in rings of 0.2 arcsec",
-        "the same, star known", "positions beyond 4 (Gaussian)", "highest",
+        "the same, star known", "positions beyond 4 (Gaussian; as wide)", "highest",
         "limit / photon limit, mean", "worst ring", "star error, sigma", "chi2 / pixel", "status",
     )  # fmt: skip
     return [
@@ -63,7 +68,9 @@ def about_calibration() -> list[str]:
         "arcsec must be 1. About a hundred positions of a frame are independent, so that twenty "
         "frames know it to 2 %; the matched filter that knows the star shows what the noise "
         "itself did in those frames. The limit is the closed-form 5-sigma contrast, the median "
-        "over a ring, relative to that of the matched filter that knows the star.",
+        "over a ring, relative to that of the matched filter that knows the star. Positions beyond "
+        "4 come in clumps of a few pixels: their error is that of the sum over frames. Beside them "
+        "stands how many Gaussian noise has, of deviation 1 and of the deviation measured.",
         "",
         *markdown(header, rows),
         *origin(found),
