@@ -16,7 +16,11 @@ from pyklip.instruments.Instrument import GenericData
 from pyklip.parallelized import klip_dataset
 
 from pyklip_diffrender.bases import default_basis
-from pyklip_diffrender.errors import NoValidPixelsError, RefinementError
+from pyklip_diffrender.errors import (
+    IncompatibleSetupError,
+    NoValidPixelsError,
+    RefinementError,
+)
 from pyklip_diffrender.nircam import nircam_coronagraph
 from pyklip_diffrender.observation import Observation
 from pyklip_diffrender.opd import random_drift, random_opd
@@ -54,12 +58,16 @@ def small() -> OpticalSystem:
 
 @pytest.fixture(scope="module")
 def frames() -> NDArray[np.float64]:
+    return exposed(CONTRAST)
+
+
+def exposed(contrast: float) -> NDArray[np.float64]:
     """Photons of star, companion and sky in two rolls, with noise."""
     camera = nircam_coronagraph("F444W", fov_pixels=SHAPE, **NUMERICS)
     rng = np.random.default_rng(4)
     with torch.no_grad():
         photons = [
-            FLUX * (camera(NEW) + CONTRAST * camera(NEW, star_offset=planet_pixels(a))).numpy()
+            FLUX * (camera(NEW) + contrast * camera(NEW, star_offset=planet_pixels(a))).numpy()
             for a in ANGLES
         ]
     return rng.poisson(np.array(photons) + SKY).astype(np.float64)
@@ -133,6 +141,45 @@ def test_star_goes_companion_stays(
     assert header["DRCHI2"] == pytest.approx(max(f.result.chi2_per_pixel for f in fits_of_rolls))
     assert header["DROPD"] == OLD.name
     assert header["DRSHA256"] == OLD.sha256
+
+
+def test_what_is_detected_keeps_its_light(small: OpticalSystem, tmp_path: Path) -> None:
+    contrast = 5e-6  # Too faint for a fit of one roll to look for it by itself.
+    shots = exposed(contrast)
+    made = dataset(shots, small)
+    camera = nircam_coronagraph("F444W", fov_pixels=SHAPE, **NUMERICS)
+    star = FLUX * camera(NEW).numpy() + SKY
+    light = [FLUX * contrast * camera(NEW, star_offset=planet_pixels(a)).numpy() for a in ANGLES]
+    kept = {}
+    for keep in (False, True):
+        with backend(opd=OLD, keep_detected=keep):
+            reduced = copy.deepcopy(made)
+            _, header = reduce(reduced, tmp_path)
+        found = reduced.diffrender_results[0].subtraction
+        assert [len(fit.result.companions) for fit in found.fits] == [int(keep)] * len(ANGLES)
+        assert header["DRKEPT"] == int(keep)
+        taken = found.star[:, PAD:-PAD, PAD:-PAD] - star
+        shares = [
+            1 - (t * p / star).sum() / (p * p / star).sum()
+            for t, p in zip(taken, light, strict=True)
+        ]
+        kept[keep] = np.mean(shares)
+    print(kept)
+    assert kept[False] < 0.85
+    assert kept[True] == pytest.approx(1.0, abs=0.1)
+
+
+def test_companions_cannot_be_kept_by_a_method_without_their_errors(
+    small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path
+) -> None:
+    made = dataset(frames, small)
+    made.diffrender = replace(made.diffrender, refine_options={"iterations": 2})
+    with (
+        backend(opd=OLD, method="adam", keep_detected=True),
+        pytest.raises(IncompatibleSetupError, match="gauss-newton"),
+    ):
+        reduce(made, tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_model_without_recipe_is_good_for_its_own_square(

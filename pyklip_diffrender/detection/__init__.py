@@ -96,7 +96,8 @@ def detect(
     maps = Maps(groups, progress)
     found, factor = _search(maps, given, threshold, inner, scatter, Candidates.of_fit(given[0]))
     bright = found.contrasts > relinearise * factor * found.errors[:, 0]
-    if bool(bright.any()) and len(found) > len(given[0].companions):
+    seen = [fit for fit in given if not fit.observation.reference]
+    if bool(bright.any()) and any(len(fit.companions) != len(found) for fit in seen):
         given = with_companions(given, found, progress)
         groups = _groups(given)
         maps = Maps(groups, progress)

@@ -23,7 +23,8 @@ def with_companions(
     """Refine all frames once more, with candidates as companions of the star.
 
     A bright companion bends the fitted wavefront beyond where the linear model holds. With
-    parameters of its own it does not.
+    parameters of its own it does not. Reference stars that share nothing with the target stay as
+    they are: they have no companions.
 
     Parameters
     ----------
@@ -41,8 +42,11 @@ def with_companions(
     renewed = []
     for fit in fits:
         key = id(fit.linear)
+        members = [each for each in fits if each.linear is fit.linear]
+        if all(each.observation.reference for each in members):
+            renewed.append(fit)
+            continue
         if key not in again:
-            members = [each for each in fits if each.linear is fit.linear]
             own = members[0].observation.position_angles
             # The sky of a later group is turned: its companions are where its first frame has them.
             turn = 0.0 if own is None or origin is None else float(own[0] - origin[0])

@@ -104,6 +104,7 @@ def provenance(made: Sequence[Made]) -> fits.Header:
         ("DRSEED", first.subtraction.seed, "random seed"),
         ("DRCHI2", _number(worst.chi2), "chi2 per fitted pixel"),
         ("DRNFIT", sum(len(m.subtraction.fits) for m in made), "number of refinements"),
+        ("DRKEPT", _companions(made), "most companions that a fit knew of"),
         ("DRPIXELS", _shared([m.frames.pixels for m in made]), "pixels that were fitted"),
         ("DRFILLED", sum(m.filled for m in made), "flagged pixels replaced by neighbours"),
         ("DRNOISE", _shared([m.frames.noise for m in made]), "where the errors came from"),
@@ -142,6 +143,11 @@ def stamp(folder: Path, cards: fits.Header) -> None:
 
 def _shared(values: Sequence[str]) -> str:
     return ", ".join(dict.fromkeys(values))
+
+
+def _companions(made: Sequence[Made]) -> int:
+    """Of fits that say so; other subtractors may know nothing of companions."""
+    return max(len(getattr(f.result, "companions", ())) for m in made for f in m.subtraction.fits)
 
 
 def _number(value: float) -> float | str:

@@ -47,6 +47,7 @@ class Options(TypedDict, total=False):
     method: str
     seed: int
     fidelity: Plan | str
+    keep_detected: bool
     refine_options: Mapping[str, Any]
     model_options: Mapping[str, Any]
     subtractor: Subtractor
@@ -86,6 +87,11 @@ class DiffrenderSettings:
     fidelity : Plan or str, optional
         Passed to `refine`: "as given", "planned", or a plan that was made before, which serves
         for all fits of a reduction.
+    keep_detected : bool, optional
+        Look for companions in the fits (`detect`) and refine the star once more with them in the
+        model, so that none of their light is taken for the star's; False by default. What is not
+        detected loses as much as before: bright injected companions then say nothing about how
+        much of a faint one is left.
     refine_options : mapping, optional
         Further keywords of `refine`, such as ``free`` and ``prior``.
     model_options : mapping, optional
@@ -104,6 +110,7 @@ class DiffrenderSettings:
     method: str | None = None
     seed: int | None = None
     fidelity: Plan | str | None = None
+    keep_detected: bool | None = None
     refine_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Subtractor | None = None

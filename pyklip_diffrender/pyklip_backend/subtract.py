@@ -20,6 +20,7 @@ from pyklip_diffrender.pyklip_backend.windows import Window, extent
 
 if TYPE_CHECKING:
     from pyklip_diffrender.optics import OpticalSystem
+    from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["FIT_PIXELS", "Fit", "Subtraction", "Subtractor", "model_for", "subtract_by_refinement"]
 
@@ -118,7 +119,8 @@ def subtract_by_refinement(
     Raises
     ------
     IncompatibleSetupError
-        If there is no model and no filter to build one for.
+        If there is no model and no filter to build one for, or if companions are to be kept by a
+        method that `detect` cannot use.
     RefinementError
         If a refinement has no usable result.
     """
@@ -128,21 +130,36 @@ def subtract_by_refinement(
 
     method = METHOD if settings.method is None else settings.method
     seed = SEED if settings.seed is None else settings.seed
-    star = np.empty_like(observation.data)
-    fits = []
-    for frames, group in _alike(observation):
-        window = Window.about(group.center[0], model.detector.shape)
+    groups = list(_alike(observation))
+    windows = [Window.about(group.center[0], model.detector.shape) for _, group in groups]
+    results: list[Refinement] = []
+    for (_, group), window in zip(groups, windows, strict=True):
         options = {**_defaults(observation, method), **settings.refine_options}
         if settings.fidelity is not None:
             options["fidelity"] = settings.fidelity
         result = refine(model, window.of(group), opd, method=method, seed=seed, **options)
-        status = result.status.name.lower()
         if not result.status.usable:
             raise RefinementError(f"{group.name}: {result.status.message}", result)
+        results.append(result)
+    if settings.keep_detected:
+        results = _with_companions(results)
+    star = np.empty_like(observation.data)
+    fits = []
+    for (frames, group), window, result in zip(groups, windows, results, strict=True):
+        status = result.status.name.lower()
         logger.info("%s: %s, chi2/pixel %.4g", group.name, status, result.chi2_per_pixel)
         star[frames] = _everywhere(result, group, window)
         fits.append(Fit(tuple(map(int, frames)), status, float(result.chi2_per_pixel), result))
     return Subtraction(star, method, seed, tuple(fits))
+
+
+def _with_companions(results: list[Refinement]) -> list[Refinement]:
+    """The fits once more, with what is detected in all of them together as companions."""
+    from pyklip_diffrender.detection import detect
+
+    found = detect(results, relinearise=0.0)
+    logger.info("companions that keep their light: %s", found.table)
+    return list(found.fits)
 
 
 def _defaults(observation: Observation, method: str) -> dict[str, Any]:
@@ -180,7 +197,7 @@ def _alike(observation: Observation) -> Iterator[tuple[NDArray[np.intp], Observa
         )
 
 
-def _everywhere(result: Any, group: Observation, window: Window) -> NDArray[np.float64]:
+def _everywhere(result: Refinement, group: Observation, window: Window) -> NDArray[np.float64]:
     """The star over all valid pixels of the frames, (ny, nx), NaN elsewhere.
 
     The fitted wavefront is rendered on a larger detector; a model that cannot be made again with
