@@ -34,7 +34,7 @@ def sentences(results: Path) -> Lines:
         found.append(
             "Over the planets of the paper's comparison with KLIP, the marginalised estimate has "
             f"{min(share):.2f} to {max(share):.2f} of the S/N of a matched filter that knows the "
-            f"star, and {min(flux):.2f} to {max(flux):.2f} of the planets' light."
+            f"star, and {min(flux):.3f} to {max(flux):.3f} of the planets' light."
         )
     if curves:
         table = curves[0]
