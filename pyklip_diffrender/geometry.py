@@ -161,16 +161,16 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
     """
     rows, columns = grid.shape
     origin = torch.tensor([grid.columns[0], grid.rows[0]], dtype=torch.float64)
-    starts, ends, senses = [], [], []
-    for polygon in polygons:
-        vertices = polygon.to(torch.float64) / grid.spacing + grid.npix / 2 - origin
-        following = vertices.roll(-1, dims=0)
-        x, y = vertices.detach().unbind(dim=1)
-        x2, y2 = following.detach().unbind(dim=1)
-        starts.append(vertices)
-        ends.append(following)
-        senses.append(torch.sign((x * y2 - x2 * y).sum()).expand(len(vertices)))
-    start, end, sense = torch.cat(starts), torch.cat(ends), torch.cat(senses)
+    # All polygons at once: in forward mode every operation costs a third of a millisecond.
+    sizes = torch.tensor([len(polygon) for polygon in polygons])
+    owner = torch.repeat_interleave(torch.arange(len(polygons)), sizes)
+    first = (sizes.cumsum(0) - sizes)[owner]
+    following = first + (torch.arange(len(owner)) - first + 1) % sizes[owner]
+    start = torch.cat(polygons).to(torch.float64) / grid.spacing + grid.npix / 2 - origin
+    end = start[following]
+    (x, y), (x2, y2) = start.detach().T, end.detach().T
+    area = torch.zeros(len(polygons), dtype=torch.float64).index_add(0, owner, x * y2 - x2 * y)
+    sense = torch.sign(area)[owner]
 
     edge, fraction = _border_crossings(start, end)
     begin = start[edge] + fraction[:-1, None] * (end - start)[edge]
@@ -238,7 +238,8 @@ def transform_polygons(polygons: list[Tensor], shift: Tensor, rotation: Tensor) 
     """
     cosine, sine = torch.cos(rotation), torch.sin(rotation)
     matrix = torch.stack([torch.stack([cosine, sine]), torch.stack([-sine, cosine])])
-    return [polygon @ matrix + shift for polygon in polygons]
+    moved = torch.cat(polygons) @ matrix + shift
+    return list(moved.split([len(polygon) for polygon in polygons]))
 
 
 def _polygons(table: str, label: str, **where: str) -> dict[str, Tensor]:

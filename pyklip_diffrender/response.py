@@ -330,20 +330,20 @@ def field_derivatives(
     # Constants are built and kept at the first call; that must not happen inside a transform.
     with torch.no_grad():
         model(opd, **values)
-    found = {}
-    for name in names:
-        if name in IMAGE_PARAMETERS:
-            continue
+    moved = {name: values[name] for name in names if name not in IMAGE_PARAMETERS}
+    if not moved:
+        return {}
 
-        def fields(value: Tensor, name: str = name) -> list[Tensor]:
-            # Complex outputs of jacfwd would need complex inputs.
-            return [
-                torch.view_as_real(field) for field in model.fields(opd, **{**values, name: value})
-            ]
+    def fields(given: dict[str, Tensor]) -> list[Tensor]:
+        # Complex outputs of jacfwd would need complex inputs.
+        return [torch.view_as_real(field) for field in model.fields(opd, **{**values, **given})]
 
-        slopes = torch.func.jacfwd(fields)(values[name])
-        found[name] = [torch.view_as_complex(s.movedim(-1, 0).contiguous()) for s in slopes]
-    return found
+    # Together: one pass costs as much for five components as for one.
+    slopes = torch.func.jacfwd(fields)(moved)
+    return {
+        name: [torch.view_as_complex(s[name].movedim(-1, 0).contiguous()) for s in slopes]
+        for name in moved
+    }
 
 
 def image_derivatives(
