@@ -141,7 +141,9 @@ def where_others_lead(results: Path) -> Lines:
         "",
         *(f"- {words}" for words in found),
         "",
-        "Why: see the limits of the annulus SNR below.",
+        "Why: a bright planet's annulus SNR saturates, and faint remains of the star may raise it "
+        "above that of the true star; where the true star's is small, all are noise. See the "
+        "limits.",
         "",
     ]
 
@@ -150,12 +152,14 @@ def _ahead(part: Table, column: str, where: str, what: str, *, larger: bool) -> 
     sign = 1 if larger else -1
     own = [spread(chosen(part, method=method)[column]) for method in OURS]
     ours = max((each for each in own if math.isfinite(each[0])), key=lambda each: sign * each[0])
+    best = spread(chosen(part, method="optimal")[column])[0]
+    known = f"; true star {best:.3g}" if math.isfinite(best) else ""
     words = []
     for method in ("KLIP", "KLIP, library", "Adam"):
         theirs = spread(chosen(part, method=method)[column])
         if sign * theirs[0] > sign * ours[0]:
             words.append(
                 f"{where}: {what} {theirs[0]:.3g} ({method}) against {ours[0]:.3g} "
-                f"({ours[1]:.3g} to {ours[2]:.3g})"
+                f"({ours[1]:.3g} to {ours[2]:.3g}{known})"
             )
     return words

@@ -88,7 +88,7 @@ def draw(table: Table) -> Figure:
         panels[:, 0], ("annulus SNR", "matched-filter S/N", "planet's light kept"), strict=True
     ):
         ax.set_ylabel(label, fontsize=9)
-    panels[1, 0].legend(frameon=False, fontsize=7)
+    panels[2, 0].legend(frameon=False, fontsize=7, loc="lower right")
     return figure
 
 
