@@ -178,21 +178,24 @@ def draw_subtraction(fit: Refinement) -> Figure:
 
 
 def draw_detection(found: Detection) -> Figure:
-    """S/N map, the same without the candidates, and the contrast curve."""
+    """The frame less the star, S/N map, the same without the candidates, contrast curve."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(14.5, 4.6), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
+    figure = Figure(figsize=(18.5, 4.4), layout="constrained")
+    frame, left, middle, right = figure.subplots(1, 4)
+    noise = found.fits[0].observation.combined().error[0]
     (x0, y0), (x1, y1) = found.grid[0, 0], found.grid[-1, -1]
     pixel = found.fits[0].model.detector.pixelscale
     extent = (x0 - pixel[0] / 2, x1 + pixel[0] / 2, y0 - pixel[1] / 2, y1 + pixel[1] / 2)
     table = found.table
-    for ax, image, title in (
-        (left, found.snr, f"S/N of a point source, {len(table)} above {found.threshold:g}"),
-        (middle, found.residual_snr, "S/N once those are taken out"),
+    above = f"{len(table)} above {found.threshold:g}"
+    for ax, image, title, label in (
+        (frame, found.subtracted[0] / noise, "First frame less the star", "light / noise"),
+        (left, found.snr, f"S/N of a point source, {above}", "S/N"),
+        (middle, found.residual_snr, "S/N once those are taken out", "S/N"),
     ):
         shown = ax.imshow(image, origin="lower", extent=extent, cmap="RdBu_r", vmin=-8, vmax=8)
-        figure.colorbar(shown, ax=ax, shrink=0.85, label="S/N")
+        figure.colorbar(shown, ax=ax, shrink=0.85, label=label)
         ax.plot(0, 0, "+", color=_INK, ms=9)
         ax.plot(table["x"].value, table["y"].value, "o", mfc="none", mec="#2f9e44", ms=15, mew=1.4)
         ax.set_title(title, fontsize=10, color=_INK, loc="left")
