@@ -216,7 +216,7 @@ def draw_detection(found: Detection) -> Figure:
     )
     right.set_xlabel("arcsec", fontsize=9)
     right.set_title("5 sigma contrast, median and range of angles", fontsize=10, loc="left")
-    right.set_box_aspect(0.85)
+    right.set_box_aspect(1.0)
     right.legend(frameon=False, fontsize=8)
     return figure
 
