@@ -253,7 +253,7 @@ class Detection:
                     left = left - imitated[fit.frame][0]
                 image = left / frame.weight + light.get(fit.frame, torch.zeros(1))[0]
                 images[id(fit)] = torch.where(frame.weight > 0, image, torch.nan).numpy()
-        return tuple(images.get(id(fit), _less_star(fit)) for fit in self.fits)
+        return tuple(images[id(f)] if id(f) in images else _less_star(f) for f in self.fits)
 
     @cached_property
     def left_out(self) -> tuple[Image, Image]:

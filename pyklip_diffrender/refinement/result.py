@@ -156,7 +156,11 @@ class Refinement:
 
     @property
     def residual(self) -> NDArray[np.float64]:
-        """Data minus star, (frames, ny, nx); NaN where the data are masked."""
+        """Data minus star, (frames, ny, nx); NaN where the data are masked.
+
+        It has lost a part of the light of sources that the fit knew nothing of; see
+        `Detection.subtracted`.
+        """
         data = self.observation.data - self.star_image
         return np.where(self.observation.valid, data, np.nan)
 
