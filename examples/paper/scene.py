@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
+from multiprocessing import get_context, set_start_method
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +166,8 @@ def options(description: str) -> argparse.ArgumentParser:
 
 def _one_thread() -> None:
     torch.set_num_threads(1)
+    # pyKLIP makes a pool for every subtraction; spawned, it would import everything anew.
+    set_start_method("fork", force=True)
 
 
 def mapped(work: Callable[..., Table], jobs: list[tuple[Any, ...]], processes: int) -> Table:
