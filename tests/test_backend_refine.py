@@ -164,7 +164,6 @@ def test_what_is_detected_keeps_its_light(small: OpticalSystem, tmp_path: Path) 
             for t, p in zip(taken, light, strict=True)
         ]
         kept[keep] = np.mean(shares)
-    print(kept)
     assert kept[False] < 0.85
     assert kept[True] == pytest.approx(1.0, abs=0.1)
 

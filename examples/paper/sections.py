@@ -181,13 +181,13 @@ def about_beyond(table: Table) -> Lines:
               *(f"star error, {m}" for m in methods))  # fmt: skip
     return [
         *markdown(header, rows),
-        f"Another method leaves less of the star than this package in: {'; '.join(behind)}.",
+        f"Another method leaves less of the star than this package in: {'; '.join(behind) or 'none'}.",
         "No wavefront explains a ring, and none of one wavelength explains nine: the fit bends to "
         "them, and its status says that it does not explain the data. With the shape of the ring "
         "given, or with nine wavelengths, it does (the ring's shape is rendered with the bent "
         "wavefront: that is the larger null). KLIP has no model that could be wrong. Over "
         "nine wavelengths the price of the wavefront's freedom is higher, 1.4 to 1.5 times the "
-        "photon limit (1.2 at one): speckles of different wavelengths lie over each other, and "
-        "tell less of the modes.",
+        "photon limit in the one frame that was looked at (1.2 at one): probably because speckles "
+        "of different wavelengths lie over each other, and tell less of the modes.",
         "",
     ]
