@@ -467,6 +467,28 @@ def test_a_frame_keeps_the_light_of_candidates(world: World) -> None:
     assert difference.std() < 0.2 * closed.std()
 
 
+def test_a_bright_companions_frame_is_what_its_own_fit_leaves(world: World) -> None:
+    """The star is found in single precision once more; of 1e-3 that must not show."""
+    found = dr.detect(world.fitted(7, replace(WHERE, contrast=1e-3)))
+    (fit,) = found.fits
+    assert len(fit.companions) == len(found.candidates) == 1
+    difference = (found.subtracted[0] - fit.residual[0]) / fit.observation.error[0]
+    assert difference[radius(found) > 0.25].std() < 0.05
+
+
+def test_a_companion_that_one_fit_knows_is_given_to_the_others(world: World) -> None:
+    planet = replace(WHERE, contrast=2e-5)
+    shots = [world.observed(world.expected(planet), 80 + k) for k in (0, 1)]
+    options = {"kappa_floor": 1e-6}  # With it, fits do not look for companions by themselves.
+    fits = [
+        world.refined(shots[0], planets=(planet,), **options),
+        world.refined(shots[1], **options),
+    ]
+    assert [len(fit.companions) for fit in fits] == [1, 0]
+    found = dr.detect(fits)
+    assert [len(fit.companions) for fit in found.fits] == [1, 1]
+
+
 def test_without_candidates_a_frame_is_left_as_the_fit_left_it(empty: list[Detection]) -> None:
     fit = empty[0].fits[0]
     difference = (empty[0].subtracted[0] - fit.residual[0]) / fit.observation.error[0]

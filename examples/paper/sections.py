@@ -181,7 +181,8 @@ def about_beyond(table: Table) -> Lines:
               *(f"star error, {m}" for m in methods))  # fmt: skip
     return [
         *markdown(header, rows),
-        f"Another method leaves less of the star than this package in: {'; '.join(behind) or 'none'}.",
+        "Another method leaves less of the star than this package in: "
+        f"{'; '.join(behind) or 'none'}.",
         "No wavefront explains a ring, and none of one wavelength explains nine: the fit bends to "
         "them, and its status says that it does not explain the data. With the shape of the ring "
         "given, or with nine wavelengths, it does (the ring's shape is rendered with the bent "

@@ -24,7 +24,7 @@ from pyklip_diffrender.detection.contrast import (
     small_sample_factor,
 )
 from pyklip_diffrender.detection.maps import Group, Maps
-from pyklip_diffrender.detection.relinearise import star_only, with_companions
+from pyklip_diffrender.detection.relinearise import lacking, star_only, with_companions
 from pyklip_diffrender.detection.result import Detection, amplitudes
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -96,8 +96,7 @@ def detect(
     maps = Maps(groups, progress)
     found, factor = _search(maps, given, threshold, inner, scatter, Candidates.of_fit(given[0]))
     bright = found.contrasts > relinearise * factor * found.errors[:, 0]
-    seen = [fit for fit in given if not fit.observation.reference]
-    if bool(bright.any()) and any(len(fit.companions) != len(found) for fit in seen):
+    if bool(bright.any()) and lacking(given, found):
         given = with_companions(given, found, progress)
         groups = _groups(given)
         maps = Maps(groups, progress)

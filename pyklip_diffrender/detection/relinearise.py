@@ -14,7 +14,12 @@ from pyklip_diffrender.linear_model import LinearModel
 from pyklip_diffrender.refinement import Refinement, refine_again
 from pyklip_diffrender.scene import Planet
 
-__all__ = ["star_only", "with_companions", "without_light"]
+__all__ = ["lacking", "star_only", "with_companions", "without_light"]
+
+
+def lacking(fits: Sequence[Refinement], found: Candidates) -> bool:
+    """Whether a fit of the target does not have all candidates as companions, and no others."""
+    return any(len(fit.companions) != len(found) for fit in fits if not fit.observation.reference)
 
 
 def with_companions(

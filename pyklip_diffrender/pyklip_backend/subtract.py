@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -156,10 +157,14 @@ def subtract_by_refinement(
 def _with_companions(results: list[Refinement]) -> list[Refinement]:
     """The fits once more, with what is detected in all of them together as companions."""
     from pyklip_diffrender.detection import detect
+    from pyklip_diffrender.detection.relinearise import lacking, with_companions
 
-    found = detect(results, relinearise=0.0)
+    # Refined again below, faint ones too: a second S/N map in between would be for nothing.
+    found = detect(results, relinearise=math.inf)
     logger.info("companions that keep their light: %s", found.table)
-    return list(found.fits)
+    if not lacking(results, found.candidates):
+        return results
+    return with_companions(results, found.candidates)
 
 
 def _defaults(observation: Observation, method: str) -> dict[str, Any]:
