@@ -27,7 +27,7 @@ from pyklip_diffrender.metrics import annulus_snr
 from pyklip_diffrender.priors import WavefrontPrior
 
 sys.path.insert(0, str(Path(__file__).parent))
-from failures import FITTED
+from failures import MEASURED_SCALES
 from judging import COLOURS, chosen, photon_snr, pixel, spread, star_error
 from methods import QUICK, STEPS, Subtracted, all_of, klip, references
 from ring import ring_photons
@@ -47,7 +47,7 @@ METHODS = (
 
 
 def _held(factor: float) -> dict[str, Any]:
-    scales = {name: factor * scale for name, scale in FITTED.items()}
+    scales = {name: factor * scale for name, scale in MEASURED_SCALES.items()}
     return {"prior": WavefrontPrior(scales=scales, fit_scales=False)}
 
 

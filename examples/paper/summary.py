@@ -159,8 +159,8 @@ def about_companions() -> list[str]:
         return []
     rows = []
     for kind, table in found.items():
-        for scene in dict.fromkeys(table["scene"]):
-            part = table[table["scene"] == scene]
+        for scene, contrast in dict.fromkeys(zip(table["scene"], table["contrast"], strict=True)):
+            part = table[(table["scene"] == scene) & (table["contrast"] == contrast)]
             seen = part[part["found"]]
             ratio = np.asarray(seen["measured"] / seen["contrast"])
             pull = np.asarray((seen["measured"] - seen["contrast"]) / seen["error"])
@@ -168,16 +168,18 @@ def about_companions() -> list[str]:
                 (
                     KINDS[kind],
                     scene,
+                    f"{contrast:g}",
                     f"{len(seen)} of {len(part)}",
-                    str(int(np.max(part["false_candidates"] + (~part["found"]).astype(int)))),
+                    str(int(part["false_candidates"].max())),
                     f"{np.mean(ratio):.3f} ({ratio.min():.3f} to {ratio.max():.3f})",
-                    f"{np.mean(pull):+.2f}",
+                    f"{np.mean(pull):+.2f} ± {len(pull) ** -0.5:.2f}",
                     f"{np.std(pull):.2f}",
+                    f"{np.mean(np.abs(pull) < 1):.0%}",
                 )
             )
     header = (
-        "wavefronts", "scene", "found", "false", "flux / true", "mean pull",
-        "deviation of pulls",
+        "wavefronts", "scene", "contrast", "found", "false", "flux / true", "mean pull",
+        "deviation of pulls", "within 1 sigma",
     )  # fmt: skip
     return [
         "## Several planets, and a bright one",
@@ -198,17 +200,23 @@ def about_ring() -> list[str]:
     rows = []
     for kind, table in found.items():
         ratio = np.asarray(table["measured"] / table["light"])
+        pull = np.asarray((table["measured"] - table["light"]) / table["error"])
         kept = np.asarray(table["kept_by_subtraction"], dtype=float)
         rows.append(
             (
                 KINDS[kind],
                 str(len(table)),
                 f"{np.mean(ratio):.3f} ({ratio.min():.3f} to {ratio.max():.3f})",
-                f"{np.mean(table['error'] / table['light']):.3f}",
+                f"{np.mean(table['error'] / table['light']):.4f}",
+                f"{np.mean(pull):+.2f} ± {len(pull) ** -0.5:.2f}",
+                f"{np.std(pull):.2f}",
                 f"{np.mean(kept):.2f}",
             )
         )
-    header = ("wavefronts", "frames", "light / true", "its error", "kept by mere subtraction")
+    header = (
+        "wavefronts", "frames", "light / true", "its error", "mean pull", "deviation of pulls",
+        "kept by mere subtraction",
+    )  # fmt: skip
     return [
         "## A ring",
         "",
@@ -228,21 +236,20 @@ def about_snapshots() -> list[str]:
         return []
     rows = []
     for kind, table in found.items():
-        single = table[table["snapshots"] == 1]["error"].mean()
+        # Rows are in the order of seeds: frame by frame, as every seed may have its own wavefront.
+        single = np.asarray(table["error"][table["snapshots"] == 1], dtype=float)
         for count in sorted(set(table["snapshots"])):
             part = table[table["snapshots"] == count]
-            root = math.sqrt(count)
-            linked = np.asarray(part["linked_error"], dtype=float)
+            gain = single / np.asarray(part["error"]) / math.sqrt(count)
+            linked = single / np.asarray(part["linked_error"]) / math.sqrt(count)
             pull = (part["measured"] - 5e-7) / part["error"]
             rows.append(
                 (
                     KINDS[kind],
                     str(count),
                     f"{(5e-7 / part['error']).mean():.1f}",
-                    f"{single / part['error'].mean() / root:.3f}",
-                    f"{single / np.nanmean(linked) / root:.3f}"
-                    if np.isfinite(linked).any()
-                    else "",
+                    f"{gain.mean():.3f}",
+                    f"{np.nanmean(linked):.3f}" if np.isfinite(linked).any() else "",
                     f"{pull.mean():+.2f} ± {len(part) ** -0.5:.2f}",
                 )
             )
