@@ -438,6 +438,10 @@ def test_products_can_be_read_by_others(one: Detection, tmp_path: Path) -> None:
     assert len(curve) == len(one.contrast_curve)
 
 
+NOT_LOOKING = {"kappa_floor": 1e-6}
+"""With this option fits do not look for companions by themselves."""
+
+
 def kept(image: Image, star: Image, light: Image, error: Image) -> float:
     """Share of a planet's light that is in a subtracted frame, and not its noise's or star's."""
     good = np.isfinite(image)
@@ -479,14 +483,37 @@ def test_a_bright_companions_frame_is_what_its_own_fit_leaves(world: World) -> N
 def test_a_companion_that_one_fit_knows_is_given_to_the_others(world: World) -> None:
     planet = replace(WHERE, contrast=2e-5)
     shots = [world.observed(world.expected(planet), 80 + k) for k in (0, 1)]
-    options = {"kappa_floor": 1e-6}  # With it, fits do not look for companions by themselves.
     fits = [
-        world.refined(shots[0], planets=(planet,), **options),
-        world.refined(shots[1], **options),
+        world.refined(shots[0], planets=(planet,), **NOT_LOOKING),
+        world.refined(shots[1], **NOT_LOOKING),
     ]
     assert [len(fit.companions) for fit in fits] == [1, 0]
     found = dr.detect(fits)
     assert [len(fit.companions) for fit in found.fits] == [1, 1]
+
+
+def test_a_companion_that_is_none_is_given_to_no_fit(world: World) -> None:
+    planet = replace(WHERE, contrast=2e-5)
+    nothing = Planet(0.0, 0.9, 250.0)
+    fit = world.refined(world.observed(world.expected(planet), 80), planets=(planet, nothing))
+    assert len(fit.companions) == 2
+    found = dr.detect(fit)
+    assert len(found.candidates) == len(found.fits[0].companions) == 1
+
+
+@pytest.mark.parametrize("options", [{}, NOT_LOOKING], ids=["looking", "not looking"])
+def test_a_reference_star_on_its_own_stays_as_it_was_fitted(
+    world: World, options: dict[str, float]
+) -> None:
+    shot = world.observed(world.expected(replace(WHERE, contrast=2e-5)), 7)
+    target = world.refined(shot, **options)
+    alone = replace(world.observed(4 * world.expected(), 72), reference=True)
+    reference = world.refined(alone)
+    found = dr.detect([target, reference])
+    assert len(found.fits[0].companions) == len(found.candidates) == 1
+    assert found.fits[1] is reference
+    # What the fit has found by itself needs no second one.
+    assert [len(target.companions), found.fits[0] is target] == [int(not options), not options]
 
 
 def test_without_candidates_a_frame_is_left_as_the_fit_left_it(empty: list[Detection]) -> None:
