@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
     from pyklip_diffrender.fidelity import Plan, plan
     from pyklip_diffrender.linear_model import LinearModel
+    from pyklip_diffrender.memory import keep_freed_memory
     from pyklip_diffrender.nircam import nircam_coronagraph
     from pyklip_diffrender.observation import Observation
     from pyklip_diffrender.opd import drift, random_opd, read_opd
@@ -51,6 +52,7 @@ __all__ = [
     "drift",
     "from_poppy",
     "from_webbpsf",
+    "keep_freed_memory",
     "learn_prior",
     "measure",
     "nircam_coronagraph",
@@ -83,6 +85,7 @@ _MODULE_OF = {
     "drift": "opd",
     "from_poppy": "bridges",
     "from_webbpsf": "bridges",
+    "keep_freed_memory": "memory",
     "learn_prior": "priors",
     "measure": "detection",
     "nircam_coronagraph": "nircam",

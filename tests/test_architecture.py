@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "pyklip_diffrender"
 
 LAYERS = (
-    ("errors", "units", "files", "headers"),
+    ("errors", "units", "files", "headers", "memory"),
     ("geometry", "zernike", "spectrum", "parameters", "orientation"),
     ("propagation", "streaming"),
     ("planes", "detector", "masks", "arrays", "rotation", "detector_effects"),

@@ -164,7 +164,8 @@ def options(description: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _one_thread() -> None:
+def _begin_process() -> None:
+    dr.keep_freed_memory()
     torch.set_num_threads(1)
     # pyKLIP makes a pool for every subtraction; spawned, it would import everything anew.
     set_start_method("fork", force=True)
@@ -174,7 +175,7 @@ def mapped(work: Callable[..., Table], jobs: list[tuple[Any, ...]], processes: i
     """Run jobs, in processes of one thread each, and stack their tables in order."""
     if processes == 1:
         return vstack([work(*job) for job in jobs], metadata_conflicts="silent")
-    with ProcessPoolExecutor(processes, get_context("spawn"), _one_thread) as pool:
+    with ProcessPoolExecutor(processes, get_context("spawn"), _begin_process) as pool:
         tables = list(pool.map(work, *zip(*jobs, strict=True)))
     return vstack(tables, metadata_conflicts="silent")
 
