@@ -167,6 +167,16 @@ def test_a_bright_companion_gets_parameters_of_its_own(world: World, contrast: f
     assert fit.star_image == pytest.approx(world.expected(), rel=0.02, abs=100)
 
 
+@pytest.mark.parametrize(("contrast", "again"), [(1e-5, False), (3e-5, True)])
+def test_only_what_bends_the_wavefront_far_has_it_fitted_anew(
+    world: World, contrast: float, again: bool
+) -> None:
+    fit = world.fitted(7, replace(WHERE, contrast=contrast))
+    assert len(fit.companions) == 1
+    began = [record["wavefront"] for record in fit.history]
+    assert (began != sorted(began)) == again
+
+
 def test_what_a_fit_took_for_a_companion_need_not_be_one(world: World) -> None:
     observation = world.observed(world.expected(), 4)
     fit = world.refined(observation, planets=(replace(WHERE, contrast=1e-6),))

@@ -50,6 +50,9 @@ _COARSE = 0.01
 
 _FEW_CYCLES = 14.0
 
+_STALLED = 0.7
+"""Factor by which the model error must fall in a step that goes well."""
+
 _BRIGHT = 8.0
 """How far a companion must stand out, in units of the scatter, when the wavefront's fit stalls.
 
@@ -291,7 +294,8 @@ class GaussNewton:
         """Anneal kappa; fit alignment, then alignment and wavefront; return the best iterate."""
         began = time.perf_counter()
         options, state = self.options, self.state
-        kappa = max(self.misfit.model_error(state), options.kappa_floor)
+        needed = self.misfit.model_error(state)
+        kappa = max(needed, options.kappa_floor)
         best, best_error = state, (math.inf, math.inf)
         aligned, scales = state, self.scales
         status = Status.ITERATION_LIMIT
@@ -302,6 +306,7 @@ class GaussNewton:
         left = options.max_iterations
         while left:
             left -= 1
+            before = needed
             state, gain = self.descend(state, kappa, modes)
             needed, chi2 = self.misfit.model_error(state), self.misfit.chi2_per_pixel(state)
             if (needed, chi2) < best_error:
@@ -332,8 +337,13 @@ class GaussNewton:
                     status = self.status_of(chi2)
                     break
                 continue
-            stalled = needed > max(kappa, _NEGLIGIBLE)
+            stalled = needed > max(kappa, _NEGLIGIBLE, _STALLED * before)
             bright = self.bright_in(state, needed, modes) if stalled else []
+            if bright and needed < _COARSE:
+                # So near the solution all is linear: the wavefront gives back what it took.
+                best = state = self.with_companions(state, bright)
+                best_error = (math.inf, math.inf)
+                continue
             if bright:
                 # The wavefront has bent to it: back to where there was none.
                 best = state = self.with_companions(aligned, bright)
