@@ -14,7 +14,6 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
@@ -24,6 +23,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear_model import LinearModel
 from pyklip_diffrender.priors import EvidenceUpdate, scale_ratios, solve_with_evidence
 from pyklip_diffrender.refinement.companions import standing_out
+from pyklip_diffrender.refinement.conclusion import as_refinements
 from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.joint import Joint
 from pyklip_diffrender.refinement.linearised import Linearised, linearise
@@ -396,7 +396,6 @@ class GaussNewton:
             or len(equations.current) != count
         ):
             equations = linearise(self.misfit, state, kappa, modes)
-        frames = equations.frames
         update = self.solve(joint, equations, errors=True)
         assert update.variance is not None
         deviation = torch.sqrt(update.variance)
@@ -404,47 +403,25 @@ class GaussNewton:
             status = Status.PRIOR_MISMATCH
         linear = LinearModel(
             names=joint.names()[:count],
-            frames=frames,
+            frames=equations.frames,
             vector=state.vector[:count],
             mean=joint.initial()[:count],
             deviation=self.deviation(joint)[:count],
             curvature=equations.curvature,
         )
-        found = []
-        for k, (forward, point) in enumerate(zip(self.misfit.forwards, state.points, strict=True)):
-            unknowns, own = point.unknowns, deviation[joint.rows(k)[: len(frames[k].rows)]]
-            values = {n: v.cpu().numpy() for n, v in unknowns.values(point.vector).items()}
-            for name in ("flux", "background"):
-                values[name] = np.array([unknowns.level(name, point.vector)])
-            errors = {name: np.full(len(value), np.nan) for name, value in values.items()}
-            for name in unknowns.ordered:
-                errors[name] = own[unknowns.where(name)].numpy()
-            refinement = Refinement(
-                model=forward.problem.model,
-                observation=forward.problem.observation,
-                initial=forward.problem.initial,
-                opd=point.opd.cpu().numpy(),
-                star_image=point.star.cpu().numpy(),
-                values=values,
-                errors=errors,
-                status=status,
-                method="gauss-newton",
-                chi2_per_pixel=chi2,
-                model_error=kappa,
-                history=self.history,
-                seconds=time.perf_counter() - began,
-                seed=seed,
-                companions=unknowns.sources(point.vector).numpy(),
-                companion_errors=own[unknowns.where("companions")].reshape(-1, 3).numpy(),
-                companion_image=(point.total - point.star).cpu().numpy(),
-                scales=dict(zip(self.scale_names, self.scales.tolist(), strict=True)),
-                effective_parameters=update.effective,
-                log_evidence=update.log_evidence,
-                coefficients=point.vector[unknowns.where("modes")],
-                linear=linear,
-                frame=k,
-                settings=self.options,
-                start=forward.problem.start,
-            )
-            found.append(refinement)
-        return found
+        return as_refinements(
+            self.misfit,
+            state,
+            linear,
+            deviation,
+            status=status,
+            chi2_per_pixel=chi2,
+            model_error=kappa,
+            history=self.history,
+            seconds=time.perf_counter() - began,
+            seed=seed,
+            scales=dict(zip(self.scale_names, self.scales.tolist(), strict=True)),
+            effective_parameters=update.effective,
+            log_evidence=update.log_evidence,
+            settings=self.options,
+        )
