@@ -2,10 +2,11 @@
 
     python examples/paper/calibration.py --opd BEFORE AFTER --seeds 20
 
-One row of the table a frame: the standard deviation of S/N where there is no planet (for all
-positions, and for the rings), that of the matched filter that knows the star, on the same noise,
-and the ratio of the 5-sigma contrast to the matched filter's photon limit. About a hundred
-positions of a frame are independent: one frame's standard deviation scatters by 7 %. The longest
+One row of the table a frame: the standard deviation of S/N from 0 where there is no planet (for
+all positions, and for the rings), that of the matched filter that knows the star, on the same
+noise, and the ratio of the 5-sigma contrast to the matched filter's photon limit. About a hundred
+positions of a frame are independent, a dozen in the innermost ring: one frame's standard deviation
+scatters by 7 %, and about its own mean, which is not 0, it would be too small. The longest
 drift, extrapolated from the others, takes many times longer and gets a quarter of the seeds. On the
 embedded generator each seed has a wavefront and a drift of its own.
 """
@@ -45,6 +46,11 @@ def known_star_snr(found: Detection, shot: Frame) -> NDArray[np.float64]:
     return torch.cat(values).reshape(ny, nx).numpy()
 
 
+def deviation(snr: NDArray[np.float64]) -> float:
+    """Standard deviation from 0; NaN of nothing: a small field has no outer rings."""
+    return math.sqrt(np.mean(snr**2)) if snr.size else math.nan
+
+
 def one_frame(here: Setting, hours: float, seed: int) -> Table:
     """One row of the table."""
     here = here.redrawn(seed)
@@ -64,8 +70,8 @@ def one_frame(here: Setting, hours: float, seed: int) -> Table:
         "effective": fit.effective_parameters,
         "status": fit.status.name,
         "scatter": found.scatter,
-        "null": found.snr[inside].std(),
-        "known_star_null": optimal[inside].std(),
+        "null": deviation(found.snr[inside]),
+        "known_star_null": deviation(optimal[inside]),
         "highest": np.abs(found.snr[inside]).max(),
         "beyond_4": int((np.abs(found.snr[inside]) > 4).sum()),
         "positions": int(inside.sum()),
@@ -75,9 +81,9 @@ def one_frame(here: Setting, hours: float, seed: int) -> Table:
     limits = []
     for ring in RINGS[:-1]:
         where = (radius >= ring) & (radius < ring + 0.2)
-        # A small field has no outer rings.
         limits.append(float(np.median(limit[where])) if where.any() else math.nan)
-        row[f"null_{ring:.1f}"] = found.snr[where].std() if where.any() else math.nan
+        row[f"null_{ring:.1f}"] = deviation(found.snr[where])
+        row[f"known_star_{ring:.1f}"] = deviation(optimal[where])
         row[f"limit_{ring:.1f}"] = limits[-1]
     row["limit_mean"], row["limit_worst"] = np.nanmean(limits), np.nanmax(limits)
     return Table(rows=[row])

@@ -32,7 +32,10 @@ def about_calibration() -> list[str]:
     for kind, table in found.items():
         for hours in sorted(set(table["hours"])):
             part = table[table["hours"] == hours]
-            rings = [rms(part[f"null_{r:.1f}"]) for r in calibration.RINGS[:-1]]
+            rings, known = (
+                [rms(part[f"{name}_{r:.1f}"]) for r in calibration.RINGS[:-1]]
+                for name in ("null", "known_star")
+            )
             beyond = part["beyond_4"]
             expected = [
                 part["positions"].sum() * math.erfc(4 / width / math.sqrt(2))
@@ -45,7 +48,7 @@ def about_calibration() -> list[str]:
                     str(len(part)),
                     f"{rms(part['null']):.3f}",
                     f"{min(rings):.2f} to {max(rings):.2f}",
-                    f"{rms(part['known_star_null']):.3f}",
+                    f"{rms(part['known_star_null']):.3f} ({min(known):.2f} to {max(known):.2f})",
                     f"{beyond.sum()} ± {math.sqrt(len(part)) * np.std(beyond, ddof=1):.0f} "
                     f"({expected[0]:.1f}; {expected[1]:.1f})",
                     f"{part['highest'].max():.1f}",
@@ -58,19 +61,20 @@ def about_calibration() -> list[str]:
             )
     header = (
         "wavefronts", "drift, h", "frames", "S/N deviation", "in rings of 0.2 arcsec",
-        "the same, star known", "positions beyond 4 (Gaussian; as wide)", "highest",
+        "the same, star known (in rings)", "positions beyond 4 (Gaussian; as wide)", "highest",
         "limit / photon limit, mean", "worst ring", "star error, sigma", "chi2 / pixel", "status",
     )  # fmt: skip
     return [
         "## Is S/N calibrated?",
         "",
-        "Frames without a planet. The standard deviation of S/N over all positions from 0.3 to 2.3 "
-        "arcsec must be 1. About a hundred positions of a frame are independent, so that twenty "
-        "frames know it to 2 %; the matched filter that knows the star shows what the noise "
-        "itself did in those frames. The limit is the closed-form 5-sigma contrast, the median "
-        "over a ring, relative to that of the matched filter that knows the star. Positions beyond "
-        "4 come in clumps of a few pixels: their error is that of the sum over frames. Beside them "
-        "stands how many Gaussian noise has, of deviation 1 and of the deviation measured.",
+        "Frames without a planet. The standard deviation from 0 of S/N over all positions from 0.3 "
+        "to 2.3 arcsec must be 1. About a hundred positions of a frame are independent, a dozen in "
+        "the innermost ring, so that twenty frames know it to 2 and 6 %; the matched filter that "
+        "knows the star shows what the noise itself did in those frames. The limit is the "
+        "closed-form 5-sigma contrast, the median over a ring, relative to that of the matched "
+        "filter that knows the star. Positions beyond 4 come in clumps of a few pixels: their "
+        "error is that of the sum over frames. Beside them stands how many Gaussian noise has, of "
+        "deviation 1 and of the deviation measured.",
         "",
         *markdown(header, rows),
         *origin(found),
