@@ -339,18 +339,16 @@ class GaussNewton:
                 continue
             stalled = needed > max(kappa, _NEGLIGIBLE, _STALLED * before)
             bright = self.bright_in(state, needed, modes) if stalled else []
-            if bright and needed < _COARSE:
-                # So near the solution all is linear: the wavefront gives back what it took.
-                best = state = self.with_companions(state, bright)
-                best_error = (math.inf, math.inf)
-                continue
             if bright:
-                # The wavefront has bent to it: back to where there was none.
-                best = state = self.with_companions(aligned, bright)
+                # Near the solution all is linear, and the wavefront gives back what it took. Where
+                # it has bent too far for that: back to where there was none.
+                near = needed < _COARSE
+                best = state = self.with_companions(state if near else aligned, bright)
                 best_error, left = (math.inf, math.inf), options.max_iterations
-                self.scales, self.damping, modes = scales, 0.0, 0
-                kappa = max(self.misfit.model_error(state), options.kappa_floor)
                 bar.reset()
+                if not near:
+                    self.scales, self.damping, modes = scales, 0.0, 0
+                    kappa = max(self.misfit.model_error(state), options.kappa_floor)
                 continue
             if settled and kappa <= options.kappa_floor and modes == len(self.basis):
                 status = self.status_of(chi2)
