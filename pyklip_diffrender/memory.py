@@ -16,10 +16,10 @@ def keep_freed_memory() -> bool:
     """Keep what arrays free for the next ones, instead of giving it back to the system.
 
     A fit makes and frees gigabytes in arrays of tens of megabytes. As it comes, glibc has the
-    system provide each of them anew, page by page. Kept, they make a fit a tenth to a sixth faster,
-    the first one of a process up to a quarter (docs/inference.md); the process then holds as much
-    memory as it ever needed. The command line does this for its own process. A library must not for
-    its caller's: call it once, at the beginning of a program.
+    system provide each of them anew, page by page; kept, they made fits a tenth to a fifth faster
+    (docs/inference.md). The process then holds as much memory as it ever needed. The command line
+    does this for its own process. A library must not for its caller's: call it once, at the
+    beginning of a program.
 
     Returns
     -------

@@ -117,6 +117,7 @@ def loaded_by(code: str) -> set[str]:
             "-W",
             "error",
             "-c",
+            # On a line of its own, whatever the code has printed.
             f"{code}\nimport json, sys\nprint()\nprint(json.dumps(sorted(sys.modules)))",
         ],
         cwd=ROOT,

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from astropy.table import Table
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Detection
@@ -46,9 +46,11 @@ def known_star_snr(found: Detection, shot: Frame) -> NDArray[np.float64]:
     return torch.cat(values).reshape(ny, nx).numpy()
 
 
-def deviation(snr: NDArray[np.float64]) -> float:
-    """Standard deviation from 0; NaN of nothing: a small field has no outer rings."""
-    return math.sqrt(np.mean(snr**2)) if snr.size else math.nan
+def rms(values: ArrayLike) -> float:
+    """Root mean square of what is finite; NaN of nothing: a small field has no outer rings."""
+    array = np.asarray(values, dtype=float)
+    finite = array[np.isfinite(array)]
+    return math.sqrt(np.mean(finite**2)) if finite.size else math.nan
 
 
 def one_frame(here: Setting, hours: float, seed: int) -> Table:
@@ -70,8 +72,8 @@ def one_frame(here: Setting, hours: float, seed: int) -> Table:
         "effective": fit.effective_parameters,
         "status": fit.status.name,
         "scatter": found.scatter,
-        "null": deviation(found.snr[inside]),
-        "known_star_null": deviation(optimal[inside]),
+        "null": rms(found.snr[inside]),
+        "known_star_null": rms(optimal[inside]),
         "highest": np.abs(found.snr[inside]).max(),
         "beyond_4": int((np.abs(found.snr[inside]) > 4).sum()),
         "positions": int(inside.sum()),
@@ -82,8 +84,8 @@ def one_frame(here: Setting, hours: float, seed: int) -> Table:
     for ring in RINGS[:-1]:
         where = (radius >= ring) & (radius < ring + 0.2)
         limits.append(float(np.median(limit[where])) if where.any() else math.nan)
-        row[f"null_{ring:.1f}"] = deviation(found.snr[where])
-        row[f"known_star_{ring:.1f}"] = deviation(optimal[where])
+        row[f"null_{ring:.1f}"] = rms(found.snr[where])
+        row[f"known_star_{ring:.1f}"] = rms(optimal[where])
         row[f"limit_{ring:.1f}"] = limits[-1]
     row["limit_mean"], row["limit_worst"] = np.nanmean(limits), np.nanmax(limits)
     return Table(rows=[row])
@@ -105,8 +107,8 @@ def main() -> None:
     for hour in hours:
         part = table[table["hours"] == hour]
         print(
-            f"{hour:5.0f} h: null S/N {np.sqrt(np.mean(part['null'] ** 2)):.3f} "
-            f"(known star {np.sqrt(np.mean(part['known_star_null'] ** 2)):.3f}), "
+            f"{hour:5.0f} h: null S/N {rms(part['null']):.3f} "
+            f"(known star {rms(part['known_star_null']):.3f}), "
             f"limit {part['limit_mean'].mean():.3f}, star error {part['star_error'].mean():.2f}"
         )
 

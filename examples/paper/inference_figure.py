@@ -11,11 +11,6 @@ from pages import KINDS, tables
 COLOURS = {"measured": "#5b3f95", "generator": "#c0631a"}
 
 
-def rms(values: np.ndarray) -> float:
-    """Root mean square over frames."""
-    return float(np.sqrt(np.nanmean(np.asarray(values) ** 2)))
-
-
 def draw() -> Figure:
     """S/N calibration, limit, fluxes."""
     panels = 3 if tables("fluxes") else 2
@@ -28,7 +23,7 @@ def draw() -> Figure:
             if not len(part):
                 continue
             label = f"{KINDS[kind]}, {hours:g} h"
-            nulls = [rms(part[f"null_{r:.1f}"]) for r in calibration.RINGS[:-1]]
+            nulls = [calibration.rms(part[f"null_{r:.1f}"]) for r in calibration.RINGS[:-1]]
             limits = [part[f"limit_{r:.1f}"].mean() for r in calibration.RINGS[:-1]]
             left.plot(middles, nulls, style, color=COLOURS[kind], label=label)
             middle.plot(middles, limits, style, color=COLOURS[kind], label=label)

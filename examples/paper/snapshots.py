@@ -56,6 +56,17 @@ def one_seed(here: Setting, counts: tuple[int, ...], linked: int, seed: int) -> 
     return Table(rows=rows)
 
 
+def gain(table: Table, count: int, error: str) -> float:
+    """Of S/N with a number of snapshots, over its square root; NaN where none was measured.
+
+    Seed by seed, for each may have a wavefront of its own; rows are in the order of seeds.
+    """
+    single = np.asarray(table["error"][table["snapshots"] == 1], dtype=float)
+    several = np.asarray(table[error][table["snapshots"] == count], dtype=float)
+    ratio = single / several / math.sqrt(count)
+    return float(np.mean(ratio[np.isfinite(ratio)])) if np.isfinite(ratio).any() else math.nan
+
+
 def main() -> None:
     """Run the study."""
     parser = options(__doc__.splitlines()[0])
@@ -73,17 +84,14 @@ def main() -> None:
     table = timed_table(
         lambda: mapped(one_seed, jobs, given.processes), given.output / f"{name}.ecsv"
     )
-    # Rows are in the order of seeds: frame by frame, as every seed may have its own wavefront.
-    single = np.asarray(table["error"][table["snapshots"] == 1], dtype=float)
     for count in counts:
         part = table[table["snapshots"] == count]
-        gain = (single / np.asarray(part["error"])).mean() / math.sqrt(count)
         pull = (part["measured"] - PLANET.contrast) / part["error"]
-        text = f"N = {count}: gain over sqrt(N) {gain:.3f}, pull {pull.mean():.2f}"
-        linked = single / np.asarray(part["linked_error"]) / math.sqrt(count)
-        if np.isfinite(linked).any():
-            text += f", linked {np.nanmean(linked):.3f}"
-        print(text)
+        apart, linked = (gain(table, count, name) for name in ("error", "linked_error"))
+        print(
+            f"N = {count}: gain over sqrt(N) {apart:.3f}, fitted together {linked:.3f}, "
+            f"pull {pull.mean():.2f}"
+        )
 
 
 if __name__ == "__main__":

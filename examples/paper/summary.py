@@ -16,7 +16,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import calibration
 import fluxes
-from inference_figure import draw, rms
+import snapshots
+from calibration import rms
+from inference_figure import draw
 from pages import KINDS, RESULTS, markdown, origin, tables
 
 from pyklip_diffrender.files import replacing
@@ -240,20 +242,17 @@ def about_snapshots() -> list[str]:
         return []
     rows = []
     for kind, table in found.items():
-        # Rows are in the order of seeds: frame by frame, as every seed may have its own wavefront.
-        single = np.asarray(table["error"][table["snapshots"] == 1], dtype=float)
         for count in sorted(set(table["snapshots"])):
             part = table[table["snapshots"] == count]
-            gain = single / np.asarray(part["error"]) / math.sqrt(count)
-            linked = single / np.asarray(part["linked_error"]) / math.sqrt(count)
-            pull = (part["measured"] - 5e-7) / part["error"]
+            gain, linked = (snapshots.gain(table, count, n) for n in ("error", "linked_error"))
+            pull = (part["measured"] - snapshots.PLANET.contrast) / part["error"]
             rows.append(
                 (
                     KINDS[kind],
                     str(count),
-                    f"{(5e-7 / part['error']).mean():.1f}",
-                    f"{gain.mean():.3f}",
-                    f"{np.nanmean(linked):.3f}" if np.isfinite(linked).any() else "",
+                    f"{(snapshots.PLANET.contrast / part['error']).mean():.1f}",
+                    f"{gain:.3f}",
+                    "" if math.isnan(linked) else f"{linked:.3f}",
                     f"{pull.mean():+.2f} ± {len(part) ** -0.5:.2f}",
                 )
             )

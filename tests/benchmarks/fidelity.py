@@ -112,7 +112,7 @@ def main() -> None:
     print("|" + "---|" * len(header))
     for case in CASES:
         for seed in case.seeds:
-            print(row(case, seed), flush=True)
+            print(row(case, seed), flush=True)  # As they come: the whole takes minutes.
     print()
     print("\n".join(provenance("tests/benchmarks/fidelity.py", packages=())))
 

@@ -76,7 +76,7 @@ def main() -> None:
                 for frame in (frames[seen], frames[1 - seen], frames.mean(axis=0))
             ]
             rows.append((name, seen, *shares, fit.chi2_per_pixel, fit.status.name, fit.seconds))
-            print(rows[-1], flush=True)
+            print(rows[-1], flush=True)  # As they come: a fit takes a minute or more.
     table = Table(
         rows=rows,
         names=("model", "fitted", "fitted %", "held out %", "mean %", "chi2/pixel", "status", "s"),

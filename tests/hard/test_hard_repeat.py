@@ -166,7 +166,7 @@ def test_a_process_killed_in_the_middle_of_the_file_leaves_the_old_one(
         def half(hdus, name, **options):
             whole(hdus, name, **options)
             os.truncate(name, os.path.getsize(name) // 2)
-            print("writing", flush=True)
+            print("writing", flush=True)  # For whoever waits to kill this process.
             time.sleep(60)
 
         fits.HDUList.writeto = half
