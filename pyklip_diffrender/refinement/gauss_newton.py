@@ -50,9 +50,6 @@ _COARSE = 0.01
 
 _FEW_CYCLES = 14.0
 
-_STALLED = 0.7
-"""Factor by which the model error must fall in a step that goes well."""
-
 _BRIGHT = 8.0
 """How far a companion must stand out, in units of the scatter, when the wavefront's fit stalls.
 
@@ -306,7 +303,6 @@ class GaussNewton:
         left = options.max_iterations
         while left:
             left -= 1
-            before = needed
             state, gain = self.descend(state, kappa, modes)
             needed, chi2 = self.misfit.model_error(state), self.misfit.chi2_per_pixel(state)
             if (needed, chi2) < best_error:
@@ -337,7 +333,7 @@ class GaussNewton:
                     status = self.status_of(chi2)
                     break
                 continue
-            stalled = needed > max(kappa, _NEGLIGIBLE, _STALLED * before)
+            stalled = needed > max(kappa, _NEGLIGIBLE)
             bright = self.bright_in(state, needed, modes) if stalled else []
             if bright:
                 # Near the solution all is linear, and the wavefront gives back what it took. Where
