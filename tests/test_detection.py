@@ -379,6 +379,18 @@ def test_dithered_frames_have_star_positions_of_their_own(world: World) -> None:
     np.testing.assert_array_equal(fits[0].values["lyot_shift"], fits[1].values["lyot_shift"])
 
 
+def test_the_errors_of_frames_fitted_together_are_their_own(world: World) -> None:
+    first, second = (world.observed(world.expected(), 55 + k) for k in range(2))
+    noisy = replace(second, error=3 * second.error)
+    fits = world.refined([first, noisy])
+    apart = {name: noisier / fits[0].errors[name] for name, noisier in fits[1].errors.items()}
+    # Hardly anything else says what the background is; all say what the wavefront is, and with it
+    # where the star is.
+    assert apart["background"][0] == pytest.approx(2.9, abs=0.2)
+    assert (apart["star_offset"] > 1.005).all()
+    np.testing.assert_array_equal(apart["lyot_shift"], 1.0)
+
+
 def test_snapshots_may_drift_apart_by_what_the_prior_allows(world: World) -> None:
     generator = torch.Generator().manual_seed(8)
     change = torch.zeros(len(BASIS), dtype=torch.float64)

@@ -14,11 +14,11 @@ from pyklip_diffrender.fidelity.choice import Choice
 
 __all__ = ["Workload"]
 
-_STEPS = 8
-"""Linearisations of a fit."""
-
 _FULL_STEPS = 6
-"""Those that the wavefront takes part in."""
+"""Linearisations of a fit that the wavefront takes part in."""
+
+_DERIVATIVES = 4
+"""How often a fit propagates derivatives by the alignment: before those steps and per response."""
 
 _RENDERS = 10
 """Stars that a fit renders."""
@@ -31,7 +31,7 @@ _PER_FIELD = 3e-3
 _WAVEFRONT = 3.3e-2 / 1024**2
 """Seconds to sum the modes on a sample of the pupil."""
 
-_SLOPES = 7.5e-2
+_SLOPES = 3e-2
 """Seconds for the derivatives of the field with respect to the alignment."""
 
 _PER_MODE = 4e-4
@@ -100,7 +100,7 @@ class Workload:
         return (
             _RENDERS * render
             + waves * modes * mode
-            + _STEPS * waves * _SLOPES
+            + _DERIVATIVES * waves * _SLOPES
             + _FULL_STEPS * slopes * (_PER_SLOPE + waves * _PER_SLOPE_AND_WAVE)
             + _FULL_STEPS * effects * slopes * _PER_EFFECT
             + _FULL_STEPS * _PRODUCT * modes**2 * self.pixels * informative
