@@ -147,11 +147,12 @@ class LinearModel:
         1 less the ratio of posterior to prior variance: near 0 for what the data do not see, 1
         for what has no prior.
         """
-        inverse = torch.linalg.solve_triangular(
-            self._factor, torch.eye(len(self.vector), dtype=torch.float64), upper=False
-        )
-        variance = inverse.square_().sum(dim=0) * self._scale**2
-        return 1 - variance / self.deviation**2
+        return 1 - self.variances(torch.eye(len(self.vector)).double()) / self.deviation**2
+
+    def variances(self, combinations: Tensor) -> Tensor:
+        """Posterior variances, (k,), of linear combinations of the unknowns, (unknowns, k)."""
+        scaled = combinations * self._scale[:, None]
+        return torch.linalg.solve_triangular(self._factor, scaled, upper=False).square_().sum(dim=0)
 
     def unseen(self, limit: float = 0.01) -> tuple[str, ...]:
         """Names of the unknowns of which the data determine less than `limit`."""

@@ -20,6 +20,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.detection import Detection, small_sample_factor
 from pyklip_diffrender.detection.relinearise import with_companions
+from pyklip_diffrender.detection.scale import scale_errors
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.geometry import PupilGrid
 from pyklip_diffrender.observation import Observation
@@ -241,14 +242,60 @@ def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world: World) -> N
     """A contrast is relative to the star's light; whether there is a source at all is not."""
     fit = world.fitted(14, Planet(4e-6, 0.7, 60.0))  # Too faint to be refined again.
     row = dr.measure(fit, [WHERE.offset])[0]
-    flux = fit.values["flux"]
-    assert 0 < fit.errors["flux"][0] < 0.05 * flux[0]
-    for relative in (0.0, 0.1):
-        known = replace(fit, errors={**fit.errors, "flux": relative * flux})
-        other = dr.measure(known, [WHERE.offset])[0]
-        assert other["snr"] == pytest.approx(row["snr"])
-        expected = other["contrast"] * math.hypot(relative, 1 / other["snr"])
-        assert other["contrast_error"] == pytest.approx(expected, rel=1e-6)
+    relative = fit.errors["flux"][0] / fit.values["flux"][0]
+    assert 1e-4 < relative < 0.05
+    expected = row["contrast"] * math.hypot(relative, 1 / row["snr"])
+    # At this S/N the flux's share is small, but far above rounding.
+    assert row["contrast_error"] == pytest.approx(expected, rel=1e-8)
+    assert expected > (1 + 1e-6) * row["contrast"] / row["snr"]
+
+
+def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(world: World) -> None:
+    """As far as wavefronts that are as probable as the one that was found change its light."""
+    found = dr.detect(world.fitted(13, replace(WHERE, contrast=1e-3)))
+    (linear, templates), fit = found.groups[0], found.fits[0]
+    row = found.table[0]
+    own = row["contrast"] / row["snr"]
+    stated = math.sqrt((row["contrast_error"] ** 2 - own**2).item()) / row["contrast"]
+    assert fit.coefficients is not None
+    deviation = linear.covariance.diagonal().sqrt()
+    factor = torch.linalg.cholesky(linear.covariance / deviation[:, None] / deviation)
+    generator = torch.Generator().manual_seed(2)
+    offset, flux = found.candidates.offsets[0], linear.names.index("flux[0]")
+    image = templates.image(0, offset)
+    seen = image * linear.frames[0].weight ** 2
+    changes = []
+    for _ in range(400):
+        drawn = factor @ torch.randn(len(factor), dtype=torch.float64, generator=generator)
+        drawn *= deviation
+        opd = BASIS.opd(1e-9 * drawn[-len(BASIS) :], PupilGrid.full(NPIX))
+        light = float((seen * templates.image(0, offset, opd)).sum() / (seen * image).sum())
+        changes.append(light * (1 + float(drawn[flux] / fit.values["flux"][0])))
+    assert stated == pytest.approx(float(np.std(changes)), rel=0.12)
+    # The star's flux alone would not do.
+    assert stated > 1.15 * fit.errors["flux"][0] / fit.values["flux"][0]
+
+
+def test_what_flux_and_image_do_to_a_contrast_may_cancel(one: Detection) -> None:
+    (linear, templates), offset = one.groups[0], torch.tensor([WHERE.offset], dtype=torch.float64)
+    flux, mode = linear.names.index("flux[0]"), linear.names.index("modes[40]")
+    seen = templates.image(0, offset[0]) * linear.frames[0].weight ** 2
+    nanometre = BASIS.opd(1e-9 * torch.eye(len(BASIS)).double()[40], PupilGrid.full(NPIX))
+    more, less = (templates.image(0, offset[0], step * nanometre) for step in (0.5, -0.5))
+    slope = (seen * (more - less)).sum() / (seen * templates.image(0, offset[0])).sum()
+    changes = torch.zeros(len(linear.names), dtype=torch.float64)
+    changes[flux], changes[mode] = 1 / one.fits[0].values["flux"][0], slope
+    deviation = torch.full_like(linear.deviation, 1e-12)
+    deviation[[flux, mode]] = 1e-3 / changes[[flux, mode]].abs()
+
+    def error(curvature: torch.Tensor, frames: int = 1) -> float:
+        known = replace(linear, deviation=deviation, curvature=curvature)
+        return float(scale_errors([(known, templates)] * frames, offset, torch.tensor([1e3]))[0])
+
+    untied, tied = torch.zeros_like(linear.curvature), 1e14 * torch.outer(changes, changes)
+    assert error(untied) == pytest.approx(math.sqrt(2) * 1e-3, rel=1e-5)
+    assert error(untied, frames=2) == pytest.approx(1e-3, rel=1e-5)
+    assert error(tied) < 1e-6
 
 
 def test_two_planets_closer_than_a_beam_are_fitted_together(world: World) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.relinearise import star_only, without_light
+from pyklip_diffrender.detection.scale import scale_errors
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.files import replacing, write_fits
@@ -49,28 +50,17 @@ def amplitudes(
         information += weighed.information
     error = scatter / information.sqrt().numpy()
     contrast = (numerator / information).numpy()
+    snr = contrast / error
+    scale = scale_errors(groups, places, torch.from_numpy(snr))
     return QTable(
         {
             "x": places[:, 0].numpy() * u.arcsec,
             "y": places[:, 1].numpy() * u.arcsec,
             "contrast": contrast,
-            "contrast_error": np.hypot(error, contrast * star_flux_error(groups)),
-            "snr": contrast / error,
+            "contrast_error": np.hypot(error, contrast * scale.numpy()),
+            "snr": snr,
         }
     )
-
-
-def star_flux_error(groups: Sequence[tuple[LinearModel, Templates]]) -> float:
-    """Relative error of the light that contrasts are relative to; of several frames, of the mean.
-
-    It is integrated out of a source's amplitude as all else is; but a contrast is the source's
-    light over the star's. It does not make a source more or less significant.
-    """
-    fits = [fit for _, templates in groups for fit in templates.fits]
-    relative = [
-        float(fit.errors["flux"][0] / fit.values["flux"][0]) for fit in fits if "flux" in fit.errors
-    ]
-    return float(np.sqrt(np.nansum(np.square(relative)))) / len(fits)
 
 
 def _amplitude(linear: LinearModel, frame: int, shape: torch.Tensor) -> tuple[float, float]:
@@ -143,8 +133,9 @@ class Detection:
         """The candidates, brightest in S/N first.
 
         x, y, separation and position angle (counter-clockwise from +y of the image), contrast,
-        their errors, and S/N. The error of the contrast knows of that of the star's flux; S/N,
-        which asks whether there is a source at all, does not.
+        their errors, and S/N. The error of the contrast contains those of the star's flux and of
+        the source's own image (see `scale.scale_errors`); S/N, which asks whether there is a
+        source at all, does not.
         """
         found = self.candidates
         x, y = found.offsets.T.numpy()
@@ -175,7 +166,7 @@ class Detection:
                 "position_angle": np.rad2deg(np.arctan2(-x, y)) % 360 * u.deg,
                 "position_angle_error": np.rad2deg(angular) * u.deg,
                 "contrast": contrast,
-                "contrast_error": np.hypot(errors[:, 0], contrast * star_flux_error(self.groups)),
+                "contrast_error": np.hypot(errors[:, 0], contrast * self._scale_errors),
                 "snr": contrast / errors[:, 0] if count else np.zeros(0),
             }
         )
@@ -183,6 +174,13 @@ class Detection:
         table = table[order]
         table.meta = self._provenance()
         return table
+
+    @cached_property
+    def _scale_errors(self) -> Image:
+        """Of the candidates' contrasts, relative, (k,)."""
+        found = self.candidates
+        snr = found.contrasts / (self.scatter * found.errors[:, 0])
+        return scale_errors(self.groups, found.offsets, snr).numpy()
 
     def measure(self, offsets: ArrayLike) -> QTable:
         """Contrast of a point source at given positions, one at a time.

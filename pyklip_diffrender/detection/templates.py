@@ -135,7 +135,7 @@ class Templates:
         """
         found = {}
         for k, fit in enumerate(self.fits):
-            image = partial(self._image, k)
+            image = partial(self.image, k)
             rows = []
             for offset in offsets:
                 with torch.no_grad():
@@ -148,11 +148,21 @@ class Templates:
             found[fit.frame] = (stacked if slopes else stacked[0]).cpu()
         return found
 
-    def _image(self, k: int, offset: Tensor) -> Tensor:
-        """One planet in frame k, as a fraction of the star's light."""
+    def image(self, k: int, offset: Tensor, change: Tensor | None = None) -> Tensor:
+        """One planet in the frame of `fits[k]`, as a fraction of the star's light, (ny, nx).
+
+        Parameters
+        ----------
+        k : int
+        offset : Tensor, (2,)
+            As for `at`.
+        change : Tensor, (npix, npix), optional
+            Of the wavefront that was found, m.
+        """
         fit = self.fits[k]
         there = {**fit.optical_values, "star_offset": self._star(fit) + self._turned(k, offset)}
-        return fit.model(_as_tensor(fit.opd), **there).double()
+        opd = _as_tensor(fit.opd)
+        return fit.model(opd if change is None else opd + change, **there).double()
 
 
 def _roll(fit: Refinement, origin: Refinement) -> float:

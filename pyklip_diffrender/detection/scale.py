@@ -1,0 +1,78 @@
+"""How well that is known by which a contrast is measured: the star's light, the source's image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.geometry import PupilGrid
+from pyklip_diffrender.linear_model import LinearFrame, LinearModel
+from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.response import NANOMETRE
+
+__all__ = ["scale_errors"]
+
+_CLEAR = 25.0
+"""S/N from which on it matters that the wavefront makes a source's own image, too."""
+
+
+def scale_errors(
+    groups: Sequence[tuple[LinearModel, Templates]], offsets: Tensor, significance: Tensor
+) -> Tensor:
+    """Relative errors of contrasts by what the sources' light is compared with.
+
+    A contrast is the source's light over the star's, and the light is measured by an image that
+    the wavefront forms: what is not known of the flux or of the wavefront changes it in proportion.
+    Neither makes a source more or less significant. Both come from the same posterior, and may
+    cancel in part.
+
+    Parameters
+    ----------
+    groups : sequence of (LinearModel, Templates)
+        Independent of each other.
+    offsets : Tensor, (k, 2)
+        x, y of the sources from the star, arcsec.
+    significance : Tensor, (k,)
+        Their S/N. The image of a source below 25 counts as known: noise hides what is not.
+
+    Returns
+    -------
+    Tensor, (k,), float64
+    """
+    frames = sum(len(templates.fits) for _, templates in groups)
+    variance = torch.zeros(len(offsets), dtype=torch.float64)
+    for linear, templates in groups:
+        changes = torch.zeros(len(linear.vector), len(offsets), dtype=torch.float64)
+        for k, fit in enumerate(templates.fits):
+            frame = linear.frames[fit.frame]
+            on_rows = torch.zeros(len(frame.rows), len(offsets), dtype=torch.float64)
+            for row, unknown in enumerate(frame.rows[: frame.modes].tolist()):
+                if linear.names[unknown].startswith("flux["):
+                    on_rows[row] = 1 / float(fit.values["flux"][0])
+            for j in torch.nonzero(significance > _CLEAR).flatten().tolist():
+                on_rows[frame.modes :, j] = _by_modes(templates, k, fit, frame, offsets[j])
+            changes += frame.onto_unknowns(on_rows, len(linear.vector)) / frames
+        variance += linear.variances(changes)
+    return variance.sqrt()
+
+
+def _by_modes(
+    templates: Templates, k: int, fit: Refinement, frame: LinearFrame, offset: Tensor
+) -> Tensor:
+    """By what share every mode changes a source's light as its template sees it, per nm.
+
+    The part of the image's change that looks like the image; the rest only adds information.
+    """
+    basis = fit.settings.basis
+    count = len(frame.rows) - frame.modes
+    grid = PupilGrid.full(fit.model.npix, fit.model.diameter)
+    coefficients = torch.zeros(count, dtype=torch.float64, requires_grad=bool(count))
+    if not count:
+        return coefficients
+    image = templates.image(k, offset, basis.opd(coefficients * NANOMETRE, grid))
+    seen = image.detach() * frame.weight.to(image.device) ** 2
+    share = (seen * image).sum() / (seen * image.detach()).sum()
+    return torch.autograd.grad(share, coefficients)[0]
