@@ -3,8 +3,8 @@
     python examples/paper/snapshots.py --opd BEFORE AFTER --seeds 20
 
 The snapshots are three hours apart, beginning 40 h after the map. Fitted one by one (their
-information adds), and together with a wavefront that may drift (linked), for half the seeds. On the
-embedded generator each seed has a wavefront and a drift of its own.
+information adds), and together with a wavefront that may drift (linked), for a quarter of the
+seeds. On the embedded generator each seed has a wavefront and a drift of its own.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def main() -> None:
     counts = COUNTS[:2] if given.quick else COUNTS
     seeds = 1 if given.quick else given.seeds
     jobs = [
-        (here, counts, given.linked if seed < (seeds + 1) // 2 else 0, seed)
+        (here, counts, given.linked if seed < max(1, seeds // 4) else 0, seed)
         for seed in range(seeds)
     ]
     name = "snapshots_measured" if given.opd else "snapshots_generator"
