@@ -6,9 +6,9 @@ One row of the table a frame: the standard deviation of S/N from 0 where there i
 all positions, and for the rings), that of the matched filter that knows the star, on the same
 noise, and the ratio of the 5-sigma contrast to the matched filter's photon limit. About a hundred
 positions of a frame are independent, a dozen in the innermost ring: one frame's standard deviation
-scatters by 7 %, and about its own mean, which is not 0, it would be too small. The longest
-drift, extrapolated from the others, takes many times longer and gets a quarter of the seeds. On the
-embedded generator each seed has a wavefront and a drift of its own.
+scatters by 7 %, and about its own mean, which is not 0, it would be too small. Frames of the
+longest drift, extrapolated from the others, take many times longer than those. On the embedded
+generator each seed has a wavefront and a drift of its own.
 """
 
 from __future__ import annotations
@@ -98,8 +98,7 @@ def main() -> None:
     changes = {"npix": 256, "fov_pixels": 48} if given.quick else {}
     here = setting(tuple(given.opd) if given.opd else None, **changes)
     hours, seeds = (HOURS[2:3], 2) if given.quick else (HOURS, given.seeds)
-    few = max(1, seeds // 4)
-    jobs = [(here, h, k) for k in range(seeds) for h in hours if h < HOURS[-1] or k < few]
+    jobs = [(here, h, k) for k in range(seeds) for h in hours]
     name = "calibration_measured" if given.opd else "calibration_generator"
     table = timed_table(
         lambda: mapped(one_frame, jobs, given.processes), given.output / f"{name}.ecsv"

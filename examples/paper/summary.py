@@ -145,7 +145,7 @@ def about_mismatch() -> list[str]:
             values = np.asarray(table[name], dtype=float)
             cells.append(f"{np.median(values):.4g} ({values.min():.4g} to {values.max():.4g})")
         rows.append(cells)
-    frames = ", ".join(f"{len(table)} frames" for table in found.values())
+    frames = ", ".join(f"{len(table)} frames ({KINDS[kind]})" for kind, table in found.items())
     return [
         "## Nothing known about the instrument",
         "",

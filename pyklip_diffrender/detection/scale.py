@@ -1,4 +1,4 @@
-"""How well that is known by which a contrast is measured: the star's light, the source's image."""
+"""How well the scale of a contrast is known: the star's light, and the source's own image."""
 
 from __future__ import annotations
 
@@ -66,13 +66,12 @@ def _by_modes(
 
     The part of the image's change that looks like the image; the rest only adds information.
     """
-    basis = fit.settings.basis
-    count = len(frame.rows) - frame.modes
+    modes = torch.zeros(len(frame.rows) - frame.modes, dtype=torch.float64)
+    if not len(modes):
+        return modes  # The wavefront was not fitted.
+    modes.requires_grad_()
     grid = PupilGrid.full(fit.model.npix, fit.model.diameter)
-    coefficients = torch.zeros(count, dtype=torch.float64, requires_grad=bool(count))
-    if not count:
-        return coefficients
-    image = templates.image(k, offset, basis.opd(coefficients * NANOMETRE, grid))
+    image = templates.image(k, offset, fit.settings.basis.opd(modes * NANOMETRE, grid))
     seen = image.detach() * frame.weight.to(image.device) ** 2
     share = (seen * image).sum() / (seen * image.detach()).sum()
-    return torch.autograd.grad(share, coefficients)[0]
+    return torch.autograd.grad(share, modes)[0]

@@ -54,7 +54,7 @@ _NEAR = 0.003
 """Model error below which a companion that a fit finds has bent the wavefront but little.
 
 Planets of 5e-7 to 2e-6 were found at 0.001 to 0.0026; side lobes of one of 1e-4 at 0.3 arcsec, in
-its place, at 0.004 to 0.013.
+its place, at 0.005 to 0.1.
 """
 
 _BRIGHT = 8.0
