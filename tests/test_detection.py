@@ -62,8 +62,8 @@ class World:
         scale = self.model.detector.pixelscale
         return Observation.from_arrays(counts, error, pixelscale=scale, **details)
 
-    def fitted(self, seed: int, *planets: Planet) -> Refinement:
-        return self.refined(self.observed(self.expected(*planets), seed))
+    def fitted(self, seed: int, *planets: Planet, **options: object) -> Refinement:
+        return self.refined(self.observed(self.expected(*planets), seed), **options)
 
     def refined(self, observation: Observation, **options: object) -> Refinement:
         return refine(self.model, observation, self.opd, basis=BASIS, response_npix=NPIX, **options)  # type: ignore[call-overload, no-any-return]
@@ -241,13 +241,15 @@ def test_measuring_at_a_pixel_gives_the_maps_value(one: Detection) -> None:
 def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world: World) -> None:
     """A contrast is relative to the star's light; whether there is a source at all is not."""
     fit = world.fitted(14, Planet(4e-6, 0.7, 60.0))  # Too faint to be refined again.
-    row = dr.measure(fit, [WHERE.offset])[0]
+    row, scaled = (dr.measure(fit, [WHERE.offset], scatter=factor)[0] for factor in (1.0, 2.0))
     relative = fit.errors["flux"][0] / fit.values["flux"][0]
     assert 1e-4 < relative < 0.05
     expected = row["contrast"] * math.hypot(relative, 1 / row["snr"])
     # At this S/N the flux's share is small, but far above rounding.
     assert row["contrast_error"] == pytest.approx(expected, rel=1e-8)
     assert expected > (1 + 1e-6) * row["contrast"] / row["snr"]
+    # And what makes all errors larger makes this one larger.
+    assert scaled["contrast_error"] == pytest.approx(2 * row["contrast_error"], rel=1e-8)
 
 
 def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(world: World) -> None:
@@ -274,6 +276,19 @@ def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(world: W
     assert stated == pytest.approx(float(np.std(changes)), rel=0.12)
     # The star's flux alone would not do.
     assert stated > 1.15 * fit.errors["flux"][0] / fit.values["flux"][0]
+
+
+def test_a_wavefront_that_is_known_adds_nothing_to_a_bright_contrasts_error(world: World) -> None:
+    known = replace(world, opd=world.later)
+    found = dr.detect(known.fitted(14, replace(WHERE, contrast=1e-3), wavefront=False))
+    fit, row = found.fits[0], found.table[0]
+    relative = found.scatter * fit.errors["flux"][0] / fit.values["flux"][0]
+    expected = row["contrast"] * math.hypot(relative, 1 / row["snr"])
+    assert row["snr"] > 100
+    # The fit's own error of the flux knows of the companion beside it, the map's does not.
+    assert row["contrast_error"] == pytest.approx(expected, rel=2e-3)
+    assert row["contrast_error"] > 1.02 * row["contrast"] / row["snr"]
+    assert abs(row["contrast"] - 1e-3) < 4 * expected
 
 
 def test_what_flux_and_image_do_to_a_contrast_may_cancel(one: Detection) -> None:

@@ -51,13 +51,13 @@ def amplitudes(
     error = scatter / information.sqrt().numpy()
     contrast = (numerator / information).numpy()
     snr = contrast / error
-    scale = scale_errors(groups, places, torch.from_numpy(snr))
+    scale = scatter * scale_errors(groups, places, torch.from_numpy(snr)).numpy()
     return QTable(
         {
             "x": places[:, 0].numpy() * u.arcsec,
             "y": places[:, 1].numpy() * u.arcsec,
             "contrast": contrast,
-            "contrast_error": np.hypot(error, contrast * scale.numpy()),
+            "contrast_error": np.hypot(error, contrast * scale),
             "snr": snr,
         }
     )
@@ -180,7 +180,7 @@ class Detection:
         """Of the candidates' contrasts, relative, (k,)."""
         found = self.candidates
         snr = found.contrasts / (self.scatter * found.errors[:, 0])
-        return scale_errors(self.groups, found.offsets, snr).numpy()
+        return self.scatter * scale_errors(self.groups, found.offsets, snr).numpy()
 
     def measure(self, offsets: ArrayLike) -> QTable:
         """Contrast of a point source at given positions, one at a time.
