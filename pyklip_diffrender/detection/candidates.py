@@ -141,7 +141,7 @@ def refine_candidates(
             converged = True
             break
     if not converged:
-        _log.warning("positions of %d candidates did not settle", count)
+        _log.warning("positions did not settle, number of candidates: %d", count)
     return Candidates(offsets, contrasts, covariance, converged)
 
 
