@@ -19,6 +19,7 @@ from scipy import stats
 import pyklip_diffrender as dr
 from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.detection import Detection, small_sample_factor
+from pyklip_diffrender.detection.excess import excess
 from pyklip_diffrender.detection.relinearise import with_companions
 from pyklip_diffrender.detection.scale import scale_errors
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
@@ -87,7 +88,7 @@ def empty(world: World) -> list[Detection]:
 
 @pytest.fixture(scope="module")
 def one(world: World) -> Detection:
-    """A planet of S/N 12 or so."""
+    """A planet of S/N 44 or so."""
     return dr.detect(world.fitted(11, replace(WHERE, contrast=1e-5)))
 
 
@@ -193,6 +194,23 @@ def test_a_prior_that_is_held_too_narrow_is_noticed(world: World) -> None:
         fit = world.refined(observation, prior=held)
         assert fit.status is status
         assert fit.status.calibrated == (factor == 1.0)
+
+
+def test_a_planet_does_not_make_the_noise_larger(world: World) -> None:
+    planet = replace(WHERE, contrast=3e-6)
+    quiet, fit = world.fitted(5), world.fitted(5, planet)
+    noise, found = dr.detect(quiet), dr.detect(fit)
+    assert len(found.candidates) == 1
+    assert len(fit.companions) == 0
+    # Its light would be structure that no mode explains.
+    assert fit.reduced_chi2 > 1.1 * quiet.reduced_chi2
+    nobody = torch.zeros(0, 2, dtype=torch.float64)
+    assert excess(found.groups, nobody) == pytest.approx(math.sqrt(fit.reduced_chi2), rel=0.01)
+    assert found.scatter == pytest.approx(noise.scatter, rel=0.01)
+    # The same where positions are given, once or more often.
+    once, thrice = (dr.measure(fit, [planet.offset] * count) for count in (1, 3))
+    assert found.measure([planet.offset])["snr"] == pytest.approx(once["snr"], rel=0.01)
+    assert thrice["snr"].tolist() == pytest.approx([once["snr"][0]] * 3, rel=1e-4)
 
 
 def test_a_model_that_is_wrong_inflates_the_errors(world: World) -> None:
@@ -517,7 +535,7 @@ def test_products_can_be_read_by_others(one: Detection, tmp_path: Path) -> None:
         assert "pyklip_diffrender" in hdus[0].header["software"]
     table = QTable.read(paths[1], format="ascii.ecsv")
     assert table["separation"].unit == "arcsec"
-    assert table.meta["scatter"] == 1.0
+    assert table.meta["scatter"] == one.scatter
     curve = QTable.read(paths[2], format="ascii.ecsv")
     assert len(curve) == len(one.contrast_curve)
 

@@ -9,7 +9,6 @@ unbiased, with an error that contains the price of the wavefront's freedom.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,6 +22,7 @@ from pyklip_diffrender.detection.contrast import (
     ring_pixels,
     small_sample_factor,
 )
+from pyklip_diffrender.detection.excess import excess
 from pyklip_diffrender.detection.maps import Group, Maps
 from pyklip_diffrender.detection.relinearise import lacking, star_only, with_companions
 from pyklip_diffrender.detection.result import Detection, amplitudes
@@ -44,6 +44,9 @@ _log = logging.getLogger(__name__)
 
 _MOST = 20
 """Candidates at most."""
+
+_SOURCE = 5.0
+"""S/N from which on `measure` takes it that there is a source."""
 
 _WINGS = 0.4
 """arcsec; nearer than this to a candidate, S/N says nothing about the noise."""
@@ -72,7 +75,8 @@ def detect(
         Candidates are not looked for nearer to the star, arcsec.
     scatter : float, optional
         Factor for all errors. Default, where every fit explains its data, the square root of what
-        chi2 is to what noise makes it; else the scatter of S/N away from candidates. Never below 1.
+        chi2 is to what noise makes it, less the candidates' light; else the scatter of S/N away
+        from candidates. Never below 1.
     separations : array, optional
         Of the contrast curve, arcsec. Default every 0.1 from 0.2 to the nearest edge.
     relinearise : float
@@ -136,8 +140,8 @@ def measure(
     offsets : (k, 2)
         x, y from the star, arcsec, image orientation of the first frame.
     scatter : float, optional
-        Factor for the errors. Default as for `detect`, or 1 for fits that do not explain their
-        data.
+        Factor for the errors. Default as for `detect`, less the light measured here where its S/N
+        is above 5; or 1 for fits that do not explain their data.
     relinearise : float
         See `detect`.
 
@@ -151,16 +155,26 @@ def measure(
     IncompatibleSetupError, ShapeError
     """
     given = [fits] if isinstance(fits, Refinement) else list(fits)
-    factor = _excess(given) if scatter is None else scatter
-    table = amplitudes(_groups(given), offsets, factor)
+    table = _measured(given, offsets, scatter)
     bright = table[table["snr"] > relinearise]
     if len(bright):
         places = torch.from_numpy(np.stack([bright["x"].value, bright["y"].value], axis=1))
         contrasts = torch.from_numpy(np.asarray(bright["contrast"]))
         known = Candidates(places, contrasts, torch.zeros(3 * len(bright), 3 * len(bright)))
-        given = with_companions(given, known)
-        factor = _excess(given) if scatter is None else scatter
-        table = amplitudes(_groups(given), offsets, factor)
+        table = _measured(with_companions(given, known), offsets, scatter)
+    return table
+
+
+def _measured(fits: Sequence[Refinement], offsets: ArrayLike, scatter: float | None) -> QTable:
+    groups = _groups(fits)
+    table = amplitudes(groups, offsets, 1.0 if scatter is None else scatter)
+    if scatter is None:
+        sources = table[table["snr"] > _SOURCE]
+        places = np.stack([sources["x"].value, sources["y"].value], axis=1)
+        known = Candidates.of_fit(fits[0]).offsets
+        factor = _factor(fits, groups, torch.cat([known, torch.from_numpy(places)]))
+        table["contrast_error"] *= factor
+        table["snr"] /= factor
     return table
 
 
@@ -181,7 +195,8 @@ def contrast_curve(
     angles : int
         Positions per separation, at most.
     scatter : float, optional
-        Factor for the errors; see `measure`.
+        Factor for the errors; see `measure`. A source that no fit knows as a companion makes the
+        default larger; `detect` finds it first.
 
     Returns
     -------
@@ -203,7 +218,9 @@ def contrast_curve(
         information += weighed.information
         photon += weighed.photon
     ends = np.cumsum([len(ring[0]) for ring in rings])[:-1]
-    factor = _excess(given) if scatter is None else scatter
+    factor = scatter
+    if factor is None:
+        factor = _factor(given, groups, Candidates.of_fit(given[0]).offsets)
     errors = np.split(factor * information.numpy() ** -0.5, ends)
     known = np.split(photon.numpy() ** -0.5, ends)
     return contrast_table(wanted, errors, known, _resolution(given[0]))
@@ -247,7 +264,7 @@ def _search(
     """Candidates, strongest first, and the factor for the errors."""
     grid = maps.groups[0][1].grid
     pixel = float(np.abs(np.diff(grid[:, :, 0], axis=1)).mean())
-    explained, excess = all(fit.status.calibrated for fit in fits), _excess(fits)
+    explained = all(fit.status.calibrated for fit in fits)
     found = start
     if len(start):
         found = refine_candidates(maps.groups, start, reach=pixel / 2)
@@ -260,7 +277,11 @@ def _search(
         snr = maps.snr(maps.without(found))
         factor = scatter
         if factor is None:
-            factor = excess if explained else max(1.0, _scatter(snr, grid, found, inner))
+            factor = (
+                excess(maps.groups, found.offsets)
+                if explained
+                else max(1.0, _scatter(snr, grid, found, inner))
+            )
         peak = strongest_peak(
             snr / factor, grid, found.offsets, threshold=threshold, inner=inner, apart=pixel
         )
@@ -273,15 +294,10 @@ def _search(
         _log.info("candidates at %s arcsec", found.offsets.tolist())
 
 
-def _excess(fits: Sequence[Refinement]) -> float:
-    """By how much residuals are larger than noise makes them, at least 1.
-
-    A few percent of structure that no mode explains are in the star's place in a planet's filter,
-    too. Where fits do not explain their data at all, their model error says so instead.
-    """
-    if not all(fit.status.calibrated for fit in fits):
-        return 1.0
-    return max(1.0, math.sqrt(np.mean([fit.reduced_chi2 for fit in fits])))
+def _factor(fits: Sequence[Refinement], groups: Sequence[Group], offsets: torch.Tensor) -> float:
+    """For the errors, with the light of sources at `offsets` taken out."""
+    # Where fits do not explain their data at all, their model error is in their noise already.
+    return excess(groups, offsets) if all(fit.status.calibrated for fit in fits) else 1.0
 
 
 def _scatter(
