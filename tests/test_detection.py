@@ -19,7 +19,6 @@ from scipy import stats
 import pyklip_diffrender as dr
 from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.detection import Detection, small_sample_factor
-from pyklip_diffrender.detection.excess import excess
 from pyklip_diffrender.detection.relinearise import with_companions
 from pyklip_diffrender.detection.scale import scale_errors
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
@@ -204,13 +203,17 @@ def test_a_planet_does_not_make_the_noise_larger(world: World) -> None:
     assert len(fit.companions) == 0
     # Its light would be structure that no mode explains.
     assert fit.reduced_chi2 > 1.1 * quiet.reduced_chi2
-    nobody = torch.zeros(0, 2, dtype=torch.float64)
-    assert excess(found.groups, nobody) == pytest.approx(math.sqrt(fit.reduced_chi2), rel=0.01)
     assert found.scatter == pytest.approx(noise.scatter, rel=0.01)
     # The same where positions are given, once or more often.
     once, thrice = (dr.measure(fit, [planet.offset] * count) for count in (1, 3))
     assert found.measure([planet.offset])["snr"] == pytest.approx(once["snr"], rel=0.01)
     assert thrice["snr"].tolist() == pytest.approx([once["snr"][0]] * 3, rel=1e-4)
+
+
+def test_weights_for_outliers_do_not_hide_structure(world: World) -> None:
+    fit = world.refined(world.observed(world.expected(), 5), robust=3.0)
+    assert fit.reduced_chi2 > 1.02
+    assert dr.detect(fit).scatter == pytest.approx(math.sqrt(fit.reduced_chi2), rel=1e-6)
 
 
 def test_a_model_that_is_wrong_inflates_the_errors(world: World) -> None:

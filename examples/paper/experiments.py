@@ -95,6 +95,8 @@ LIMITS = """\
   changed the star-model error of one frame by 0.2 %.
 - The library given to KLIP lies on the target's own line of drift, closer than an archive would.
 - Spreads are the 16 and 84 percentiles over noise realisations of the same wavefronts.
+- Marginalised S/N up to 25 are a little too low here: when these tables were made, a planet's own
+  light still counted as noise in them (1 % of the S/N at 10, 3 % at 20). Since then it does not.
 """
 
 

@@ -278,7 +278,7 @@ def _search(
         factor = scatter
         if factor is None:
             factor = (
-                excess(maps.groups, found.offsets)
+                excess(fits, maps.groups, found.offsets)
                 if explained
                 else max(1.0, _scatter(snr, grid, found, inner))
             )
@@ -297,7 +297,7 @@ def _search(
 def _factor(fits: Sequence[Refinement], groups: Sequence[Group], offsets: torch.Tensor) -> float:
     """For the errors, with the light of sources at `offsets` taken out."""
     # Where fits do not explain their data at all, their model error is in their noise already.
-    return excess(groups, offsets) if all(fit.status.calibrated for fit in fits) else 1.0
+    return excess(fits, groups, offsets) if all(fit.status.calibrated for fit in fits) else 1.0
 
 
 def _scatter(
