@@ -10,13 +10,10 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.linear_model import LinearModel
+from pyklip_diffrender.detection.maps import Group
 from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["excess"]
-
-Group = tuple[LinearModel, Templates]
 
 _DEPENDENT = 1e-6
 """Relative eigenvalue below which a source is no other than those beside it."""
