@@ -248,7 +248,7 @@ def snr_map(here: Setting) -> list[Case]:
         """S/N on the map against single sources through the fine model, at pixel centres."""
         grid = found.grid.reshape(-1, 2)
         near = [int(np.hypot(*(grid - place).T).argmin()) for place in _ring(here)]
-        exact = measure(found.fits, grid[near])["snr"]
+        exact = measure(found.fits, grid[near], scatter=found.scatter)["snr"]
         return Found(float(np.abs(found.snr.reshape(-1)[near] - exact).max()))
 
     pixels = here.fov**2
