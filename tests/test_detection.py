@@ -511,6 +511,13 @@ def test_the_contrast_curve_is_five_times_the_error_of_the_map(
         assert row["contrast"] == pytest.approx(table["contrast"][k], rel=1e-6)
 
 
+def test_companions_do_not_raise_the_contrast_curve(one: Detection) -> None:
+    assert len(one.fits[0].companions) == 1
+    by_itself = dr.contrast_curve(one.fits[0], [0.5])
+    given = dr.contrast_curve(one.fits[0], [0.5], scatter=one.scatter)
+    np.testing.assert_allclose(by_itself["contrast"], given["contrast"], rtol=1e-3)
+
+
 def test_small_samples_need_higher_thresholds() -> None:
     # Mawet et al. 2014, figure 6: at 1 lambda/D, six elements, a 5 sigma false alarm
     # probability needs tens of sigma; far out nothing is added.
