@@ -19,9 +19,9 @@ from pyklip.instruments.JWST import JWSTData
 from pyklip.parallelized import klip_dataset
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.files import replacing
+from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.plotting import draw_subtraction, save
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.report import draw_subtraction, save
 
 COMPANION_RADIUS = 0.35  # arcsec; what is left out of the figure of merit
 

@@ -13,14 +13,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pyklip_diffrender.bridges import from_poppy, from_webbpsf
     from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
-    from pyklip_diffrender.fidelity import Plan, plan
-    from pyklip_diffrender.linear_model import LinearModel
-    from pyklip_diffrender.memory import keep_freed_memory
-    from pyklip_diffrender.nircam import nircam_coronagraph
-    from pyklip_diffrender.observation import Observation
-    from pyklip_diffrender.opd import drift, random_opd, read_opd
-    from pyklip_diffrender.optics import OpticalSystem
-    from pyklip_diffrender.priors import WavefrontPrior, learn_prior
+    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+    from pyklip_diffrender.linear.model import LinearModel
+    from pyklip_diffrender.optics.system import OpticalSystem
+    from pyklip_diffrender.planning import Plan, plan
     from pyklip_diffrender.pyklip_backend import (
         DiffrenderSettings,
         backend,
@@ -29,8 +25,11 @@ if TYPE_CHECKING:
         unregister,
     )
     from pyklip_diffrender.refinement import Refinement, Status, refine
-    from pyklip_diffrender.scene import Planet, Scene, Star
-    from pyklip_diffrender.simulation import simulate
+    from pyklip_diffrender.scene.objects import Planet, Scene, Star
+    from pyklip_diffrender.scene.observation import Observation
+    from pyklip_diffrender.scene.simulation import simulate
+    from pyklip_diffrender.wavefront.opd import drift, random_opd, read_opd
+    from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
 
 __all__ = [
     "Detection",
@@ -52,7 +51,6 @@ __all__ = [
     "drift",
     "from_poppy",
     "from_webbpsf",
-    "keep_freed_memory",
     "learn_prior",
     "measure",
     "nircam_coronagraph",
@@ -69,33 +67,32 @@ __all__ = [
 _MODULE_OF = {
     "Detection": "detection",
     "DiffrenderSettings": "pyklip_backend",
-    "LinearModel": "linear_model",
-    "Observation": "observation",
-    "OpticalSystem": "optics",
-    "Plan": "fidelity",
-    "Planet": "scene",
+    "LinearModel": "linear.model",
+    "Observation": "scene.observation",
+    "OpticalSystem": "optics.system",
+    "Plan": "planning",
+    "Planet": "scene.objects",
     "Refinement": "refinement",
-    "Scene": "scene",
-    "Star": "scene",
+    "Scene": "scene.objects",
+    "Star": "scene.objects",
     "Status": "refinement",
-    "WavefrontPrior": "priors",
+    "WavefrontPrior": "wavefront.priors",
     "backend": "pyklip_backend",
     "contrast_curve": "detection",
     "detect": "detection",
-    "drift": "opd",
+    "drift": "wavefront.opd",
     "from_poppy": "bridges",
     "from_webbpsf": "bridges",
-    "keep_freed_memory": "memory",
-    "learn_prior": "priors",
+    "learn_prior": "wavefront.priors",
     "measure": "detection",
-    "nircam_coronagraph": "nircam",
+    "nircam_coronagraph": "instrument.nircam",
     "observation_from_dataset": "pyklip_backend",
-    "plan": "fidelity",
-    "random_opd": "opd",
-    "read_opd": "opd",
+    "plan": "planning",
+    "random_opd": "wavefront.opd",
+    "read_opd": "wavefront.opd",
     "refine": "refinement",
     "register": "pyklip_backend",
-    "simulate": "simulation",
+    "simulate": "scene.simulation",
     "unregister": "pyklip_backend",
 }
 """The module each public name lives in."""

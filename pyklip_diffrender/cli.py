@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pyklip_diffrender.errors import DiffrenderError
-from pyklip_diffrender.memory import keep_freed_memory
 
 if TYPE_CHECKING:
     from pyklip_diffrender.refinement import Refinement
@@ -65,18 +64,6 @@ def _parser() -> argparse.ArgumentParser:
     detect.add_argument("--threshold", type=float, default=5.0, help="S/N of a candidate")
     detect.set_defaults(run=_detect)
 
-    bench = commands.add_parser("bench", help="error beside time, for this package and others")
-    bench.add_argument("-o", "--output", type=Path, default=Path("diffrender-bench"))
-    bench.add_argument("--rows", nargs="+", metavar="ROW", help="beginnings of rows' names")
-    bench.add_argument("--quick", action="store_true", help="small arrays, seconds")
-    bench.add_argument("--device", default="cpu", help="of the package, such as cuda")
-    bench.add_argument("--stpsf-path", default="", help="stpsf's data; default STPSF_PATH")
-    bench.add_argument("--no-memory", action="store_true", help="leave the memory out")
-    bench.add_argument(
-        "--page", type=Path, metavar="TABLE",
-        help="measure nothing; write performance.md from this table into the output folder",
-    )  # fmt: skip
-    bench.set_defaults(run=_bench)
     return parser
 
 
@@ -86,9 +73,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(
         level=logging.INFO if options.verbose else logging.WARNING, format="%(message)s"
     )
-    if arguments is None and options.command != "bench":
-        # The process is this command's own; what is timed runs in one as it comes.
-        keep_freed_memory()
     try:
         options.run(options)
     except DiffrenderError as error:
@@ -99,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _demo(options: argparse.Namespace) -> None:
     from pyklip_diffrender.demo import run_demo, write_demo
-    from pyklip_diffrender.report import draw_demo, save
+    from pyklip_diffrender.plotting import draw_demo, save
 
     result = run_demo(
         contrast=options.contrast,
@@ -136,9 +120,9 @@ def _demo(options: argparse.Namespace) -> None:
 def _psf(options: argparse.Namespace) -> None:
     from astropy.io import fits
 
-    from pyklip_diffrender.files import write_fits
-    from pyklip_diffrender.nircam import nircam_coronagraph
-    from pyklip_diffrender.opd import read_opd, resample
+    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+    from pyklip_diffrender.io.files import write_fits
+    from pyklip_diffrender.wavefront.opd import read_opd, resample
 
     model = nircam_coronagraph(
         options.filter, monochromatic=options.monochromatic, fov_pixels=options.fov_pixels
@@ -153,10 +137,10 @@ def _psf(options: argparse.Namespace) -> None:
 
 
 def _fitted(options: argparse.Namespace) -> Refinement:
-    from pyklip_diffrender.nircam import nircam_coronagraph
-    from pyklip_diffrender.observation import Observation
+    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
     from pyklip_diffrender.refinement import refine
     from pyklip_diffrender.refinement.presets import NIRCAM_FIT, NIRCAM_MODEL
+    from pyklip_diffrender.scene.observation import Observation
 
     observation = Observation.from_fits(options.frames).cutout(options.fov_pixels)
     model = nircam_coronagraph(
@@ -171,7 +155,7 @@ def _fitted(options: argparse.Namespace) -> Refinement:
 
 def _detect(options: argparse.Namespace) -> None:
     from pyklip_diffrender.detection import detect
-    from pyklip_diffrender.report import draw_detection, save
+    from pyklip_diffrender.plotting import draw_detection, save
 
     fit = _fitted(options)
     found = detect(fit, threshold=options.threshold, progress=True)
@@ -184,35 +168,11 @@ def _detect(options: argparse.Namespace) -> None:
         print(f"wrote {path}")
 
 
-def _bench(options: argparse.Namespace) -> None:
-    import shlex
-
-    from pyklip_diffrender.bench import Setting, run_bench, write_page, write_table
-    from pyklip_diffrender.report import draw_bench, save
-
-    if options.page:
-        print(f"wrote {write_page(options.page, options.output)}")
-        return
-    shown = ["--quick"] * options.quick + (["--rows", *options.rows] if options.rows else [])
-    table = run_bench(
-        Setting(options.quick, options.device, options.stpsf_path),
-        options.rows,
-        budget=0.1 if options.quick else 2.0,
-        memory=not options.no_memory,
-        command=shlex.join(["pyklip-diffrender", "bench", *shown]),
-    )
-    table["row", "column", "precision", "seconds", "ratio", "error", "sigma"].pprint_all()
-    figure = options.output / "performance.png"
-    save(draw_bench(table), figure)
-    for path in (write_table(table, options.output), figure):
-        print(f"wrote {path}")
-
-
 def _refine(options: argparse.Namespace) -> None:
     import numpy as np
     from astropy.io import fits
 
-    from pyklip_diffrender.files import write_fits
+    from pyklip_diffrender.io.files import write_fits
 
     fit = _fitted(options)
     primary = fits.PrimaryHDU()

@@ -18,22 +18,22 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from pyklip_diffrender.detection import Detection, detect
-from pyklip_diffrender.files import replacing, write_fits
-from pyklip_diffrender.metrics import annulus_snr, star_model_error, throughput
-from pyklip_diffrender.nircam import nircam_coronagraph
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import OPDMap, random_drift, random_opd
-from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.detection.metrics import annulus_snr, star_model_error, throughput
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.io.files import replacing, write_fits
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pyklip_backend.comparison import klip_rdi
 from pyklip_diffrender.refinement import Refinement, refine
-from pyklip_diffrender.scene import (
+from pyklip_diffrender.scene.objects import (
     ALPHA_PICTORIS_W2,
     PAPER_SEGMENT_GAP,
     Planet,
     Scene,
     Star,
 )
-from pyklip_diffrender.simulation import planet_photons, simulate, star_photons
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.simulation import planet_photons, simulate, star_photons
+from pyklip_diffrender.wavefront.opd import OPDMap, random_drift, random_opd
 
 __all__ = ["DITHERS", "DemoResult", "run_demo", "simulate_references"]
 

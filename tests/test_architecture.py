@@ -16,38 +16,38 @@ import pyklip_diffrender as dr
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "pyklip_diffrender"
 
-LAYERS = (
-    ("errors", "units", "files", "headers", "memory"),
-    ("geometry", "zernike", "spectrum", "parameters", "orientation"),
-    ("propagation", "streaming"),
-    ("planes", "detector", "masks", "arrays", "rotation", "detector_effects"),
-    ("cells", "route"),
-    ("psf_file", "optics"),
-    ("lattice",),
-    ("nircam",),
-    ("bridges",),
-    ("observation", "scene", "simulation"),
-    ("bases", "opd", "priors"),
-    ("response", "multifidelity", "linear_file", "linear_model"),
-    ("fidelity",),
-    ("refinement",),
-    ("metrics", "detection"),
-    ("pyklip_backend",),
-    ("demo", "report", "bench", "cli"),
+PACKAGES = (
+    "errors",
+    "parameters",
+    "io",
+    "optics",
+    "instrument",
+    "wavefront",
+    "scene",
+    "bridges",
+    "linear",
+    "planning",
+    "refinement",
+    "detection",
+    "pyklip_backend",
+    "demo",
+    "plotting",
+    "cli",
 )
-"""All modules, in order: a module imports only from those before it, in its own row as well."""
+"""Top-level modules and packages in order: each imports only from those before it.
+
+Inside a package, and inside packages of that package, imports must form no circle.
+"""
 
 OWNERS = {
-    "matplotlib": "report",
-    "mpl_toolkits": "report",
+    "matplotlib": "plotting",
+    "mpl_toolkits": "plotting",
     "poppy": "bridges",
     "pyklip": "pyklip_backend",
     "stpsf": "bridges",
     "webbpsf": "bridges",
 }
-"""Libraries that one module alone may import."""
-
-ORDER = tuple(name for layer in LAYERS for name in layer)
+"""Libraries that one package alone may import."""
 
 
 def imported_names(tree: ast.AST, inside: str) -> Iterator[tuple[int, str]]:
@@ -81,25 +81,58 @@ def imported_names(tree: ast.AST, inside: str) -> Iterator[tuple[int, str]]:
 def violations(sources: dict[Path, str]) -> list[str]:
     """What is wrong with the imports of modules, given as path below the package and text."""
     found = []
-    for path, text in sorted(sources.items()):
-        module = path.parts[0].removesuffix(".py")
-        if module == "__init__":
+    modules = {".".join(path.with_suffix("").parts): path for path in sources}
+    imports: dict[str, set[str]] = {name: set() for name in modules}
+    for name, path in sorted(modules.items()):
+        package = path.parts[0].removesuffix(".py")
+        if package == "__init__":
             continue  # The lazy front of the package; tested by what it loads, below.
-        if module not in ORDER:
-            found.append(f"{path}: not in LAYERS; give it its place there")
+        if package not in PACKAGES:
+            found.append(f"{path}: not in PACKAGES; give it its place there")
             continue
         inside = ".".join([PACKAGE, *path.parts[:-1]])
-        for line, name in imported_names(ast.parse(text), inside):
-            top, *rest = name.split(".")
-            if top in OWNERS and OWNERS[top] != module:
+        for line, imported in imported_names(ast.parse(sources[path]), inside):
+            top, _, rest = imported.partition(".")
+            if top in OWNERS and OWNERS[top] != package:
                 found.append(f"{path}:{line}: only {OWNERS[top]} imports {top}")
-            if top != PACKAGE or rest == ["__version__"] or rest[:1] == [module]:
+            if top != PACKAGE or rest == "__version__":
                 continue
-            if not rest or rest[0] not in ORDER:
-                found.append(f"{path}:{line}: imports {name} instead of the module it is in")
-            elif ORDER.index(rest[0]) > ORDER.index(module):
-                found.append(f"{path}:{line}: {rest[0]} comes after {module}")
-    return found
+            other = rest.split(".")[0]
+            if other not in PACKAGES:
+                found.append(f"{path}:{line}: imports {imported} instead of the module it is in")
+            elif PACKAGES.index(other) > PACKAGES.index(package):
+                found.append(f"{path}:{line}: {other} comes after {package}")
+            elif other == package:
+                imports[name] |= {_module_of(rest, modules)} - {name, ""}
+    return found + [f"a circle of imports: {' -> '.join(each)}" for each in _circles(imports)]
+
+
+def _module_of(name: str, modules: dict[str, Path]) -> str:
+    """The module that a dotted name below the package is, or is in; "" if there is none."""
+    while name:
+        for candidate in (name, f"{name}.__init__"):
+            if candidate in modules:
+                return candidate
+        name = name.rpartition(".")[0]
+    return ""
+
+
+def _circles(imports: dict[str, set[str]]) -> list[list[str]]:
+    """Circles in a graph of imports, each once, by depth-first search."""
+    circles: list[list[str]] = []
+    finished: set[str] = set()
+
+    def visit(name: str, trail: list[str]) -> None:
+        if name in trail:
+            circles.append([*trail[trail.index(name) :], name])
+        elif name not in finished:
+            for other in sorted(imports[name]):
+                visit(other, [*trail, name])
+            finished.add(name)
+
+    for name in sorted(imports):
+        visit(name, [])
+    return circles
 
 
 def package_sources() -> dict[Path, str]:
@@ -136,26 +169,26 @@ def test_imports_go_one_way() -> None:
 
 def test_the_table_lists_the_modules_that_there_are() -> None:
     modules = {path.parts[0].removesuffix(".py") for path in package_sources()} - {"__init__"}
-    assert modules == set(ORDER)
-    assert len(ORDER) == len(set(ORDER))
+    assert modules == set(PACKAGES)
+    assert len(PACKAGES) == len(set(PACKAGES))
 
 
 @pytest.mark.parametrize(
     ("path", "text", "complaint"),
     [
-        ("units.py", "from pyklip_diffrender.opd import drift", "opd comes after units"),
-        ("units.py", "import pyklip_diffrender.files", "files comes after units"),
-        ("optics.py", "from .nircam import nircam_coronagraph", "nircam comes after optics"),
-        ("optics.py", "from . import errors, nircam", "nircam comes after optics"),
-        ("optics.py", "def f():\n    from pyklip_diffrender import cli", "optics.py:2: cli comes"),
-        ("optics/planes.py", "from ..metrics import psnr", "metrics comes after optics"),
-        ("optics.py", "import pyklip_diffrender as dr", "instead of the module it is in"),
-        ("optics.py", "from pyklip_diffrender import Scene", "instead of the module it is in"),
+        ("io/units.py", "from pyklip_diffrender.wavefront.opd import drift", "wavefront comes"),
+        ("optics/a.py", "import pyklip_diffrender.cli", "cli comes after optics"),
+        ("optics/a.py", "from ..instrument import nircam", "instrument comes after optics"),
+        ("optics/a.py", "from .. import errors, instrument", "instrument comes after optics"),
+        ("optics/a.py", "def f():\n    from pyklip_diffrender import cli", "a.py:2: cli comes"),
+        ("optics/fast/a.py", "from ...detection import metrics", "detection comes after optics"),
+        ("optics/a.py", "import pyklip_diffrender as dr", "instead of the module it is in"),
+        ("optics/a.py", "from pyklip_diffrender import Scene", "instead of the module it is in"),
         ("demo.py", "import pyklip.parallelized as p", "only pyklip_backend imports pyklip"),
         ("demo.py", "from importlib import import_module\nimport_module('pyklip.fm')", "demo.py:2"),
-        ("nircam.py", "try:\n    import stpsf\nexcept ImportError:\n    pass", "only bridges"),
-        ("cli.py", "import os, matplotlib.pyplot as plt", "only report imports matplotlib"),
-        ("novelty.py", "", "not in LAYERS"),
+        ("io/a.py", "try:\n    import stpsf\nexcept ImportError:\n    pass", "only bridges"),
+        ("cli.py", "import os, matplotlib.pyplot as plt", "only plotting imports matplotlib"),
+        ("novelty.py", "", "not in PACKAGES"),
     ],
 )
 def test_a_planted_violation_is_found(path: str, text: str, complaint: str) -> None:
@@ -167,15 +200,22 @@ def test_a_planted_violation_is_found(path: str, text: str, complaint: str) -> N
 @pytest.mark.parametrize(
     ("path", "text"),
     [
-        ("optics.py", "import torch\nfrom pyklip_diffrender.errors import ShapeError"),
-        ("optics/planes.py", "from .stops import Stop\nfrom ..optics import lyot"),
-        ("pyklip_backend.py", "import pyklip.fm\nfrom pyklip_diffrender import __version__"),
-        ("report.py", "def f():\n    from matplotlib import pyplot"),
-        ("bridges.py", "import poppy\nimport stpsf"),
+        ("optics/a.py", "import torch\nfrom pyklip_diffrender.errors import ShapeError"),
+        ("optics/a.py", "from .stops import Stop\nfrom ..optics import lyot"),
+        ("pyklip_backend/a.py", "import pyklip.fm\nfrom pyklip_diffrender import __version__"),
+        ("plotting.py", "def f():\n    from matplotlib import pyplot"),
+        ("bridges/a.py", "import poppy\nimport stpsf"),
     ],
 )
 def test_what_is_allowed_is_not_reported(path: str, text: str) -> None:
     assert violations({Path(path): text}) == []
+
+
+def test_a_planted_circle_is_found() -> None:
+    name = "from pyklip_diffrender.optics"
+    circle = {"a": f"{name}.b import B", "b": f"{name} import c", "c": f"{name}.a import A"}
+    found = violations({Path(f"optics/{key}.py"): text for key, text in circle.items()})
+    assert found == ["a circle of imports: optics.a -> optics.b -> optics.c -> optics.a"]
 
 
 def test_importing_the_package_loads_nothing_heavy() -> None:
@@ -193,7 +233,7 @@ def test_asking_for_help_loads_nothing_heavy() -> None:
 
 
 def test_the_numerical_core_needs_none_of_the_owned_libraries() -> None:
-    core = [name for name in ORDER if name not in {*OWNERS.values(), "demo", "cli"}]
+    core = [name for name in PACKAGES if name not in {*OWNERS.values(), "demo", "cli"}]
     loaded = loaded_by("\n".join(f"import {PACKAGE}.{name}" for name in core))
     assert "torch" in loaded
     assert not loaded & set(OWNERS)
@@ -213,7 +253,7 @@ def test_unknown_name_is_an_attribute_error() -> None:
 
 def test_no_public_name_is_also_a_module() -> None:
     """Loading such a module would put it in the function's place."""
-    assert not set(dr._MODULE_OF) & set(ORDER)
+    assert not set(dr._MODULE_OF) & set(PACKAGES)
 
 
 def test_type_checkers_see_the_names_that_are_loaded_lazily() -> None:

@@ -15,23 +15,18 @@ from numpy.typing import NDArray
 from pyklip.instruments.Instrument import GenericData
 from pyklip.parallelized import klip_dataset
 
-from pyklip_diffrender.bases import default_basis
 from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     NoValidPixelsError,
     RefinementError,
 )
-from pyklip_diffrender.nircam import nircam_coronagraph
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import random_drift, random_opd
-from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
-
-# torch.func.jvp of torch 2.13 compiles its own decompositions with torch.jit.script.
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:`torch.jit.script` is deprecated:DeprecationWarning"
-)
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.bases import default_basis
+from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 
 SHAPE = (44, 40)
 PAD = 6

@@ -8,20 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from pyklip_diffrender.bases import (
+from pyklip_diffrender.instrument.jwst import TABULATED_GAP, jwst_pupil, jwst_segments
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
+from pyklip_diffrender.wavefront.bases import (
     Basis,
     FourierModes,
     JointBasis,
     SegmentMotions,
     default_basis,
-)
-from pyklip_diffrender.geometry import (
-    TABULATED_GAP,
-    PupilGrid,
-    jwst_pupil,
-    jwst_segments,
-    polygon_coverage,
-    widen_polygon,
 )
 
 GRID = PupilGrid.full(128)

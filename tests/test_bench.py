@@ -12,19 +12,19 @@ import pytest
 import torch
 from astropy.table import Table
 
-from pyklip_diffrender.bench import Setting, rivals, run_bench, write_page, write_table
-from pyklip_diffrender.bench import images as bench_images
-from pyklip_diffrender.bench.case import Case
-from pyklip_diffrender.bench.images import forward
-from pyklip_diffrender.bench.memory import memory_of, peak_memory
-from pyklip_diffrender.bench.page import page, targets
-from pyklip_diffrender.bench.rivals import load, paper_recipe
-from pyklip_diffrender.bench.rows import ROWS, chosen_rows
-from pyklip_diffrender.bench.timing import exponent, interleaved
 from pyklip_diffrender.bridges.plain import plain_stpsf
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.report import draw_bench
+from pyklip_diffrender.plotting import draw_bench
+from tests.benchmarks.speed import Setting, rivals, run_bench, write_page, write_table
+from tests.benchmarks.speed import images as bench_images
+from tests.benchmarks.speed.case import Case
+from tests.benchmarks.speed.images import forward
+from tests.benchmarks.speed.memory import memory_of, peak_memory
+from tests.benchmarks.speed.page import page, targets
+from tests.benchmarks.speed.rivals import load, paper_recipe
+from tests.benchmarks.speed.rows import ROWS, chosen_rows
+from tests.benchmarks.speed.timing import exponent, interleaved
 
 
 @pytest.fixture(scope="module")

@@ -27,11 +27,11 @@ from pyklip_diffrender.errors import (
     NonFiniteError,
     UnitError,
 )
-from pyklip_diffrender.geometry import JWST_DIAMETER, PupilGrid
-from pyklip_diffrender.nircam import nircam_coronagraph
-from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.planes import EntrancePupil, PupilStop
-from pyklip_diffrender.zernike import zernike_basis
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.optics.planes import EntrancePupil, PupilStop
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.optics.zernike import zernike_basis
 
 Array = NDArray[np.float64]
 

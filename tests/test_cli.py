@@ -13,9 +13,9 @@ import torch
 from astropy.io import fits
 
 from pyklip_diffrender.cli import main
-from pyklip_diffrender.files import open_fits
-from pyklip_diffrender.nircam import nircam_coronagraph
-from pyklip_diffrender.opd import random_opd, resample
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.wavefront.opd import random_opd, resample
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from scipy import stats
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.detection import Detection, small_sample_factor
 from pyklip_diffrender.detection.relinearise import with_companions
 from pyklip_diffrender.detection.scale import scale_errors
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.geometry import PupilGrid
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import random_opd
-from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.priors import WavefrontPrior
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import Refinement, Status, refine
-from pyklip_diffrender.scene import Planet
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 NPIX = 128
 FLUX = 3e11

@@ -10,16 +10,16 @@ from astropy.convolution import convolve
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from pyklip_diffrender.detector import Detector
-from pyklip_diffrender.detector_effects import (
+from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.detector_effects import (
     ChainDetector,
     Effect,
     GaussianBlur,
     LinearResampling,
     PixelCrosstalk,
 )
-from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.rotation import SplineRotation
+from pyklip_diffrender.optics.rotation import SplineRotation
 
 Array = NDArray[np.float64]
 

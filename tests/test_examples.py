@@ -42,8 +42,7 @@ NO_SCRIPTS = {
     "published", "scene", "sections", "summary",
 }  # fmt: skip
 
-# torch 2.13 loads its own scripted functions at the first forward-mode derivative.
-WARNINGS = ("-W", "error", "-W", "ignore:`torch.jit.script` is deprecated:DeprecationWarning")
+WARNINGS = ("-W", "error")
 
 
 def test_every_study_is_tested() -> None:

@@ -13,29 +13,30 @@ import torch
 from torch import Tensor
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.bases import default_basis
-from pyklip_diffrender.detector_effects import ChainDetector, GaussianBlur, PixelCrosstalk
 from pyklip_diffrender.errors import (
     DiffrenderWarning,
     IncompatibleSetupError,
     MissingOPDError,
     ShapeError,
 )
-from pyklip_diffrender.fidelity import Economy, Error, Option, Plan, plan, probes
-from pyklip_diffrender.fidelity.absorb import Absorber
-from pyklip_diffrender.fidelity.build import CheapSystem, optional_parts, quadrature
-from pyklip_diffrender.fidelity.trial import PROBED, START, Trial
-from pyklip_diffrender.geometry import PupilGrid
-from pyklip_diffrender.nircam import nircam_coronagraph
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import random_drift, random_opd
-from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.priors import WavefrontPrior
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.instrument.spectrum import filter_bandpass
+from pyklip_diffrender.linear.response import NANOMETRE, coarse_copy, coarse_npix, downsample
+from pyklip_diffrender.optics.bandpass import Bandpass
+from pyklip_diffrender.optics.detector_effects import ChainDetector, GaussianBlur, PixelCrosstalk
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.planning import Economy, Error, Option, Plan, plan, probes
+from pyklip_diffrender.planning.absorb import Absorber
+from pyklip_diffrender.planning.build import CheapSystem, optional_parts, quadrature
+from pyklip_diffrender.planning.trial import PROBED, START, Trial
 from pyklip_diffrender.refinement import refine
-from pyklip_diffrender.response import NANOMETRE, coarse_copy, coarse_npix, downsample
-from pyklip_diffrender.scene import Planet, Scene, Star
-from pyklip_diffrender.simulation import simulate, star_photons
-from pyklip_diffrender.spectrum import Bandpass, filter_bandpass
+from pyklip_diffrender.scene.objects import Planet, Scene, Star
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.simulation import simulate, star_photons
+from pyklip_diffrender.wavefront.bases import default_basis
+from pyklip_diffrender.wavefront.opd import random_drift, random_opd
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 NPIX = 256
 CYCLES = (20.0,)

@@ -21,8 +21,8 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.files import embedded_table, open_fits, replacing, sha256, write_fits
-from pyklip_diffrender.units import (
+from pyklip_diffrender.io.files import embedded_table, open_fits, replacing, sha256, write_fits
+from pyklip_diffrender.io.units import (
     ARCSEC,
     native_float64,
     require_finite,
@@ -280,7 +280,7 @@ def test_a_process_killed_while_writing_leaves_the_old_product_intact(
     killed(
         """
         import sys, time
-        from pyklip_diffrender.files import replacing
+        from pyklip_diffrender.io.files import replacing
         with replacing(sys.argv[1]) as temporary:
             temporary.write_bytes(b"half")
             print("writing", flush=True)

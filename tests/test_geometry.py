@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from pyklip_diffrender.geometry import (
-    JWST_DIAMETER,
+from pyklip_diffrender.instrument.jwst import (
     TABULATED_GAP,
-    PupilGrid,
     jwst_pupil,
     jwst_segments,
     maskrnd_openings,
+)
+from pyklip_diffrender.optics.grid import (
+    JWST_DIAMETER,
+    PupilGrid,
     polygon_coverage,
     transform_polygons,
     widen_polygon,

@@ -10,10 +10,10 @@ import torch
 
 from pyklip_diffrender import route
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.lattice import PointSources
-from pyklip_diffrender.nircam import SIAF_PIXELSCALE, SIAF_SHEAR, nircam_coronagraph
-from pyklip_diffrender.opd import random_opd
-from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.instrument.nircam import SIAF_PIXELSCALE, SIAF_SHEAR, nircam_coronagraph
+from pyklip_diffrender.optics.fast.point_sources import PointSources
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.wavefront.opd import random_opd
 
 WAVELENGTH = 4.5e-6
 SIAF: dict[str, Any] = {"pixelscale": SIAF_PIXELSCALE, "shear": SIAF_SHEAR}

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import CorruptFileError, ShapeError
-from pyklip_diffrender.linear_model import LinearFrame, LinearModel
+from pyklip_diffrender.linear.model import LinearFrame, LinearModel
 
 NY, NX = 6, 7
 SHARED, DRIFT = 6, 2

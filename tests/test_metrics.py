@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from pyklip_diffrender.metrics import (
+from pyklip_diffrender.detection.metrics import (
     annulus_snr,
     aperture_sum,
     psnr,

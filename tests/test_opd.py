@@ -11,7 +11,6 @@ import torch
 from astropy import units as u
 from astropy.io import fits
 
-from pyklip_diffrender.bases import SegmentMotions
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
@@ -19,10 +18,12 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.files import sha256
-from pyklip_diffrender.geometry import PupilGrid, jwst_pupil
-from pyklip_diffrender.nircam import nircam_coronagraph
-from pyklip_diffrender.opd import (
+from pyklip_diffrender.instrument.jwst import jwst_pupil
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.io.files import sha256
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.wavefront.bases import SegmentMotions
+from pyklip_diffrender.wavefront.opd import (
     OPDMap,
     as_opd_map,
     drift,

@@ -15,14 +15,18 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.geometry import JWST_DIAMETER, PupilGrid
-from pyklip_diffrender.nircam import MASK335R_RADIUS, mask335r_complement, nircam_coronagraph
-from pyklip_diffrender.opd import random_opd
-from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.instrument.nircam import (
+    MASK335R_RADIUS,
+    mask335r_complement,
+    nircam_coronagraph,
+)
+from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, filter_names
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.fourier import MatrixFourier
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
-from pyklip_diffrender.propagation import MatrixFourier
-from pyklip_diffrender.spectrum import blackbody, filter_bandpass, filter_names
-from pyklip_diffrender.units import ARCSEC
+from pyklip_diffrender.wavefront.opd import random_opd
 
 WAVELENGTH = 4.5e-6
 

@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 import torch
 
-from pyklip_diffrender.orientation import Orientation
+from pyklip_diffrender.optics.orientation import Orientation
 
 TURNS = [
     Orientation.quarter_turns(count).then(Orientation.inversion(axis) if axis else Orientation())

@@ -11,23 +11,22 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pyklip_diffrender.geometry import (
+from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.fourier import MatrixFourier
+from pyklip_diffrender.optics.grid import (
     JWST_DIAMETER,
     PupilGrid,
-    jwst_pupil,
-    maskrnd_openings,
     polygon_coverage,
     transform_polygons,
 )
-from pyklip_diffrender.nircam import nircam_coronagraph
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import random_opd, resample
-from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.planes import Wavefront
-from pyklip_diffrender.propagation import MatrixFourier
-from pyklip_diffrender.scene import Planet, Scene, Star
-from pyklip_diffrender.simulation import expected_photons, planet_photons, star_photons
-from pyklip_diffrender.units import ARCSEC
+from pyklip_diffrender.optics.planes import Wavefront
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.scene.objects import Planet, Scene, Star
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.simulation import expected_photons, planet_photons, star_photons
+from pyklip_diffrender.wavefront.opd import random_opd, resample
 
 WAVELENGTH = 4.5e-6
 SCALE = 0.062424185

@@ -9,7 +9,6 @@ import pytest
 import torch
 from astropy import units as u
 
-from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.errors import (
     DiffrenderWarning,
     IncompatibleSetupError,
@@ -18,13 +17,15 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
     ShapeError,
 )
-from pyklip_diffrender.geometry import PupilGrid, maskrnd_openings, polygon_coverage
-from pyklip_diffrender.nircam import nircam_coronagraph
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import random_opd
-from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.priors import WavefrontPrior
+from pyklip_diffrender.instrument.jwst import maskrnd_openings
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import METHODS, Refinement, Status, refine
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 NPIX = 128
 FLUX = 3e11

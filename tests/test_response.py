@@ -7,21 +7,22 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 
-from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.geometry import PupilGrid, jwst_pupil
-from pyklip_diffrender.nircam import nircam_coronagraph
-from pyklip_diffrender.opd import random_opd
-from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.priors import WavefrontPrior, learn_prior, solve_with_evidence
-from pyklip_diffrender.response import (
+from pyklip_diffrender.instrument.jwst import jwst_pupil
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.linear.response import (
     NANOMETRE,
     WavefrontResponse,
     coarse_copy,
     downsample,
     parameter_jacobian,
 )
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.parameters import parameter
+from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior, solve_with_evidence
 
 NPIX = 256
 BASIS = JointBasis([SegmentMotions(), FourierModes(6)])

@@ -22,9 +22,9 @@ from astropy.table import Table
 from matplotlib.figure import Figure
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.files import embedded_table
-from pyklip_diffrender.metrics import annulus_snr
-from pyklip_diffrender.priors import WavefrontPrior
+from pyklip_diffrender.detection.metrics import annulus_snr
+from pyklip_diffrender.io.files import embedded_table
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 sys.path.insert(0, str(Path(__file__).parent))
 from failures import MEASURED_SCALES

@@ -30,10 +30,10 @@ from astropy.table import Table
 from matplotlib.figure import Figure
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.detection.metrics import aperture_sum
 from pyklip_diffrender.detection.relinearise import star_only
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.metrics import aperture_sum
-from pyklip_diffrender.nircam import mask335r_complement
+from pyklip_diffrender.instrument.nircam import mask335r_complement
 from pyklip_diffrender.refinement import Refinement
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -19,7 +19,7 @@ import numpy as np
 from astropy.table import Table
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.priors import WavefrontPrior
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 sys.path.insert(0, str(Path(__file__).parent))
 from scene import Frame, Setting, frame, mapped, options, setting, timed_table

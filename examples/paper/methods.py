@@ -15,11 +15,11 @@ from torch import Tensor
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.demo import simulate_references
-from pyklip_diffrender.multifidelity import MultiFidelity
 from pyklip_diffrender.pyklip_backend.comparison import klip_rdi
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.scene import ALPHA_PICTORIS_W2
-from pyklip_diffrender.simulation import simulate
+from pyklip_diffrender.scene.objects import ALPHA_PICTORIS_W2
+from pyklip_diffrender.scene.simulation import simulate
+from tests.benchmarks.speed.multifidelity import MultiFidelity
 
 STEPS = 1000
 """Of Adam, in the paper."""

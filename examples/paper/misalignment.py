@@ -23,7 +23,7 @@ from astropy.table import Table
 from matplotlib.figure import Figure
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.metrics import psnr
+from pyklip_diffrender.detection.metrics import psnr
 
 sys.path.insert(0, str(Path(__file__).parent))
 from judging import COLOURS, chosen, pixel, spread, star_error

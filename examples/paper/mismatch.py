@@ -19,7 +19,7 @@ import torch
 from astropy.table import Table
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.scene import Star
+from pyklip_diffrender.scene.objects import Star
 
 sys.path.insert(0, str(Path(__file__).parent))
 from scene import Planet, Setting, mapped, options, setting, timed_table

@@ -10,7 +10,7 @@ from astropy.io import fits
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from pyklip_diffrender.files import open_fits, write_fits
+from pyklip_diffrender.io.files import open_fits, write_fits
 
 Image = NDArray[np.float64]
 

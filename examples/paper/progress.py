@@ -19,9 +19,10 @@ import numpy as np
 from astropy.table import Table
 from matplotlib.figure import Figure
 
-from pyklip_diffrender.geometry import PupilGrid, maskrnd_openings, polygon_coverage
-from pyklip_diffrender.opd import resample
+from pyklip_diffrender.instrument.jwst import maskrnd_openings
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.wavefront.opd import resample
 
 sys.path.insert(0, str(Path(__file__).parent))
 from judging import COLOURS, chosen, paper_snr, spread, star_error

@@ -19,8 +19,8 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.scene import Scene, Star
-from pyklip_diffrender.simulation import simulate, star_photons
+from pyklip_diffrender.scene.objects import Scene, Star
+from pyklip_diffrender.scene.simulation import simulate, star_photons
 
 sys.path.insert(0, str(Path(__file__).parent))
 from scene import Setting, mapped, options, setting, timed_table

@@ -26,11 +26,11 @@ from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.files import replacing
-from pyklip_diffrender.opd import drift, random_drift, random_opd, read_opd, resample
-from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.scene import PAPER_SEGMENT_GAP, Planet, Scene, Star
-from pyklip_diffrender.simulation import planet_photons, simulate, star_photons
+from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.scene.objects import PAPER_SEGMENT_GAP, Planet, Scene, Star
+from pyklip_diffrender.scene.simulation import planet_photons, simulate, star_photons
+from pyklip_diffrender.wavefront.opd import drift, random_drift, random_opd, read_opd, resample
 
 Image = NDArray[np.float64]
 
@@ -165,7 +165,6 @@ def options(description: str) -> argparse.ArgumentParser:
 
 
 def _begin_process() -> None:
-    dr.keep_freed_memory()
     torch.set_num_threads(1)
     # pyKLIP makes a pool for every subtraction; spawned, it would import everything anew.
     set_start_method("fork", force=True)

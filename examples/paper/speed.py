@@ -3,7 +3,7 @@
     python examples/paper/speed.py --opd BEFORE AFTER
 
 80 x 80 pixels, all cores, nothing else running. The first run of a process loads libraries and
-builds constants; then once more, and once more again with `keep_freed_memory`.
+builds constants; then once more.
 """
 
 from __future__ import annotations
@@ -104,9 +104,6 @@ def main() -> None:
         for here, name, star_known in cases:
             rows += measured(here, name, ("first", "second"), star_known)
         rows.append(recipe(one))
-        dr.keep_freed_memory()
-        for here, name, star_known in cases:
-            rows += measured(here, name, ("second, freed memory kept",), star_known)
         return Table(rows=rows)
 
     name = "speed_measured" if given.opd else "speed_generator"

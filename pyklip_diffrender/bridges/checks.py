@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import DiffrenderWarning, UnitError
-from pyklip_diffrender.units import require_finite
+from pyklip_diffrender.io.units import require_finite
 
 __all__ = ["check_opd"]
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from poppy.poppy_core import PlaneType
 from torch import Tensor
 
-from pyklip_diffrender.arrays import Gain, OffsetDetector, OrientedPupil, PupilOptic
 from pyklip_diffrender.bridges.sampling import (
     COMPACT_OPTICS,
     ImageSamples,
@@ -24,12 +23,19 @@ from pyklip_diffrender.bridges.sampling import (
 )
 from pyklip_diffrender.bridges.supported import check_supported
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.masks import BoxPart, FourierMask, MaskPart, SampledOcculter, SeparablePart
-from pyklip_diffrender.orientation import Orientation
-from pyklip_diffrender.planes import Plane
-from pyklip_diffrender.rotation import FreeRotation
-from pyklip_diffrender.spectrum import Bandpass
-from pyklip_diffrender.units import ARCSEC, native_float64, to_metres
+from pyklip_diffrender.io.units import ARCSEC, native_float64, to_metres
+from pyklip_diffrender.optics.bandpass import Bandpass
+from pyklip_diffrender.optics.masks import (
+    BoxPart,
+    FourierMask,
+    MaskPart,
+    SampledOcculter,
+    SeparablePart,
+)
+from pyklip_diffrender.optics.orientation import Orientation
+from pyklip_diffrender.optics.planes import Plane
+from pyklip_diffrender.optics.rotation import FreeRotation
+from pyklip_diffrender.optics.sampled_planes import Gain, OffsetDetector, OrientedPupil, PupilOptic
 
 __all__ = ["Converted", "Converter"]
 

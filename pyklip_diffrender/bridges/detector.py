@@ -10,14 +10,14 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from pyklip_diffrender.detector_effects import (
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.optics.detector_effects import (
     Effect,
     GaussianBlur,
     LinearResampling,
     PixelCrosstalk,
 )
-from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.rotation import SplineRotation
+from pyklip_diffrender.optics.rotation import SplineRotation
 
 __all__ = ["stpsf_effects"]
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import poppy
@@ -12,12 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.masks import FourierMask, SampledOcculter
-from pyklip_diffrender.orientation import Orientation
-from pyklip_diffrender.units import ARCSEC
-
-if TYPE_CHECKING:
-    from pyklip_diffrender.bridges.poppy import PoppySystem
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.masks import FourierMask, SampledOcculter
+from pyklip_diffrender.optics.orientation import Orientation
+from pyklip_diffrender.optics.system import OpticalSystem
 
 __all__ = ["intermediate_wavefronts"]
 
@@ -25,11 +24,24 @@ Array = NDArray[Any]
 
 
 def intermediate_wavefronts(
-    system: PoppySystem, normalize: str, only_last: bool
+    system: OpticalSystem,
+    orientations: Sequence[Orientation],
+    normalize: str,
+    only_last: bool,
 ) -> list[poppy.Wavefront]:
     """Fields as poppy's own objects, one per plane, weighted and summed as poppy does.
 
     Image planes: the field behind the mask, on that part of the image where it was sampled.
+
+    Parameters
+    ----------
+    system : OpticalSystem
+    orientations : sequence of Orientation
+        Of every plane, the entrance pupil first, relative to poppy's.
+    normalize : str
+        Only "first".
+    only_last : bool
+        Return the field on the detector alone.
     """
     if normalize.lower() != "first":
         raise IncompatibleSetupError(
@@ -39,7 +51,7 @@ def intermediate_wavefronts(
     for wavelength, weight in zip(
         system.bandpass.wavelengths, system.bandpass.weights, strict=True
     ):
-        for k, wave in enumerate(_wavefronts(system, wavelength, only_last)):
+        for k, wave in enumerate(_wavefronts(system, orientations, wavelength, only_last)):
             wave.wavefront = wave.wavefront * weight
             if k == len(summed):
                 summed.append(wave)
@@ -50,7 +62,9 @@ def intermediate_wavefronts(
     return summed
 
 
-def _wavefronts(system: PoppySystem, wavelength: float, only_last: bool) -> list[poppy.Wavefront]:
+def _wavefronts(
+    system: OpticalSystem, orientations: Sequence[Orientation], wavelength: float, only_last: bool
+) -> list[poppy.Wavefront]:
     values = system.values({})
     full = system.entrance.full
     found = []
@@ -59,7 +73,7 @@ def _wavefronts(system: PoppySystem, wavelength: float, only_last: bool) -> list
         onto = system.windows(values)
         planes: list[Any] = [system.entrance, *system.planes]
         for k, plane in enumerate(planes):
-            back = system.frames[k].inverse
+            back = orientations[k].inverse
             if isinstance(plane, SampledOcculter | FourierMask):
                 field, spacing = plane.focal_sample(wavefront)
                 wave = _wave_of(field, wavelength, full.diameter, spacing / ARCSEC)

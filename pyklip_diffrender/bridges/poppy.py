@@ -14,15 +14,15 @@ from astropy.io import fits
 from poppy.poppy_core import PlaneType
 from torch import Tensor
 
-from pyklip_diffrender.arrays import PupilOptic
 from pyklip_diffrender.bridges.convert import Converted, Converter
 from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
-from pyklip_diffrender.detector import Detector
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.orientation import Orientation
-from pyklip_diffrender.psf_file import poppy_psf
-from pyklip_diffrender.units import to_metres
+from pyklip_diffrender.io.units import to_metres
+from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.orientation import Orientation
+from pyklip_diffrender.optics.psf_file import poppy_psf
+from pyklip_diffrender.optics.sampled_planes import PupilOptic
+from pyklip_diffrender.optics.system import OpticalSystem
 
 __all__ = ["PoppySystem", "from_poppy", "opd_to_hdus", "opd_to_poppy"]
 
@@ -135,7 +135,9 @@ class PoppySystem(OpticalSystem):
         hdus = poppy_psf(system, normalize, opd, **parameters)
         if not (return_intermediates or return_final):
             return hdus
-        return hdus, intermediate_wavefronts(system, normalize, only_last=not return_intermediates)
+        return hdus, intermediate_wavefronts(
+            system, system.frames, normalize, only_last=not return_intermediates
+        )
 
 
 def from_poppy(

@@ -14,7 +14,7 @@ from astropy import units as u
 from astropy.io import fits
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
-from pyklip_diffrender.units import to_metres
+from pyklip_diffrender.io.units import to_metres
 
 __all__ = ["band", "data_errors", "kernel_files_left_open", "oversampling", "private_copy"]
 

@@ -12,7 +12,6 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from poppy.poppy_core import PlaneType
 
-from pyklip_diffrender.arrays import AberrationOptic, MovableStop, PupilOptic
 from pyklip_diffrender.bridges.checks import check_opd
 from pyklip_diffrender.bridges.convert import Converter
 from pyklip_diffrender.bridges.detector import stpsf_effects
@@ -25,12 +24,13 @@ from pyklip_diffrender.bridges.settings import (
     oversampling,
     private_copy,
 )
-from pyklip_diffrender.detector import Detector
-from pyklip_diffrender.detector_effects import ChainDetector
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.geometry import JWST_DIAMETER
-from pyklip_diffrender.psf_file import poppy_psf, save
-from pyklip_diffrender.units import to_metres
+from pyklip_diffrender.io.units import to_metres
+from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.detector_effects import ChainDetector
+from pyklip_diffrender.optics.grid import JWST_DIAMETER
+from pyklip_diffrender.optics.psf_file import poppy_psf, save
+from pyklip_diffrender.optics.sampled_planes import AberrationOptic, MovableStop, PupilOptic
 
 __all__ = ["WebbSystem", "from_webbpsf", "opd_to_webbpsf"]
 
@@ -125,7 +125,9 @@ class WebbSystem(PoppySystem):
                 hdu.header["DRSIFLIP"] = (system.si_wfe_flipped, "SI WFE map flipped vertically")
         save(result, outfile, overwrite)
         if return_intermediates:
-            return result, intermediate_wavefronts(system, normalize, only_last=False)
+            return result, intermediate_wavefronts(
+                system, system.frames, normalize, only_last=False
+            )
         return result
 
     @property

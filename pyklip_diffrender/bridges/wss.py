@@ -30,9 +30,10 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     MissingOPDError,
 )
-from pyklip_diffrender.files import open_fits, sha256
-from pyklip_diffrender.geometry import JWST_DIAMETER, jwst_pupil
-from pyklip_diffrender.units import native_float64, require_shape
+from pyklip_diffrender.instrument.jwst import jwst_pupil
+from pyklip_diffrender.io.files import open_fits, sha256
+from pyklip_diffrender.io.units import native_float64, require_shape
+from pyklip_diffrender.optics.grid import JWST_DIAMETER
 
 __all__ = ["WSSMap", "interpolate_wss", "load_wss_opd", "load_wss_opd_by_date"]
 

@@ -28,8 +28,8 @@ from pyklip_diffrender.detection.relinearise import lacking, star_only, with_com
 from pyklip_diffrender.detection.result import Detection, amplitudes
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.units import ARCSEC
 
 __all__ = [
     "Candidates",

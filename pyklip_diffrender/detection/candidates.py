@@ -14,7 +14,7 @@ from scipy.ndimage import maximum_filter
 from torch import Tensor
 
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.linear_model import LinearModel
+from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["Candidates", "refine_candidates", "strongest_peak"]

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.linear_model import LinearModel
+from pyklip_diffrender.linear.model import LinearModel
 
 __all__ = ["Maps"]
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.linear_model import LinearModel
+from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import Refinement, refine_again
-from pyklip_diffrender.scene import Planet
+from pyklip_diffrender.scene.objects import Planet
 
 __all__ = ["lacking", "star_only", "with_companions", "without_light"]
 

@@ -20,8 +20,8 @@ from pyklip_diffrender.detection.relinearise import star_only, without_light
 from pyklip_diffrender.detection.scale import scale_errors
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.files import replacing, write_fits
-from pyklip_diffrender.linear_model import LinearModel
+from pyklip_diffrender.io.files import replacing, write_fits
+from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["Detection", "amplitudes"]

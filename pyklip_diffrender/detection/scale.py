@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.geometry import PupilGrid
-from pyklip_diffrender.linear_model import LinearFrame, LinearModel
+from pyklip_diffrender.linear.model import LinearFrame, LinearModel
+from pyklip_diffrender.linear.response import NANOMETRE
+from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.response import NANOMETRE
 
 __all__ = ["scale_errors"]
 

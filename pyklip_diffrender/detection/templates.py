@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.lattice import PointSources
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.linear.forward_mode import jacfwd
+from pyklip_diffrender.linear.response import coarse_copy, downsample
+from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.response import coarse_copy, downsample
-from pyklip_diffrender.units import ARCSEC
 
 __all__ = ["Templates"]
 
@@ -141,7 +142,7 @@ class Templates:
                 with torch.no_grad():
                     rows.append([image(offset)])
                 if slopes:
-                    rows[-1] += list(torch.func.jacfwd(image)(offset).movedim(-1, 0))
+                    rows[-1] += list(jacfwd(image)(offset).movedim(-1, 0))
             stacked = float(fit.values["flux"][0]) * torch.stack(
                 [torch.stack(row) for row in rows], dim=1
             )

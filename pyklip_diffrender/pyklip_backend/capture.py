@@ -20,7 +20,7 @@ from astropy import units as u
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from pyklip_diffrender.observation import BAD_PIXEL_BITS
+from pyklip_diffrender.scene.observation import BAD_PIXEL_BITS
 
 __all__ = [
     "SourceFrames",

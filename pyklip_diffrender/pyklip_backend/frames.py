@@ -18,12 +18,12 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
-from pyklip_diffrender.headers import header_date
-from pyklip_diffrender.nircam import NIRCAM_LW_PIXELSCALE
-from pyklip_diffrender.observation import Observation
+from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
+from pyklip_diffrender.io.headers import header_date
+from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pyklip_backend.capture import SourceFrames, source_frames_of
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, settings_of
-from pyklip_diffrender.units import native_float64
+from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["Frames", "frames_of", "observation_from_dataset"]
 

@@ -14,9 +14,9 @@ from typing import Any
 from astropy.io import fits
 
 from pyklip_diffrender import __version__
-from pyklip_diffrender.opd import OPDMap
 from pyklip_diffrender.pyklip_backend.frames import Frames
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
+from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["Made", "provenance", "require_folder", "staging", "stamp"]
 

@@ -22,7 +22,6 @@ from pyklip_diffrender.errors import (
     RefinementError,
     ShapeError,
 )
-from pyklip_diffrender.opd import OPDMap
 from pyklip_diffrender.pyklip_backend.frames import Frames, frames_of
 from pyklip_diffrender.pyklip_backend.placement import (
     aligned_before,
@@ -42,6 +41,7 @@ from pyklip_diffrender.pyklip_backend.products import (
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.wavefront import starting_opd
+from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["RESULTS", "Reduction", "mark_filtered"]
 

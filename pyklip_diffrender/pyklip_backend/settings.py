@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
 
@@ -23,9 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 from pyklip_diffrender.errors import IncompatibleSetupError
 
 if TYPE_CHECKING:
-    from pyklip_diffrender.fidelity import Plan
-    from pyklip_diffrender.opd import OPDMap
-    from pyklip_diffrender.pyklip_backend.subtract import Subtractor
+    from pyklip_diffrender.planning import Plan
+    from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["ATTRIBUTE", "DiffrenderSettings", "OPDLike", "Options", "settings_of"]
 
@@ -50,7 +49,7 @@ class Options(TypedDict, total=False):
     keep_detected: bool
     refine_options: Mapping[str, Any]
     model_options: Mapping[str, Any]
-    subtractor: Subtractor
+    subtractor: Callable[..., Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +112,7 @@ class DiffrenderSettings:
     keep_detected: bool | None = None
     refine_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    subtractor: Subtractor | None = None
+    subtractor: Callable[..., Any] | None = None
 
     def over(self, other: DiffrenderSettings) -> DiffrenderSettings:
         """These settings, with what they do not say taken from `other`."""

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import OPDMap
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:
-    from pyklip_diffrender.optics import OpticalSystem
+    from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["FIT_PIXELS", "Fit", "Subtraction", "Subtractor", "model_for", "subtract_by_refinement"]
@@ -246,9 +246,9 @@ def model_for(observation: Observation, settings: DiffrenderSettings) -> Optical
         "pixelscale": observation.pixelscale,
     }
     if _is_nircam(observation) and settings.pixelscale is None:
-        from pyklip_diffrender.geometry import samples_for_field
+        from pyklip_diffrender.instrument.spectrum import filter_throughput
+        from pyklip_diffrender.optics.grid import samples_for_field
         from pyklip_diffrender.refinement.presets import NIRCAM_MODEL
-        from pyklip_diffrender.spectrum import filter_throughput
 
         options |= NIRCAM_MODEL
         # What is subtracted covers the whole frame.
@@ -265,7 +265,7 @@ def model_for(observation: Observation, settings: DiffrenderSettings) -> Optical
 
 
 def _build(filter_name: str, options: tuple[tuple[str, Any], ...]) -> OpticalSystem:
-    from pyklip_diffrender.nircam import nircam_coronagraph
+    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 
     return nircam_coronagraph(filter_name, **dict(options))
 

@@ -7,8 +7,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from pyklip_diffrender.errors import MissingOPDError
-from pyklip_diffrender.opd import OPDMap, as_opd_map
 from pyklip_diffrender.pyklip_backend.settings import OPDLike
+from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
 
 __all__ = ["starting_opd"]
 
@@ -21,7 +21,7 @@ def starting_opd(opd: OPDLike | None) -> OPDMap:
     MissingOPDError
         If there is none, with the ways to give one.
     CorruptFileError, UnitError, ShapeError, NonFiniteError
-        As `pyklip_diffrender.opd.read_opd`.
+        As `pyklip_diffrender.wavefront.opd.read_opd`.
     """
     if opd is None:
         raise MissingOPDError(

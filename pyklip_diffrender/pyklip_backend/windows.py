@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import NoValidPixelsError
-from pyklip_diffrender.observation import Observation
+from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["Window", "extent"]
 

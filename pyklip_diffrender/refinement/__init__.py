@@ -14,16 +14,16 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
     ShapeError,
 )
-from pyklip_diffrender.fidelity import Plan
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import as_opd_map
-from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.planning import Plan
 from pyklip_diffrender.refinement.gradient import AdamOptions, LBFGSOptions, adam, lbfgs
 from pyklip_diffrender.refinement.growth import gauss_newton
 from pyklip_diffrender.refinement.options import GaussNewtonOptions
 from pyklip_diffrender.refinement.planned import make_plan, refine_by_plan, require_plan_for
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement, Status
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import as_opd_map
 
 __all__ = [
     "FIDELITY",

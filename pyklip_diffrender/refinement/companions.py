@@ -17,9 +17,9 @@ from scipy.ndimage import maximum_filter
 from scipy.signal import fftconvolve
 from torch import Tensor
 
-from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.misfit import Misfit, State
-from pyklip_diffrender.scene import Planet
+from pyklip_diffrender.scene.objects import Planet
 
 __all__ = ["bright_companions", "standing_out"]
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from pyklip_diffrender.linear_model import LinearModel
+from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement.misfit import Misfit, State
 from pyklip_diffrender.refinement.result import Refinement
 

@@ -7,10 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.geometry import PupilGrid
-from pyklip_diffrender.refinement.problem import Problem
-from pyklip_diffrender.refinement.unknowns import Unknowns
-from pyklip_diffrender.response import (
+from pyklip_diffrender.linear.response import (
     NANOMETRE,
     Responses,
     WavefrontResponse,
@@ -18,6 +15,9 @@ from pyklip_diffrender.response import (
     downsample,
     parameter_jacobian,
 )
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.unknowns import Unknowns
 
 __all__ = ["Forward", "Point"]
 

@@ -18,10 +18,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from pyklip_diffrender.bases import Basis
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.linear_model import LinearModel
-from pyklip_diffrender.priors import EvidenceUpdate, scale_ratios, solve_with_evidence
+from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.linear.response import Responses
 from pyklip_diffrender.refinement.companions import standing_out
 from pyklip_diffrender.refinement.conclusion import as_refinements
 from pyklip_diffrender.refinement.forward import Forward
@@ -32,8 +31,9 @@ from pyklip_diffrender.refinement.options import GaussNewtonOptions
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement, Status
 from pyklip_diffrender.refinement.unknowns import Unknowns
-from pyklip_diffrender.response import Responses
-from pyklip_diffrender.scene import Planet
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.wavefront.bases import Basis
+from pyklip_diffrender.wavefront.priors import EvidenceUpdate, scale_ratios, solve_with_evidence
 
 __all__ = ["GaussNewton"]
 

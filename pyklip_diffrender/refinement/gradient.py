@@ -15,13 +15,13 @@ from scipy.optimize import minimize
 from torch import Tensor
 from tqdm import tqdm
 
-from pyklip_diffrender.bases import Basis, default_basis
-from pyklip_diffrender.geometry import PupilGrid
+from pyklip_diffrender.linear.response import NANOMETRE
+from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.parameters import FLUX_AND_BACKGROUND, parameter
-from pyklip_diffrender.priors import WavefrontPrior
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement, Status
-from pyklip_diffrender.response import NANOMETRE
+from pyklip_diffrender.wavefront.bases import Basis, default_basis
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = ["AdamOptions", "LBFGSOptions", "adam", "lbfgs"]
 

@@ -7,12 +7,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pyklip_diffrender.bases import default_basis
 from pyklip_diffrender.refinement.gauss_newton import GaussNewton
 from pyklip_diffrender.refinement.options import GaussNewtonOptions
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.scene import Planet
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.wavefront.bases import default_basis
 
 __all__ = ["gauss_newton"]
 

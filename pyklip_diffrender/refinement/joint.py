@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.linear_model import LinearModel
+from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement.unknowns import Unknowns
-from pyklip_diffrender.scene import Planet
+from pyklip_diffrender.scene.objects import Planet
 
 __all__ = ["Joint"]
 

@@ -8,7 +8,7 @@ import torch
 from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
-from pyklip_diffrender.linear_model import LinearFrame
+from pyklip_diffrender.linear.model import LinearFrame
 from pyklip_diffrender.refinement.misfit import Misfit, State
 
 __all__ = ["Linearised", "linearise"]

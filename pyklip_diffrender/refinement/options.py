@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from pyklip_diffrender.bases import Basis
-from pyklip_diffrender.linear_model import LinearModel
-from pyklip_diffrender.priors import WavefrontPrior
-from pyklip_diffrender.scene import Planet
+from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.wavefront.bases import Basis
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = ["GaussNewtonOptions"]
 

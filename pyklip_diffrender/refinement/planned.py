@@ -13,17 +13,17 @@ import numpy as np
 import torch
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.fidelity import Error, Plan, plan
-from pyklip_diffrender.geometry import PupilGrid
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import OPDMap
-from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.linear.response import NANOMETRE
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.planning import Error, Plan, plan
 from pyklip_diffrender.refinement.growth import gauss_newton
 from pyklip_diffrender.refinement.options import GaussNewtonOptions
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.response import NANOMETRE
-from pyklip_diffrender.scene import Planet
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["make_plan", "refine_by_plan", "require_plan_for"]
 

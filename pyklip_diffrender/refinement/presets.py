@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from pyklip_diffrender.nircam import SIAF_PIXELSCALE, SIAF_SHEAR
-from pyklip_diffrender.priors import WavefrontPrior
+from pyklip_diffrender.instrument.nircam import SIAF_PIXELSCALE, SIAF_SHEAR
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = ["NIRCAM_FIT", "NIRCAM_MODEL"]
 

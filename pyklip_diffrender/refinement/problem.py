@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import OPDMap, resample
-from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import OPDMap, resample
 
 __all__ = ["Problem"]
 

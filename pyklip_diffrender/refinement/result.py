@@ -14,12 +14,12 @@ from astropy.table import QTable, Table
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pyklip_diffrender.fidelity import Plan
-from pyklip_diffrender.linear_model import LinearModel
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import OPDMap
-from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
+from pyklip_diffrender.planning import Plan
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["Refinement", "Status"]
 

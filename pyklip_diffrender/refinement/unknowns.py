@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.parameters import FLUX_AND_BACKGROUND, parameter
-from pyklip_diffrender.scene import Planet
+from pyklip_diffrender.scene.objects import Planet
 
 __all__ = ["COMPANION_PRIOR", "Unknowns"]
 

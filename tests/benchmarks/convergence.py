@@ -20,9 +20,10 @@ import torch
 from compared import Array, largest, timed
 from provenance import provenance
 
-from pyklip_diffrender.geometry import PupilGrid, jwst_pupil, maskrnd_openings, polygon_coverage
-from pyklip_diffrender.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
-from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
+from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
+from pyklip_diffrender.optics.system import OpticalSystem
 
 TESTS = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(TESTS))

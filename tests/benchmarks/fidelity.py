@@ -19,11 +19,11 @@ import torch
 from provenance import provenance
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.nircam import nircam_coronagraph
-from pyklip_diffrender.opd import random_drift, random_opd
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.scene import PAPER_SEGMENT_GAP, Planet, Scene, Star
-from pyklip_diffrender.simulation import simulate, star_photons
+from pyklip_diffrender.scene.objects import PAPER_SEGMENT_GAP, Planet, Scene, Star
+from pyklip_diffrender.scene.simulation import simulate, star_photons
+from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 
 SEEDS = (1, 2)
 ONE = {"monochromatic": 4.5e-6}

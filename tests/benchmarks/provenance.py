@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 import torch
 
-from pyklip_diffrender.bench.timing import processor
+from tests.benchmarks.speed.timing import processor
 
 __all__ = ["provenance"]
 

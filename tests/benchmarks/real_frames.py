@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from pyklip_diffrender.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import read_opd
+from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
 from pyklip_diffrender.refinement import refine
 from pyklip_diffrender.refinement.presets import NIRCAM_FIT, NIRCAM_MODEL
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import read_opd
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from hip65426_pyklip import away_from_companions, residual_share

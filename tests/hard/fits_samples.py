@@ -15,9 +15,9 @@ import torch
 from astropy.io import fits
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError
-from pyklip_diffrender.linear_model import LinearFrame, LinearModel
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import OPDMap, random_opd, read_opd
+from pyklip_diffrender.linear.model import LinearFrame, LinearModel
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, read_opd
 
 __all__ = ["READERS", "calints", "content", "opd_map", "outcome", "same", "sane", "wavefront"]
 

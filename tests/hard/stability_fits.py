@@ -17,15 +17,15 @@ import torch
 from hard_cases import WAVELENGTH, segment
 from numpy.typing import NDArray
 
-from pyklip_diffrender.bases import FourierModes, JointBasis, SegmentMotions
-from pyklip_diffrender.geometry import PupilGrid
-from pyklip_diffrender.nircam import nircam_coronagraph
-from pyklip_diffrender.observation import Observation
-from pyklip_diffrender.opd import random_opd
-from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.priors import WavefrontPrior
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import Refinement, Status, refine
-from pyklip_diffrender.scene import Planet
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = [
     "FITS", "PRIOR", "SUCCESS", "FitRow", "Pistons", "adam_on_pixels", "drift_rms", "error_of",

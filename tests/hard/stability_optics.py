@@ -24,10 +24,11 @@ from hard_cases import (
     worst,
 )
 
-from pyklip_diffrender.geometry import PupilGrid, jwst_pupil, maskrnd_openings, polygon_coverage
-from pyklip_diffrender.nircam import NIRCAM_LW_PIXELSCALE, mask335r_complement
-from pyklip_diffrender.scene import Planet, Scene
-from pyklip_diffrender.simulation import expected_photons, planet_photons, star_photons
+from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
+from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, mask335r_complement
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
+from pyklip_diffrender.scene.objects import Planet, Scene
+from pyklip_diffrender.scene.simulation import expected_photons, planet_photons, star_photons
 
 __all__ = ["NPIX", "ROWS", "summed_in_float32"]
 

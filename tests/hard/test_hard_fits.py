@@ -29,11 +29,11 @@ from stability_fits import (
     star,
 )
 
-from pyklip_diffrender.bases import FourierModes
-from pyklip_diffrender.geometry import PupilGrid
-from pyklip_diffrender.metrics import psnr, star_model_error, throughput
+from pyklip_diffrender.detection.metrics import psnr, star_model_error, throughput
+from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
 from pyklip_diffrender.refinement import Refinement, Status
+from pyklip_diffrender.wavefront.bases import FourierModes
 
 pytestmark = pytest.mark.hard
 

@@ -9,12 +9,12 @@ import pytest
 import torch
 from hard_cases import DTYPES, WAVELENGTH, small
 
-from pyklip_diffrender.geometry import JWST_DIAMETER, PupilGrid
-from pyklip_diffrender.masks import BoxPart, FourierMask, SampledOcculter, SeparablePart
-from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.planes import Plane, Wavefront
-from pyklip_diffrender.propagation import MatrixFourier
-from pyklip_diffrender.units import ARCSEC
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.fourier import MatrixFourier
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.optics.masks import BoxPart, FourierMask, SampledOcculter, SeparablePart
+from pyklip_diffrender.optics.planes import Plane, Wavefront
+from pyklip_diffrender.optics.system import OpticalSystem
 
 pytestmark = pytest.mark.hard
 

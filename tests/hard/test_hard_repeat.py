@@ -14,15 +14,15 @@ from astropy.io import fits
 from hard_cases import DTYPES, NPIX, small, system, wavefront, worst
 from stability_fits import error_of, fitted, noise, observed, star
 
-from pyklip_diffrender.arrays import AberrationOptic
-from pyklip_diffrender.files import open_fits, write_fits
-from pyklip_diffrender.geometry import JWST_DIAMETER, PupilGrid
-from pyklip_diffrender.masks import FourierMask
-from pyklip_diffrender.opd import random_drift, random_opd
-from pyklip_diffrender.orientation import Orientation
-from pyklip_diffrender.planes import Wavefront
-from pyklip_diffrender.scene import Planet, Scene
-from pyklip_diffrender.simulation import simulate
+from pyklip_diffrender.io.files import open_fits, write_fits
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.optics.masks import FourierMask
+from pyklip_diffrender.optics.orientation import Orientation
+from pyklip_diffrender.optics.planes import Wavefront
+from pyklip_diffrender.optics.sampled_planes import AberrationOptic
+from pyklip_diffrender.scene.objects import Planet, Scene
+from pyklip_diffrender.scene.simulation import simulate
+from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 
 pytestmark = pytest.mark.hard
 
@@ -160,7 +160,7 @@ def test_a_process_killed_in_the_middle_of_the_file_leaves_the_old_one(
         import os, sys, time
         import numpy as np
         from astropy.io import fits
-        from pyklip_diffrender.files import write_fits
+        from pyklip_diffrender.io.files import write_fits
         whole = fits.HDUList.writeto
 
         def half(hdus, name, **options):

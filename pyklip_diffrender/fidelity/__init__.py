@@ -1,9 +1,0 @@
-"""How fine a model has to be for a scene: measured, chosen, verified."""
-
-from __future__ import annotations
-
-from pyklip_diffrender.fidelity.choice import Choice, Economy, Error, Option
-from pyklip_diffrender.fidelity.planning import plan
-from pyklip_diffrender.fidelity.result import Plan
-
-__all__ = ["Choice", "Economy", "Error", "Option", "Plan", "plan"]

@@ -1,0 +1,1 @@
+"""JWST and NIRCam from embedded tables: mirror, masks, filters, `nircam_coronagraph`."""

@@ -1,0 +1,76 @@
+"""The JWST primary mirror and NIRCam's Lyot stop: outlines from the embedded tables.
+
+Orientation: entrance pupil, x along +V2 and y along +V3 (see `pyklip_diffrender.optics.grid`).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.io.files import embedded_table
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
+
+__all__ = ["TABULATED_GAP", "jwst_pupil", "jwst_segments", "maskrnd_openings"]
+
+TABULATED_GAP = 7.68e-3
+"""Distance between neighbouring segments of the embedded outlines, m."""
+
+
+def _polygons(table: str, label: str, **where: str) -> dict[str, Tensor]:
+    rows = embedded_table(table)
+    for column, value in where.items():
+        rows = rows[rows[column] == value]
+    polygons = {}
+    for name in dict.fromkeys(str(value) for value in rows[label]):
+        chosen = rows[rows[label].astype(str) == name]
+        polygons[name] = torch.from_numpy(
+            np.stack([np.array(chosen["v2"]), np.array(chosen["v3"])], axis=1).astype(np.float64)
+        )
+    return polygons
+
+
+@lru_cache(maxsize=1)
+def jwst_segments() -> dict[str, Tensor]:
+    """Outlines of the 18 primary-mirror segments, (vertices, 2) in m, by name."""
+    return _polygons("jwst_primary_polygons", "name", kind="segment")
+
+
+@lru_cache(maxsize=1)
+def maskrnd_openings() -> list[Tensor]:
+    """Outlines of the 14 openings of the MASKRND Lyot stop, (vertices, 2) in m at the primary."""
+    return list(_polygons("nircam_maskrnd_openings", "opening").values())
+
+
+def jwst_pupil(npix: int, segment_gap: float | None = None) -> Tensor:
+    """Amplitude transmission of the JWST entrance pupil.
+
+    Parameters
+    ----------
+    npix : int
+        Samples across 6.603464 m.
+    segment_gap : float, optional
+        Width of the gaps between the segments, m, by moving all segment edges alike. The
+        embedded outlines have 7.7 mm.
+
+    Returns
+    -------
+    Tensor, (npix, npix), float64
+        Pixels cut by an edge hold the covered fraction of their area.
+    """
+    # Struts cross segment edges inside single pixels, where a product of coverages is only
+    # approximate: small arrays are averaged from a fine one.
+    fine = npix * max(1, -(-1024 // npix))
+    grid = PupilGrid.full(fine)
+    outlines = list(jwst_segments().values())
+    if segment_gap is not None:
+        growth = (TABULATED_GAP - segment_gap) / 2
+        outlines = [widen_polygon(outline, growth) for outline in outlines]
+    # Outlines without gaps overlap by up to a tenth of a millimetre where three of them meet.
+    pupil = polygon_coverage(outlines, grid).clamp(max=1.0)
+    for strut in _polygons("jwst_primary_polygons", "name", kind="strut").values():
+        pupil = pupil * (1 - polygon_coverage([strut], grid))
+    return pupil.reshape(npix, fine // npix, npix, fine // npix).mean(dim=(1, 3))

@@ -1,0 +1,1 @@
+"""What crosses the package's border: units, files and headers."""

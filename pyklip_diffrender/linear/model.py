@@ -1,0 +1,366 @@
+"""The linear model of a fit: what every unknown does to every pixel, and how well it is known.
+
+With the whitened Jacobian G of all unknowns, their prior precision P and the data r (their
+distance from what the prior's mean predicts), the data's covariance once all unknowns are
+integrated out is Sigma = 1 + G^T P^-1 G. By Woodbury everything that Sigma^-1 is needed for costs
+one Cholesky factor of P + G G^T: the flux of a template p and its error are
+
+    flux = p . Sigma^-1 r / p . Sigma^-1 p,    error = 1 / sqrt(p . Sigma^-1 p).
+
+(C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, section
+2.7 has this marginalisation.) Here unknowns are rows, pixels columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pyklip_diffrender.errors import ShapeError
+
+__all__ = ["LinearFrame", "LinearModel", "Weighed"]
+
+_BATCH = 512
+
+
+@dataclass(frozen=True)
+class LinearFrame:
+    """One frame's part of a linear model.
+
+    Attributes
+    ----------
+    residual : Tensor, (ny, nx), float64
+        Data minus prediction where the model is linearised.
+    weight : Tensor, (ny, nx), float64
+        1 / standard deviation; 0 for pixels that do not count.
+    jacobian : Tensor, (rows, ny, nx), float32
+        What the unknowns do to the pixels, in the data's unit.
+    rows : Tensor, (rows,), int64
+        Which of the model's unknowns each row belongs to.
+    drift : Tensor, (some,), int64
+        Unknowns by which the last rows of this frame (its wavefront modes, from the first one on)
+        may differ from the other frames'.
+    modes : int
+        Place of the first wavefront mode among the rows.
+    """
+
+    residual: Tensor
+    weight: Tensor
+    jacobian: Tensor
+    rows: Tensor
+    drift: Tensor
+    modes: int
+
+    def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
+        """Sum what stands for every row, (rows, k), over the unknowns, (size, k)."""
+        total = torch.zeros(size, *on_rows.shape[1:], dtype=on_rows.dtype)
+        total.index_add_(0, self.rows, on_rows)
+        count = len(self.drift)
+        return total.index_add_(0, self.drift, on_rows[self.modes : self.modes + count])
+
+    def of_unknowns(self, values: Tensor) -> Tensor:
+        """Values of the rows from those of the unknowns; the adjoint of `onto_unknowns`."""
+        rows = values[self.rows]
+        rows[self.modes : self.modes + len(self.drift)] += values[self.drift]
+        return rows
+
+
+class Weighed(NamedTuple):
+    """Inner products of templates p, (k,) each.
+
+    Attributes
+    ----------
+    numerator : Tensor
+        p . Sigma^-1 r.
+    information : Tensor
+        p . Sigma^-1 p.
+    photon : Tensor
+        p . p, whitened: the information if everything but the template's amplitude were known.
+    """
+
+    numerator: Tensor
+    information: Tensor
+    photon: Tensor
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """Data = prediction + Jacobian (x - vector) + noise, with Gaussian priors on x.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of all unknowns.
+    frames : tuple of LinearFrame
+    vector : Tensor, (unknowns,)
+        Where it is linearised.
+    mean, deviation : Tensor, (unknowns,)
+        The priors; a deviation of inf is none.
+    curvature : Tensor, (unknowns, unknowns)
+        G G^T over all frames, float64.
+    """
+
+    names: tuple[str, ...]
+    frames: tuple[LinearFrame, ...]
+    vector: Tensor
+    mean: Tensor
+    deviation: Tensor
+    curvature: Tensor
+
+    def __repr__(self) -> str:
+        ny, nx = self.frames[0].residual.shape
+        return f"<LinearModel: {len(self.names)} unknowns, {len(self.frames)} x {ny} x {nx} pixels>"
+
+    @cached_property
+    def _scale(self) -> Tensor:
+        """Units of the unknowns in which the curvature's diagonal is of order 1."""
+        precision = self.curvature.diagonal() + self.deviation**-2.0
+        return precision.clamp(min=1e-300) ** -0.5
+
+    @cached_property
+    def _factor(self) -> Tensor:
+        """Lower Cholesky factor of P + G G^T, in scaled units."""
+        system = self.curvature * self._scale[:, None] * self._scale
+        system.diagonal().add_((self._scale / self.deviation) ** 2)
+        return torch.linalg.cholesky(system)
+
+    @property
+    def covariance(self) -> Tensor:
+        """Posterior covariance of all unknowns, (unknowns, unknowns)."""
+        return torch.cholesky_inverse(self._factor) * self._scale[:, None] * self._scale
+
+    @cached_property
+    def determined(self) -> Tensor:
+        """How far the data determine every unknown, (unknowns,).
+
+        1 less the ratio of posterior to prior variance: near 0 for what the data do not see, 1
+        for what has no prior.
+        """
+        return 1 - self.variances(torch.eye(len(self.vector)).double()) / self.deviation**2
+
+    def variances(self, combinations: Tensor) -> Tensor:
+        """Posterior variances, (k,), of linear combinations of the unknowns, (unknowns, k)."""
+        scaled = combinations * self._scale[:, None]
+        return torch.linalg.solve_triangular(self._factor, scaled, upper=False).square_().sum(dim=0)
+
+    def unseen(self, limit: float = 0.01) -> tuple[str, ...]:
+        """Names of the unknowns of which the data determine less than `limit`."""
+        return tuple(
+            name for name, share in zip(self.names, self.determined, strict=True) if share < limit
+        )
+
+    def degenerate(self, limit: float = 0.95) -> list[tuple[str, str, float]]:
+        """Pairs of unknowns that the data hardly tell apart.
+
+        Parameters
+        ----------
+        limit : float
+            Smallest absolute posterior correlation.
+
+        Returns
+        -------
+        list of (name, name, correlation)
+            The strongest first.
+        """
+        covariance = self.covariance
+        deviation = covariance.diagonal().sqrt()
+        correlation = (covariance / deviation[:, None] / deviation).triu(1)
+        found = torch.nonzero(correlation.abs() >= limit).tolist()
+        pairs = [(self.names[i], self.names[j], float(correlation[i, j])) for i, j in found]
+        return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+    @cached_property
+    def step(self) -> Tensor:
+        """From `vector` to the most probable unknowns of the linear model, (unknowns,).
+
+        Small after a fit that has converged. Kept as a difference: the way from the priors' means
+        may be long, and its digits would be lost in single precision.
+        """
+        gradient = -(self.vector - self.mean) / self.deviation**2
+        for frame in self.frames:
+            weighted = (frame.weight**2 * frame.residual).flatten()
+            on_rows = frame.jacobian.flatten(1) @ weighted.float()
+            gradient = gradient + frame.onto_unknowns(on_rows.double(), len(self.vector))
+        scaled = torch.cholesky_solve((gradient * self._scale)[:, None], self._factor)[:, 0]
+        return scaled * self._scale
+
+    @cached_property
+    def cleaned(self) -> tuple[Tensor, ...]:
+        """Sigma^-1 r of every frame, (ny, nx): what the most probable unknowns leave, whitened."""
+        found = []
+        for frame in self.frames:
+            on_rows = frame.of_unknowns(self.step).float()
+            explained = torch.tensordot(on_rows, frame.jacobian, dims=1).double()
+            found.append(frame.weight * (frame.residual - explained))
+        return tuple(found)
+
+    def projected(self, templates: Mapping[int, Tensor]) -> Tensor:
+        """What the unknowns can do of some templates: L^-1 G p, with P + G G^T = L L^T.
+
+        Parameters
+        ----------
+        templates : mapping of int to Tensor, (k, ny, nx)
+            Of the frames that show them, in units of the data (not whitened).
+
+        Returns
+        -------
+        Tensor, (unknowns, k), float64
+        """
+        count = {len(t) for t in templates.values()}
+        if len(count) != 1:
+            raise ShapeError(f"templates: got {sorted(count)} of them, expected one number")
+        total = torch.zeros(len(self.vector), *count, dtype=torch.float64)
+        for k, images in templates.items():
+            frame = self.frames[k]
+            weighted = (images * (frame.weight**2).to(images.dtype)).flatten(1)
+            on_rows = frame.jacobian.flatten(1) @ weighted.T.to(frame.jacobian.dtype)
+            total += frame.onto_unknowns(on_rows.double(), len(self.vector))
+        return torch.linalg.solve_triangular(
+            self._factor, total * self._scale[:, None], upper=False
+        )
+
+    def weigh(self, templates: Mapping[int, Tensor]) -> Weighed:
+        """Amplitudes of templates, one at a time, with all unknowns integrated out.
+
+        Parameters
+        ----------
+        templates : mapping of int to Tensor, (k, ny, nx)
+            Of the frames that show them, in units of the data.
+
+        Returns
+        -------
+        Weighed
+            The amplitude is numerator / information, its standard deviation
+            1 / sqrt(information), or 1 / sqrt(photon) if all unknowns were known.
+        """
+        parts = []
+        total = len(next(iter(templates.values())))
+        for start in range(0, total, _BATCH):
+            part = {k: images[start : start + _BATCH] for k, images in templates.items()}
+            imitated = (self.projected(part) ** 2).sum(dim=0)
+            numerator, photon = torch.zeros_like(imitated), torch.zeros_like(imitated)
+            for k, images in part.items():
+                whitened = (images * self.frames[k].weight.to(images.dtype)).double()
+                numerator += torch.tensordot(whitened, self.cleaned[k], dims=2)
+                photon += (whitened**2).sum(dim=(1, 2))
+            parts.append(Weighed(numerator, photon - imitated, photon))
+        return Weighed(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+    def clean(self, templates: Mapping[int, Tensor]) -> dict[int, Tensor]:
+        """Sigma^-1 p, whitened, of templates (k, ny, nx) by frame; for every frame of the model.
+
+        What of the templates the unknowns cannot imitate.
+        """
+        solved = torch.linalg.solve_triangular(
+            self._factor.T, self.projected(templates), upper=True
+        )
+        solved = solved * self._scale[:, None]
+        found = {}
+        for k, frame in enumerate(self.frames):
+            explained = torch.tensordot(
+                frame.of_unknowns(solved).float(), frame.jacobian, dims=([0], [0])
+            )
+            left = -explained.double()
+            if k in templates:
+                left += templates[k].double()
+            found[k] = frame.weight * left
+        return found
+
+    def normal_equations(self, templates: Mapping[int, Tensor]) -> tuple[Tensor, Tensor]:
+        """p_i . Sigma^-1 p_j and p_i . Sigma^-1 r for a few templates fitted together."""
+        projected = self.projected(templates)
+        matrix = -projected.T @ projected
+        vector = torch.zeros(len(matrix), dtype=torch.float64)
+        for k, images in templates.items():
+            whitened = (images.double() * self.frames[k].weight).flatten(1)
+            matrix += whitened @ whitened.T
+            vector += whitened @ self.cleaned[k].flatten()
+        return matrix, vector
+
+    def without(
+        self, name: str, light: Mapping[int, Tensor | NDArray[np.float64] | float]
+    ) -> LinearModel:
+        """The model with some unknowns gone and their light back in the data.
+
+        Parameters
+        ----------
+        name : str
+            Of the unknowns, up to the bracket.
+        light : mapping of int to array, (ny, nx)
+            What those unknowns render in each frame.
+        """
+        keeps = torch.tensor([not label.startswith(f"{name}[") for label in self.names])
+        place = torch.cumsum(keeps, 0) - 1
+        frames = []
+        for k, frame in enumerate(self.frames):
+            rows = keeps[frame.rows]
+            counts = frame.weight > 0
+            back = torch.as_tensor(light.get(k, 0.0), dtype=torch.float64)
+            frames.append(
+                replace(
+                    frame,
+                    residual=torch.where(counts, frame.residual + back, 0.0),
+                    jacobian=frame.jacobian[rows],
+                    rows=place[frame.rows[rows]],
+                    drift=place[frame.drift],
+                    modes=frame.modes - int((~rows[: frame.modes]).sum()),
+                )
+            )
+        kept = torch.nonzero(keeps).flatten()
+        return LinearModel(
+            tuple(self.names[k] for k in kept.tolist()),
+            tuple(frames),
+            self.vector[kept],
+            self.mean[kept],
+            self.deviation[kept],
+            self.curvature[kept][:, kept],
+        )
+
+    def left_out(self, size: int = 5, frame: int = 0) -> tuple[Tensor, Tensor]:
+        """Residual of every patch of pixels as predicted from all pixels but its own.
+
+        Parameters
+        ----------
+        size : int
+            Side of a patch, pixels.
+        frame : int
+
+        Returns
+        -------
+        residual, deviation : Tensor, (ny, nx)
+            Data minus prediction by a fit that never saw the patch, in the data's unit, and its
+            standard deviation (noise and prediction); NaN for pixels that do not count.
+        """
+        part = self.frames[frame]
+        ny, nx = part.residual.shape
+        white = part.jacobian.double() * part.weight
+        basis = torch.zeros(len(self.vector), ny * nx, dtype=torch.float64)
+        basis.copy_(part.onto_unknowns(white.flatten(1), len(self.vector)))
+        basis = torch.linalg.solve_triangular(
+            self._factor, basis * self._scale[:, None], upper=False
+        ).reshape(-1, ny, nx)
+        residual = torch.full((ny, nx), torch.nan, dtype=torch.float64)
+        deviation = residual.clone()
+        for y in range(0, ny, size):
+            for x in range(0, nx, size):
+                window = (slice(y, y + size), slice(x, x + size))
+                counts = part.weight[window] > 0
+                if not bool(counts.any()):
+                    continue
+                inside = basis[:, window[0], window[1]][:, counts]
+                inverse = torch.eye(inside.shape[1], dtype=torch.float64) - inside.T @ inside
+                covariance = torch.linalg.inv(inverse)
+                weight = part.weight[window][counts]
+                found = covariance @ self.cleaned[frame][window][counts] / weight
+                residual[window] = residual[window].masked_scatter(counts, found)
+                deviation[window] = deviation[window].masked_scatter(
+                    counts, covariance.diagonal().sqrt() / weight
+                )
+        return residual, deviation

@@ -1,0 +1,1 @@
+"""Fourier optics of a coronagraph in torch: pupils, masks, detector, `OpticalSystem`."""

@@ -1,0 +1,1 @@
+"""A faster path through a coronagraph with one compact occulter, with the same results."""

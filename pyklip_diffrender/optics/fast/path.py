@@ -1,0 +1,321 @@
+"""The way through a coronagraph with one round occulter by convolution on `cells`.
+
+One star without moving planes goes block by block through `streaming`, all else by torch's own
+operations, which every kind of derivative passes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.fast.occulter import DEFAULT_SAMPLING, OcculterLattice, finest_spacing
+from pyklip_diffrender.optics.fast.streaming import Branch, PupilStream, has_memory, is_plain
+from pyklip_diffrender.optics.fourier import tilt_phases
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.planes import (
+    CompactOcculter,
+    EntrancePupil,
+    InternalAberration,
+    LyotStop,
+    Plane,
+    PupilStop,
+    Values,
+    Wavefront,
+)
+from pyklip_diffrender.optics.sampled_planes import Gain, PupilOptic
+
+__all__ = ["LatticeRoute", "is_pointwise"]
+
+_POINTWISE = (Gain, InternalAberration, LyotStop, PupilOptic, PupilStop)
+
+
+_LARGE = 512
+"""Samples across a pupil whose arrays do not fit into the cache: only there does it pay to compute
+the field a second time."""
+
+
+def is_pointwise(plane: Plane) -> bool:
+    """Whether a plane multiplies the field in the pupil, each sample by its own fixed factor."""
+    return isinstance(plane, _POINTWISE) and not (
+        isinstance(plane, PupilOptic) and plane.opd is not None
+    )
+
+
+class LatticeRoute:
+    """The way through planes with one round occulter by `OcculterLattice`.
+
+    Parameters
+    ----------
+    planes : sequence of Plane
+        See `serves`.
+    detector : Detector
+    """
+
+    def __init__(self, planes: Sequence[Plane], detector: Detector) -> None:
+        self.planes, self.detector = tuple(planes), detector
+        (self._place,) = (k for k, p in enumerate(planes) if isinstance(p, CompactOcculter))
+        behind = planes[self._place + 1 :]
+        self._moving = {name for plane in behind for name in plane.parameters}
+        self._lattices: dict[float, OcculterLattice] = {}
+        self._stops: dict[float, Wavefront] = {}
+        self._kernels: dict[float, Tensor] = {}
+        self._stars: dict[float, _StreamedStar] = {}
+        self._stream: PupilStream | None = None
+
+    @staticmethod
+    def serves(planes: Sequence[Plane]) -> bool:
+        """Whether there is one `CompactOcculter`, and nothing but factors in pupils."""
+        others = [plane for plane in planes if not isinstance(plane, CompactOcculter)]
+        return len(planes) - len(others) == 1 and all(is_pointwise(plane) for plane in others)
+
+    @property
+    def occulter(self) -> CompactOcculter:
+        """The occulter among the planes."""
+        plane = self.planes[self._place]
+        assert isinstance(plane, CompactOcculter)
+        return plane
+
+    @property
+    def sampling(self) -> float:
+        """Cells per lambda/D, at least."""
+        return self.occulter.sampling or DEFAULT_SAMPLING
+
+    def pays(self, wavelengths: Sequence[float]) -> bool:
+        """Whether the cells are not much finer than asked for, to fit a detector that is."""
+        for wavelength in wavelengths:
+            wanted = wavelength / self.occulter.diameter / self.sampling
+            found = finest_spacing(self.occulter, self.detector, wavelength, self.sampling)
+            if found < wanted / 2.5:
+                return False
+        return True
+
+    def lattice(self, wavelength: float) -> OcculterLattice:
+        """The cells at a wavelength."""
+        if wavelength not in self._lattices:
+            self._lattices[wavelength] = OcculterLattice(
+                self.occulter, self.detector, wavelength, self.sampling
+            )
+        return self._lattices[wavelength]
+
+    def _stop(self, onto: Sequence[PupilGrid], wavelength: float, values: Values) -> Wavefront:
+        """What the planes behind the occulter make of a field of ones.
+
+        A shift of the detector is a tilt there, so that the rest does not see it.
+        """
+        moves = not self._moving.isdisjoint(values)
+        stop = None if moves else self._stops.get(wavelength)
+        if stop is None:
+            grid = onto[self._place]
+            ones = torch.ones(
+                grid.shape, dtype=self.detector.dtype.to_complex(), device=self.detector.device
+            )
+            stop = Wavefront(ones, wavelength, grid)
+            for plane, window in zip(
+                self.planes[self._place + 1 :], onto[self._place + 1 :], strict=True
+            ):
+                stop = plane.apply(stop, values, window)
+            if not moves:
+                self._stops[wavelength] = stop
+        if "detector_shift" not in values:
+            return stop
+        x, y = values["detector_shift"].unbind(-1)
+        shift = torch.stack([x, y + self.detector.shear * x], dim=-1) * ARCSEC
+        factors = [
+            torch.polar(torch.ones_like(phase), phase).to(stop.field.dtype)
+            for phase in tilt_phases(shift, stop.grid, wavelength)
+        ]
+        return replace(stop, field=stop.field * factors[0][None, :] * factors[1][:, None])
+
+    def _kernel(self, stop: Wavefront, values: Values) -> Tensor:
+        moves = not {*self._moving, "detector_shift"}.isdisjoint(values)
+        kernel = None if moves else self._kernels.get(stop.wavelength)
+        if kernel is None:
+            kernel = self.lattice(stop.wavelength).kernel(stop, self.detector.axes({}))
+            if not moves:
+                self._kernels[stop.wavelength] = kernel
+        return kernel
+
+    def field(self, wavefront: Wavefront, values: Values, onto: Sequence[PupilGrid]) -> Tensor:
+        """Field on the detector's samples from that behind the entrance pupil.
+
+        Parameters
+        ----------
+        wavefront : Wavefront
+        values : mapping of str to Tensor
+        onto : sequence of PupilGrid
+            For every plane, the window to hand on (`OpticalSystem.windows`).
+        """
+        for plane, window in zip(self.planes[: self._place], onto, strict=False):
+            wavefront = plane.apply(wavefront, values, window)
+        lattice = self.lattice(wavefront.wavelength)
+        stop = self._stop(onto, wavefront.wavelength, values)
+        passed = wavefront.grid.crop(wavefront.field, stop.grid) * stop.field
+        direct = self.detector.field(replace(stop, field=passed), {})
+        light = lattice.focus(wavefront) * lattice.blocked
+        return direct - lattice.convolve(light, self._kernel(stop, values))
+
+    def star(
+        self,
+        entrance: EntrancePupil,
+        opd: Tensor,
+        wavelength: float,
+        values: Values,
+        onto: Sequence[PupilGrid],
+    ) -> Tensor | None:
+        """The same as `field`, for one star, in a third of the time.
+
+        Returns
+        -------
+        Tensor or None
+            It can be differentiated in reverse mode with respect to the OPD and to the star's
+            offset. None where other derivatives, several stars or moving planes are asked for.
+        """
+        offset = values.get("star_offset")
+        fixed = [value for name, value in values.items() if name != "star_offset"]
+        if (
+            self._place > 0
+            or type(entrance) is not EntrancePupil
+            or opd.device.type != "cpu"
+            or opd.ndim > 2
+            or (offset is not None and offset.ndim > 1)
+            or not {*self._moving, "detector_shift"}.isdisjoint(values)
+            or not all(is_plain(t) for t in fixed)
+            or not all(has_memory(t) for t in (opd, *values.values()))
+        ):
+            return None
+        varied = [t for t in (opd, offset) if t is not None and not is_plain(t)]
+        if varied and (opd.is_complex() or opd.shape[-1] < _LARGE):
+            return None
+        with torch.no_grad():
+            star = self._streamed(entrance, wavelength, values, onto)
+            if not varied:
+                return star.field(star.products(opd, offset))
+
+        def again(opd: Tensor, offset: Tensor | None) -> Tensor:
+            given = dict(values) if offset is None else {**values, "star_offset": offset}
+            return self.field(entrance.field(opd, wavelength, offset), given, onto)
+
+        found: Tensor = _ReverseMode.apply(opd, offset, star, again)
+        return found
+
+    def _streamed(
+        self,
+        entrance: EntrancePupil,
+        wavelength: float,
+        values: Values,
+        onto: Sequence[PupilGrid],
+    ) -> _StreamedStar:
+        if wavelength not in self._stars:
+            if self._stream is None:
+                self._stream = PupilStream(entrance.amplitude, entrance.grid)
+            lattice = self.lattice(wavelength)
+            stop = self._stop(onto, wavelength, values)
+            cells = lattice.x.positions, lattice.y.positions
+            branches = [
+                Branch(grid, factor, *axes, wavelength, self.detector.dtype, lattice.shear)
+                for grid, factor, axes in (
+                    (entrance.grid, None, cells),
+                    (stop.grid, stop.field, self.detector.axes(values)),
+                )
+            ]
+            self._stars[wavelength] = _StreamedStar(
+                self._stream,
+                branches,
+                lattice,
+                self._kernel(stop, values),
+                self.detector.per_sample,
+            )
+        return self._stars[wavelength]
+
+
+@dataclass(frozen=True)
+class _StreamedStar:
+    """What turns an OPD into the field of the star, when nothing else varies.
+
+    Attributes
+    ----------
+    stream : PupilStream
+    branches : list of Branch
+        To the cells in front of the mask, and to the detector.
+    lattice : OcculterLattice
+    kernel : Tensor
+        Of the convolution.
+    per_sample : float
+        See `Detector`.
+    """
+
+    stream: PupilStream
+    branches: list[Branch]
+    lattice: OcculterLattice
+    kernel: Tensor
+    per_sample: float
+
+    def products(self, opd: Tensor, offset: Tensor | None) -> list[Tensor]:
+        """Of the field along x, see `PupilStream.products`; the star's offset in arcsec."""
+        with torch.no_grad():
+            return self.stream.products(opd, _radians(offset), self.branches)
+
+    def field(self, products: Sequence[Tensor]) -> Tensor:
+        """Field on the detector's samples; linear, and by torch's own operations."""
+        focus, direct = (b.finish(p) for b, p in zip(self.branches, products, strict=True))
+        light = focus * self.lattice.blocked
+        return self.per_sample * direct - self.lattice.convolve(light, self.kernel)
+
+    def slopes(
+        self, opd: Tensor, offset: Tensor | None, along_x: Sequence[Tensor]
+    ) -> tuple[Tensor, Tensor | None]:
+        """Derivatives with respect to OPD and offset, from those with respect to `products`."""
+        by_opd, by_offset = self.stream.slopes(opd, _radians(offset), self.branches, along_x)
+        return by_opd, None if by_offset is None else by_offset * ARCSEC
+
+
+def _radians(offset: Tensor | None) -> Tensor | None:
+    return None if offset is None else offset * ARCSEC
+
+
+class _ReverseMode(torch.autograd.Function):
+    """The field of a `_StreamedStar` with the derivatives that reverse mode asks for.
+
+    The field in the pupil is computed again on the way back, block by block, instead of kept.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        opd: Tensor,
+        offset: Tensor | None,
+        star: _StreamedStar,
+        again: Callable[[Tensor, Tensor | None], Tensor],
+    ) -> Tensor:
+        products = star.products(opd, offset)
+        with torch.enable_grad():
+            # What follows the products is small, and autograd may keep all of it.
+            products = [product.requires_grad_() for product in products]
+            field = star.field(products)
+        ctx.save_for_backward(opd, offset)
+        ctx.star, ctx.again, ctx.kept = star, again, (products, field)
+        return field.detach()
+
+    @staticmethod
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        opd, offset = ctx.saved_tensors
+        if not torch.is_grad_enabled():
+            products, field = ctx.kept
+            along_x = torch.autograd.grad(field, products, slope, retain_graph=True)
+            by_opd, by_offset = ctx.star.slopes(opd, offset, along_x)
+            return by_opd.to(opd.dtype), by_offset, None, None
+        # These derivatives will be differentiated: through operations that autograd knows.
+        both = opd, offset
+        wanted = [t for t in both if t is not None and t.requires_grad]
+        by_each = iter(
+            torch.autograd.grad(ctx.again(opd, offset), wanted, slope, create_graph=True)
+        )
+        found = [next(by_each) if t is not None and t.requires_grad else None for t in both]
+        return found[0], found[1], None, None

@@ -1,0 +1,280 @@
+"""Point sources at every detector pixel, by convolution on cells that fit the detector.
+
+A source at p is a tilt of the pupil: what `cells` needs of the field, F[E] and F[L E], becomes
+F[E](c - p) and F[L E](x - p). Where cells, samples and sources are points of one lattice, all
+differences lie on it too. Both are computed once, on larger pieces of the lattice, and a source
+costs two small FFTs.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.fast.occulter import OcculterLattice
+from pyklip_diffrender.optics.fast.path import LatticeRoute, is_pointwise
+from pyklip_diffrender.optics.fourier import MatrixFourier
+from pyklip_diffrender.optics.planes import CompactOcculter, Wavefront
+from pyklip_diffrender.optics.system import OpticalSystem, Value
+
+__all__ = ["PointSources"]
+
+Index = ArrayLike | Tensor
+
+_log = logging.getLogger(__name__)
+
+_BATCH_BYTES = 1.2e7
+"""Of one array of a batch: more does not fit into the cache, and takes twice as long."""
+
+_NEAR = 0.15
+"""Sources within this part of the occulter's radius are computed in double precision: there the
+image is what a thousandfold suppression leaves, and single precision is good to 4e-6 of that."""
+
+
+class PointSources:
+    """Images of point sources at the centres of detector pixels, many at a time.
+
+    Parameters
+    ----------
+    model : OpticalSystem
+    opd : Tensor, (npix, npix), optional
+        m; as in a call of the model.
+    values : mapping of str to value, optional
+        The model's other parameters. A ``star_offset`` is ignored: the positions are the pixels'.
+    sampling : float
+        Cells of the occulter per lambda/D, at least.
+
+    Attributes
+    ----------
+    route : "lattice" or "model"
+        How the images are made: as in the head of this module, or by calling the model, which is
+        the way for systems whose planes are not one round mask between pupil planes.
+    """
+
+    def __init__(
+        self,
+        model: OpticalSystem,
+        opd: Value | None = None,
+        values: Mapping[str, Value | None] | None = None,
+        *,
+        sampling: float = 1.5,
+    ) -> None:
+        self.model = model
+        given = {name: value for name, value in (values or {}).items() if name != "star_offset"}
+        with torch.no_grad():
+            self._opd = model.opd(opd).detach()
+            if self._opd.ndim != 2:
+                raise ShapeError(f"opd: got shape {tuple(self._opd.shape)}, expected one map")
+            self._values = {name: value.detach() for name, value in model.values(given).items()}
+            self._waves = (
+                [self._wave(wavelength, sampling) for wavelength in model.bandpass.wavelengths]
+                if _on_one_lattice(model)
+                else []
+            )
+        self.route = "lattice" if self._waves else "model"
+        _log.debug("point sources by the route %r", self.route)
+
+    def _wave(self, wavelength: float, sampling: float) -> _Wave:
+        model, values = self.model, self._values
+        windows = model.windows(values)
+        front = model.pupil_field(self._opd, wavelength, values)
+        ones = torch.ones((), dtype=model.dtype.to_complex(), device=model.device)
+        stop = Wavefront(ones.expand(front.grid.shape), wavelength, front.grid)
+        occulter = None
+        for plane, onto in zip(model.planes, windows, strict=True):
+            if isinstance(plane, CompactOcculter):
+                occulter = plane
+                stop = Wavefront(ones.expand(onto.shape), wavelength, onto)
+            elif occulter is None:
+                front = plane.apply(front, values, onto)
+                stop = Wavefront(ones.expand(front.grid.shape), wavelength, front.grid)
+            else:
+                stop = plane.apply(stop, values, onto)
+        axes = tuple(model.detector.axes(values))
+        return _Wave(front, stop, occulter, model.detector, axes, sampling)
+
+    def positions(self, rows: Index, columns: Index) -> Tensor:
+        """Centres of pixels relative to the optical axis, (k, 2) as x, y in arcsec, float64."""
+        rows, columns = self._indices(rows, columns)
+        detector = self.model.detector
+        x, y = (
+            axis.reshape(-1, detector.oversample).mean(dim=1) / ARCSEC
+            for axis in detector.axes(self._values)
+        )
+        return torch.stack([x[columns], y[rows] + detector.shear * x[columns]], dim=-1)
+
+    def images(self, rows: Index, columns: Index) -> Tensor:
+        """Images of point sources, each in the middle of a pixel.
+
+        Parameters
+        ----------
+        rows, columns : (k,) of int
+            Indices of the pixels.
+
+        Returns
+        -------
+        Tensor, (k, ny, nx), float32
+            What ``model(opd, star_offset=position, **values)`` gives: light per detector pixel
+            as a fraction of what the pupil collects.
+
+        Raises
+        ------
+        ShapeError
+            For pixels that are not on the detector.
+        """
+        rows, columns = self._indices(rows, columns)
+        shape = (len(rows), *self.model.detector.shape)
+        found = torch.empty(shape, dtype=torch.float32, device=self.model.device)
+        with torch.no_grad():
+            near = self._near(self.positions(rows, columns))
+            for double in (False, True):
+                chosen = torch.nonzero(near == double).flatten()
+                for part in chosen.split(self._batch(double)) if len(chosen) else ():
+                    found[part] = self._batch_of_images(rows[part], columns[part], double)
+        return found
+
+    def _indices(self, rows: Index, columns: Index) -> tuple[Tensor, Tensor]:
+        pair = []
+        for name, given, count in zip(
+            ("rows", "columns"), (rows, columns), self.model.detector.shape, strict=True
+        ):
+            index = torch.as_tensor(given, device=self.model.device).reshape(-1).to(torch.int64)
+            if len(index) and (int(index.min()) < 0 or int(index.max()) >= count):
+                raise ShapeError(f"{name}: expected indices from 0 to {count - 1}")
+            pair.append(index)
+        if len(pair[0]) != len(pair[1]):
+            raise ShapeError(f"got {len(pair[0])} rows and {len(pair[1])} columns")
+        return pair[0], pair[1]
+
+    def _near(self, positions: Tensor) -> Tensor:
+        """Which positions need double precision, (k,)."""
+        radius = max(
+            (p.radius for p in self.model.planes if isinstance(p, CompactOcculter)), default=0.0
+        )
+        if self.model.dtype != torch.float64:
+            radius = 0.0
+        return positions.norm(dim=-1) < _NEAR * radius
+
+    def _batch(self, double: bool) -> int:
+        if self.route == "lattice":
+            size = max(wave.size for wave in self._waves) * (16 if double else 8)
+            return max(1, int(_BATCH_BYTES / size))
+        return max(1, int(5 * _BATCH_BYTES / (16 * self.model.npix**2)))
+
+    def _batch_of_images(self, rows: Tensor, columns: Tensor, double: bool) -> Tensor:
+        if self.route == "model":
+            offsets = self.positions(rows, columns)
+            return self.model(self._opd, offsets, **self._values).to(torch.float32)
+        oversample = self.model.detector.oversample
+        ny, nx = (count * oversample for count in self.model.detector.shape)
+        real = torch.float64 if double else torch.float32
+        total = torch.zeros(len(rows), ny, nx, dtype=real, device=self.model.device)
+        for wave, weight in zip(self._waves, self.model.bandpass.weights, strict=True):
+            wave.add_intensity(total, rows, columns, float(weight))
+        return self.model.detector.image(total, self._values).to(torch.float32)
+
+
+def _on_one_lattice(model: OpticalSystem) -> bool:
+    """Whether the planes are at most one round occulter between factors in the pupil."""
+    return LatticeRoute.serves(model.planes) or all(is_pointwise(p) for p in model.planes)
+
+
+class _Wave:
+    """What one wavelength needs: three transforms on pieces of the lattice.
+
+    Parameters
+    ----------
+    front : Wavefront
+        In front of the occulter, the source on the axis.
+    stop : Wavefront
+        What the planes behind the occulter make of a field of ones.
+    occulter : CompactOcculter or None
+    detector : Detector
+    axes : tuple of Tensor
+        Sample positions x, y, radians.
+    sampling : float
+        Cells per lambda/D, at least.
+    """
+
+    def __init__(
+        self,
+        front: Wavefront,
+        stop: Wavefront,
+        occulter: CompactOcculter | None,
+        detector: Detector,
+        axes: tuple[Tensor, ...],
+        sampling: float,
+    ) -> None:
+        self._shape, self._oversample = detector.shape, detector.oversample
+        counts = detector.shape[::-1]
+        # Samples minus sources: from the last source's first sample to the first one's last.
+        k = detector.oversample
+        differences = [
+            (torch.arange(k * (2 * n - 1), dtype=torch.float64) - (k * (n - 0.5) - 0.5))
+            * (scale * ARCSEC / k)
+            for n, scale in zip(counts, detector.pixelscale, strict=True)
+        ]
+        behind = front.grid.crop(front.field, stop.grid) * stop.field
+        direct = self._transform(behind, stop, differences, detector.shear)
+        arrays = [detector.per_sample * direct]
+        self._lattice: OcculterLattice | None = None
+        self.size = math.prod(detector.shape) * k**2
+        """Numbers in the largest array that a source needs."""
+        if occulter is not None:
+            lattice = OcculterLattice(occulter, detector, stop.wavelength, sampling)
+            both = (lattice.x, lattice.y)
+            self._per_pixel = [k * axis.cells // axis.phases for axis in both]
+            last = [float(axis[-k:].mean()) for axis in axes]
+            # Cells minus sources.
+            differences = [
+                torch.arange(2 * axis.half + 1 + (n - 1) * q, dtype=torch.float64) * axis.spacing
+                - (axis.half * axis.spacing + pixel)
+                for axis, n, q, pixel in zip(both, counts, self._per_pixel, last, strict=True)
+            ]
+            focus = self._transform(front.field, front, differences, detector.shear)
+            kernel = lattice.kernel(stop, axes)
+            arrays += [lattice.blocked, focus, kernel]
+            self._lattice = lattice
+            self.size = max(self.size, kernel.numel())
+        self._tables = _in_both_precisions(arrays)
+
+    @staticmethod
+    def _transform(field: Tensor, like: Wavefront, axes: Sequence[Tensor], shear: float) -> Tensor:
+        x, y = (axis.to(field.device) for axis in axes)
+        return MatrixFourier(like.grid, x, y, like.wavelength, field.dtype, shear).forward(field)
+
+    def add_intensity(self, total: Tensor, rows: Tensor, columns: Tensor, weight: float) -> None:
+        """Add the weighted intensities of sources to `total`, (k, samples in y, samples in x)."""
+        k = self._oversample
+        ny, nx = self._shape
+        up, left = ny - 1 - rows, nx - 1 - columns
+        direct, *occulted = self._tables[total.dtype]
+        field = _cut(direct, up * k, left * k, (ny * k, nx * k))
+        if self._lattice is not None:
+            blocked, focus, kernel = occulted
+            qx, qy = self._per_pixel
+            light = _cut(focus, up * qy, left * qx, tuple(blocked.shape)).mul_(blocked)
+            field -= self._lattice.convolve(light, kernel)
+        total.add_(field.real.square().add_(field.imag.square()), alpha=weight)
+
+
+def _in_both_precisions(arrays: Sequence[Tensor]) -> dict[torch.dtype, list[Tensor]]:
+    """The arrays in single and in double precision, by the type of real numbers."""
+    return {
+        real: [a.to(real.to_complex() if a.is_complex() else real) for a in arrays]
+        for real in (torch.float32, torch.float64)
+    }
+
+
+def _cut(array: Tensor, top: Tensor, left: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Windows of an array, one for each pair of first row and column, (k, *shape)."""
+    every = array.unfold(0, shape[0], 1).unfold(1, shape[1], 1)
+    return every[top, left]

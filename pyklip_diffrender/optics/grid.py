@@ -1,0 +1,244 @@
+"""Pupil grids and the exact rasterisation of polygons onto them.
+
+Orientation: all pupil planes are in OTE entrance-pupil orientation, x along +V2 and y along
++V3, arrays [y, x], pixel centres at ``(arange(n) - (n - 1) / 2) * D / n``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.io.units import ARCSEC
+
+__all__ = [
+    "JWST_DIAMETER",
+    "PupilGrid",
+    "polygon_coverage",
+    "samples_for_field",
+    "transform_polygons",
+    "widen_polygon",
+]
+
+JWST_DIAMETER = 6.603464
+"""Circumscribed diameter of the primary, m (stpsf.constants 2.2.0)."""
+
+
+@dataclass(frozen=True)
+class PupilGrid:
+    """A rectangular window of an ``npix`` x ``npix`` pupil array of side ``diameter``.
+
+    Attributes
+    ----------
+    npix : int
+        Samples across the full array.
+    diameter : float
+        Side of the full array, m.
+    rows, columns : tuple of int
+        Half-open index ranges [start, stop) of the window.
+    """
+
+    npix: int
+    diameter: float
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+
+    @classmethod
+    def full(cls, npix: int, diameter: float = JWST_DIAMETER) -> PupilGrid:
+        """The window that is the whole array."""
+        return cls(npix, diameter, (0, npix), (0, npix))
+
+    @property
+    def spacing(self) -> float:
+        """Distance between samples, m."""
+        return self.diameter / self.npix
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the window."""
+        return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
+
+    @property
+    def x(self) -> Tensor:
+        """Sample positions along V2, m, float64."""
+        return self._positions(self.columns)
+
+    @property
+    def y(self) -> Tensor:
+        """Sample positions along V3, m, float64."""
+        return self._positions(self.rows)
+
+    def _positions(self, limits: tuple[int, int]) -> Tensor:
+        index = torch.arange(*limits, dtype=torch.float64)
+        return (index - (self.npix - 1) / 2) * self.spacing
+
+    def around(self, array: Tensor) -> PupilGrid:
+        """The smallest window of this one outside which `array` is zero."""
+        used = array.detach() != 0
+        rows = torch.nonzero(used.any(dim=1)).flatten().tolist() or [0]
+        columns = torch.nonzero(used.any(dim=0)).flatten().tolist() or [0]
+        return replace(
+            self,
+            rows=(self.rows[0] + rows[0], self.rows[0] + rows[-1] + 1),
+            columns=(self.columns[0] + columns[0], self.columns[0] + columns[-1] + 1),
+        )
+
+    def widened(self, margin: float) -> PupilGrid:
+        """This window with `margin` metres added on every side, inside the full array."""
+        extra = int(np.ceil(margin / self.spacing))
+        return replace(
+            self,
+            rows=(max(0, self.rows[0] - extra), min(self.npix, self.rows[1] + extra)),
+            columns=(max(0, self.columns[0] - extra), min(self.npix, self.columns[1] + extra)),
+        )
+
+    def crop(self, array: Tensor, to: PupilGrid) -> Tensor:
+        """Cut the window `to` out of an array on this window, with zeros where it sticks out.
+
+        Parameters
+        ----------
+        array : Tensor, (..., rows, columns)
+        to : PupilGrid
+            A window of the same full array.
+        """
+        if to == self:
+            return array
+        top, bottom = to.rows[0] - self.rows[0], self.rows[1] - to.rows[1]
+        left, right = to.columns[0] - self.columns[0], self.columns[1] - to.columns[1]
+        height, width = self.shape
+        if top >= height or bottom >= height or left >= width or right >= width:
+            return array.new_zeros((*array.shape[:-2], *to.shape))  # They do not meet.
+        if min(top, bottom, left, right) < 0:
+            return torch.nn.functional.pad(array, (-left, -right, -top, -bottom))
+        return array[..., top : top + to.shape[0], left : left + to.shape[1]]
+
+
+def samples_for_field(field: float, wavelength: float, diameter: float = JWST_DIAMETER) -> int:
+    """Fewest samples across a pupil whose image does not repeat itself inside a field.
+
+    Parameters
+    ----------
+    field : float
+        Width, arcsec.
+    wavelength, diameter : float
+        m; the shortest wavelength, and the side of the pupil array.
+    """
+    return math.ceil(field * ARCSEC * diameter / wavelength)
+
+
+def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
+    """Fraction of each pixel's area that lies inside non-overlapping polygons.
+
+    The area is exact, whatever the grid, and differentiable in the vertices: every edge is cut
+    where it crosses pixel borders, each piece adds its signed area to its pixel and its height
+    to all pixels on its right (the scan-line accumulation of font rasterisers; by Green's
+    theorem the sum is the enclosed area).
+
+    Parameters
+    ----------
+    polygons : list of Tensor, each (vertices, 2)
+        x, y of the vertices in m, in either sense of rotation, not self-intersecting.
+    grid : PupilGrid
+
+    Returns
+    -------
+    Tensor, (rows, columns), float64
+        Between 0 and 1.
+    """
+    rows, columns = grid.shape
+    origin = torch.tensor([grid.columns[0], grid.rows[0]], dtype=torch.float64)
+    # All polygons at once: in forward mode every operation costs a third of a millisecond.
+    sizes = torch.tensor([len(polygon) for polygon in polygons])
+    owner = torch.repeat_interleave(torch.arange(len(polygons)), sizes)
+    first = (sizes.cumsum(0) - sizes)[owner]
+    following = first + (torch.arange(len(owner)) - first + 1) % sizes[owner]
+    start = torch.cat(polygons).to(torch.float64) / grid.spacing + grid.npix / 2 - origin
+    end = start[following]
+    (x, y), (x2, y2) = start.detach().T, end.detach().T
+    area = torch.zeros(len(polygons), dtype=torch.float64).index_add(0, owner, x * y2 - x2 * y)
+    sense = torch.sign(area)[owner]
+
+    edge, fraction = _border_crossings(start, end)
+    begin = start[edge] + fraction[:-1, None] * (end - start)[edge]
+    # Within one edge a piece ends where the next begins; at a change of edge it ends at 1.
+    last = torch.ones(len(edge), dtype=torch.bool)
+    last[:-1] = edge[1:] != edge[:-1]
+    stop_fraction = torch.where(last, torch.ones_like(fraction[1:]), fraction[1:])
+    finish = start[edge] + stop_fraction[:, None] * (end - start)[edge]
+
+    middle = (begin + finish) / 2
+    column, row = torch.floor(middle.detach()).to(torch.int64).unbind(dim=1)
+    height = -(finish - begin)[:, 1] * sense[edge]
+    # A piece left of the window fills all of its row, one right of it nothing.
+    beyond = column < 0
+    inside_x = torch.where(beyond, torch.zeros_like(height), middle[:, 0] - column)
+    column = column.clamp(0, columns)
+    kept = (row >= 0) & (row < rows)
+    flat = (row * (columns + 2) + column)[kept]
+    accumulated = torch.zeros(rows * (columns + 2), dtype=torch.float64)
+    accumulated = accumulated.index_add(0, flat, (height * (1 - inside_x))[kept])
+    accumulated = accumulated.index_add(0, flat + 1, (height * inside_x)[kept])
+    covered = accumulated.reshape(rows, columns + 2).cumsum(dim=1)[:, :columns]
+    # Sums of exact areas leave rounding errors of 1e-14 to the right of a polygon.
+    return torch.where(covered.detach().abs() < 1e-11, torch.zeros_like(covered), covered)
+
+
+def _border_crossings(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+    """Where edges cross integer x or y, as fractions of the edge; every edge also has its 0.
+
+    Returns
+    -------
+    edge : Tensor, (pieces,), int64
+        Which edge each piece belongs to, ascending.
+    fraction : Tensor, (pieces + 1,)
+        Where each piece begins on its edge, ascending within an edge (and one spare element).
+    """
+    edges = [torch.arange(len(start))]
+    fractions = [torch.zeros(len(start), dtype=torch.float64)]
+    for axis in (0, 1):
+        a, b = start[:, axis], end[:, axis]
+        first = torch.floor(torch.minimum(a, b).detach()).to(torch.int64) + 1
+        after = torch.ceil(torch.maximum(a, b).detach()).to(torch.int64)
+        count = (after - first).clamp(min=0)
+        edge = torch.repeat_interleave(torch.arange(len(start)), count)
+        order = torch.arange(len(edge)) - (count.cumsum(0) - count)[edge]
+        fractions.append((first[edge] + order - a[edge]) / (b - a)[edge])
+        edges.append(edge)
+    edge, fraction = torch.cat(edges), torch.cat(fractions)
+    order = torch.argsort(fraction.detach(), stable=True)
+    order = order[torch.argsort(edge[order], stable=True)]
+    return edge[order], torch.cat([fraction[order], torch.ones(1, dtype=torch.float64)])
+
+
+def transform_polygons(polygons: list[Tensor], shift: Tensor, rotation: Tensor) -> list[Tensor]:
+    """Turn polygons about the pupil's centre, then shift them.
+
+    Parameters
+    ----------
+    polygons : list of Tensor, each (vertices, 2)
+        m.
+    shift : Tensor, (2,)
+        x, y in m.
+    rotation : Tensor, ()
+        Radians, counter-clockwise (from +x to +y).
+    """
+    cosine, sine = torch.cos(rotation), torch.sin(rotation)
+    matrix = torch.stack([torch.stack([cosine, sine]), torch.stack([-sine, cosine])])
+    moved = torch.cat(polygons) @ matrix + shift
+    return list(moved.split([len(polygon) for polygon in polygons]))
+
+
+def widen_polygon(polygon: Tensor, distance: float) -> Tensor:
+    """Move every edge of a convex polygon outwards by `distance` m (inwards if negative)."""
+    edge = polygon.roll(-1, dims=0) - polygon
+    sense = torch.sign((polygon * polygon.roll(-1, dims=0).flip(1) * torch.tensor([1, -1])).sum())
+    normal = sense * torch.stack([edge[:, 1], -edge[:, 0]], dim=1)
+    normal = normal / normal.norm(dim=1, keepdim=True)
+    before = normal.roll(1, dims=0)
+    # A corner moves along the bisector, far enough that both its edges move by the distance.
+    bisector = (before + normal) / (1 + (before * normal).sum(dim=1, keepdim=True))
+    return polygon + distance * bisector

@@ -1,0 +1,280 @@
+"""Image-plane masks of any shape: in a box, along the axes, or all over a padded FFT.
+
+All sample the image on the same lattice: multiples of ``lambda / diameter / sampling`` about the
+axis. What a mask takes away is computed where it takes something away; the three ways differ in
+speed, not in what they compute, to rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+from scipy.fft import next_fast_len
+from torch import Tensor
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.fourier import MatrixFourier
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.planes import Values, Wavefront
+
+__all__ = ["Box", "BoxPart", "FourierMask", "MaskPart", "SampledOcculter", "SeparablePart"]
+
+Box = tuple[float, float, float, float]
+"""Lower x, upper x, lower y, upper y in arcsec."""
+
+
+def _lattice(low: float, high: float, spacing: float, limit: float) -> Tensor:
+    """Multiples of `spacing` that cover an interval, all in radians.
+
+    A sampled pupil repeats its image beyond the field that its samples resolve, from ``-limit``
+    to `limit`: nothing may be taken away there twice.
+    """
+    edge = round(limit / spacing)
+    first = max(math.floor(low / spacing), -edge)
+    last = min(math.ceil(high / spacing), edge - 1)
+    return torch.arange(first, last + 1, dtype=torch.float64) * spacing
+
+
+class MaskPart(Protocol):
+    """A part of a mask: what it takes from the field, seen in the pupil behind."""
+
+    def removed(self, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
+        """Field to subtract on the window `onto`; `spacing` of the lattice in radians."""
+
+
+class BoxPart:
+    """A part that is clear outside a box: two matrix transforms on the lattice inside it.
+
+    Parameters
+    ----------
+    complement : callable
+        (x, y, wavelength) to ``1 - t``: x (1, columns) and y (rows, 1) in arcsec, image
+        orientation, wavelength in m.
+    box : Box
+    """
+
+    def __init__(self, complement: Callable[[Tensor, Tensor, float], Tensor], box: Box) -> None:
+        self.complement, self.box = complement, box
+        self._cells: dict[tuple[float, float, float], tuple[Tensor, Tensor, Tensor]] = {}
+        self._transforms: dict[tuple[float, float, PupilGrid, torch.dtype], MatrixFourier] = {}
+
+    def cells(self, wavefront: Wavefront, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions x (columns,), y (rows,) in radians, and ``1 - t`` (rows, columns)."""
+        wavelength = wavefront.wavelength
+        limit = wavelength / (2 * wavefront.grid.spacing)
+        key = (wavelength, spacing, limit)
+        if key not in self._cells:
+            left, right, bottom, top = (edge * ARCSEC for edge in self.box)
+            x = _lattice(left, right, spacing, limit)
+            y = _lattice(bottom, top, spacing, limit)
+            blocked = self.complement(x[None, :] / ARCSEC, y[:, None] / ARCSEC, wavelength)
+            self._cells[key] = (x, y, blocked)
+        return self._cells[key]
+
+    def _transform(self, wavefront: Wavefront, spacing: float, grid: PupilGrid) -> MatrixFourier:
+        device, dtype = wavefront.field.device, wavefront.field.dtype
+        key = (wavefront.wavelength, spacing, grid, dtype)
+        if key not in self._transforms:
+            x, y, _ = self.cells(wavefront, spacing)
+            self._transforms[key] = MatrixFourier(
+                grid, x.to(device), y.to(device), wavefront.wavelength, dtype
+            )
+        return self._transforms[key]
+
+    def focal_field(self, wavefront: Wavefront, spacing: float) -> Tensor:
+        """Field in front of the mask on the cells of the box."""
+        return self._transform(wavefront, spacing, wavefront.grid).forward(wavefront.field)
+
+    def removed(self, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
+        """See `MaskPart`."""
+        blocked = self.cells(wavefront, spacing)[2].to(wavefront.field)
+        taken = self.focal_field(wavefront, spacing) * blocked
+        return self._transform(wavefront, spacing, onto).inverse(taken, spacing**2)
+
+
+class SeparablePart:
+    """A part ``f(x) g(y)`` that may reach to the end of the image: one convolution per axis.
+
+    Parameters
+    ----------
+    along_x, along_y : callable or None
+        Positions in arcsec, image orientation, to that factor of ``1 - t``; None for one
+        everywhere.
+    sampling : float
+        Lattice points per lambda/diameter. As in an FFT of the pupil padded by this factor, the
+        lattice ends at ``npix / 2`` lambda/diameter.
+    """
+
+    def __init__(
+        self,
+        along_x: Callable[[Tensor], Tensor] | None,
+        along_y: Callable[[Tensor], Tensor] | None,
+        sampling: float,
+    ) -> None:
+        self.along_x, self.along_y, self.sampling = along_x, along_y, sampling
+        self._spectra: dict[tuple[str, float, PupilGrid, PupilGrid, torch.dtype], Tensor] = {}
+
+    def _spectrum(self, axis: str, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
+        """Transform of the kernel that takes the window in front to the one behind, one axis."""
+        key = (axis, wavefront.wavelength, wavefront.grid, onto, wavefront.field.dtype)
+        if key not in self._spectra:
+            grid = wavefront.grid
+            factor = self.along_x if axis == "x" else self.along_y
+            assert factor is not None
+            count = round(grid.npix * self.sampling)
+            index = torch.arange(count) - count // 2
+            values = factor(index * spacing / ARCSEC).to(torch.float64)
+            # Pupil samples whose distance is d see the d-th Fourier coefficient of the factor;
+            # the sign of the exponent is that of `propagation`, opposite in y.
+            coefficients = torch.fft.fft(torch.fft.ifftshift(values)) / count
+            if axis == "y":
+                coefficients = coefficients.conj()
+            before, behind = (w.columns if axis == "x" else w.rows for w in (grid, onto))
+            distance = torch.arange(behind[0] - before[1] + 1, behind[1] - before[0])
+            spectrum = torch.fft.fft(coefficients[distance % count], next_fast_len(len(distance)))
+            self._spectra[key] = spectrum.to(wavefront.field.device, wavefront.field.dtype)
+        return self._spectra[key]
+
+    def _convolved(
+        self, field: Tensor, axis: str, wavefront: Wavefront, spacing: float, onto: PupilGrid
+    ) -> Tensor:
+        spectrum = self._spectrum(axis, wavefront, spacing, onto)
+        dim = -1 if axis == "x" else -2
+        first = field.shape[dim] - 1
+        size = onto.shape[1] if axis == "x" else onto.shape[0]
+        shaped = spectrum if axis == "x" else spectrum[:, None]
+        product = torch.fft.fft(field, len(spectrum), dim=dim) * shaped
+        return torch.fft.ifft(product, dim=dim).narrow(dim, first, size)
+
+    def removed(self, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
+        """See `MaskPart`."""
+        field, grid = wavefront.field, wavefront.grid
+        if self.along_y is None:
+            field = grid.crop(field, replace(onto, columns=grid.columns))
+        else:
+            field = self._convolved(field, "y", wavefront, spacing, onto)
+        if self.along_x is None:
+            return replace(grid, rows=onto.rows).crop(field, onto)
+        return self._convolved(field, "x", wavefront, spacing, onto)
+
+
+class SampledOcculter:
+    """A mask that is clear but for its parts, each taken away on the common lattice.
+
+    Parameters
+    ----------
+    parts : sequence of MaskPart
+        Their complements add up to that of the mask.
+    sampling : float
+        Lattice points per lambda / `diameter`.
+    """
+
+    parameters: tuple[str, ...] = ()
+
+    def __init__(
+        self, parts: Sequence[MaskPart], sampling: float, diameter: float, name: str
+    ) -> None:
+        if sampling < 1:
+            raise IncompatibleSetupError(
+                f"{name}: got {sampling} cells per lambda/D, expected at least 1 (below that the "
+                "cells alias the pupil onto itself; 2 to 8 is usual)"
+            )
+        self.name, self.parts = name, tuple(parts)
+        self.sampling, self.diameter = sampling, diameter
+
+    def window(self, values: Values) -> None:
+        """Takes what comes."""
+        return None
+
+    def _spacing(self, wavelength: float) -> float:
+        return wavelength / self.diameter / self.sampling
+
+    def focal_field(self, wavefront: Wavefront) -> Tensor:
+        """The field in front of the first part that has a box, on its cells."""
+        for part in self.parts:
+            if isinstance(part, BoxPart):
+                return part.focal_field(wavefront, self._spacing(wavefront.wavelength))
+        raise IncompatibleSetupError(f"{self.name} has no part in a box to look at")
+
+    def focal_sample(self, wavefront: Wavefront) -> tuple[Tensor, float]:
+        """The field behind the mask inside the first box, and the lattice's spacing (radians)."""
+        spacing = self._spacing(wavefront.wavelength)
+        for part in self.parts:
+            if isinstance(part, BoxPart):
+                field = part.focal_field(wavefront, spacing) * spacing
+                blocked = part.cells(wavefront, spacing)[2]
+                return field * (1 - blocked.to(field)), spacing
+        raise IncompatibleSetupError(f"{self.name} has no part in a box to look at")
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        """Subtract what every part takes away."""
+        field = wavefront.grid.crop(wavefront.field, onto)
+        for part in self.parts:
+            field = field - part.removed(wavefront, self._spacing(wavefront.wavelength), onto)
+        return replace(wavefront, field=field, grid=onto)
+
+
+class FourierMask:
+    """A mask of any kind by FFTs of the padded pupil, as poppy does it.
+
+    Parameters
+    ----------
+    transmission : callable
+        Wavelength (m) to the complex amplitude transmission on the lattice, (n, n) with
+        n = npix times `padding`, the axis at sample n // 2; frame of the pupil transform with
+        positive exponents in x and y.
+    padding : int
+        Lattice points per lambda / diameter.
+    """
+
+    parameters: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        transmission: Callable[[float], Tensor],
+        padding: int,
+        npix: int,
+        diameter: float,
+        name: str,
+    ) -> None:
+        self.name = name
+        self.transmission, self.padding = transmission, padding
+        # poppy pads by whole samples on both sides and puts the odd one, if any, behind.
+        first = -((npix * (padding - 1)) // 2)
+        limits = (first, first + npix * padding)
+        self.grid = PupilGrid(npix, diameter, limits, limits)
+        self._latest: tuple[float, torch.dtype, Tensor] | None = None
+
+    def window(self, values: Values) -> PupilGrid:
+        """All of the padded pupil: light beside the pupil reaches the next mask."""
+        return self.grid
+
+    def _lattice_transmission(self, wavefront: Wavefront) -> Tensor:
+        # One wavelength at a time: at eight points per lambda/D one is a gigabyte. Looked at once,
+        # for another thread may put its own there at any moment.
+        latest = self._latest
+        wanted = (wavefront.wavelength, wavefront.field.dtype)
+        if latest is None or latest[:2] != wanted:
+            lattice = torch.fft.ifftshift(self.transmission(wavefront.wavelength))
+            latest = (*wanted, lattice.to(wavefront.field))
+            self._latest = latest
+        return latest[2]
+
+    def focal_sample(self, wavefront: Wavefront) -> tuple[Tensor, float]:
+        """The field behind the mask on all of the lattice, and its spacing (radians)."""
+        field = wavefront.grid.crop(wavefront.field, self.grid) * wavefront.grid.spacing
+        image = torch.fft.ifft2(field, norm="ortho") * self._lattice_transmission(wavefront)
+        spacing = wavefront.wavelength / wavefront.grid.diameter / self.padding
+        return torch.fft.fftshift(image), spacing
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        """Transform, multiply, transform back."""
+        lattice = self._lattice_transmission(wavefront)
+        field = wavefront.grid.crop(wavefront.field, self.grid)
+        field = torch.fft.fft2(torch.fft.ifft2(field) * lattice)
+        return replace(wavefront, field=self.grid.crop(field, onto), grid=onto)

@@ -1,0 +1,278 @@
+"""Planes made from arrays that somebody else sampled, in whatever frame they come.
+
+Inside a system every pupil array has the frame in which `propagation` makes the final image. The
+planes here take arrays in the frame of their own plane and turn them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.orientation import Orientation
+from pyklip_diffrender.optics.planes import EntrancePupil, Values, Wavefront
+from pyklip_diffrender.optics.zernike import zernike_basis
+
+__all__ = [
+    "AberrationOptic",
+    "Gain",
+    "MovableStop",
+    "OffsetDetector",
+    "OrientedPupil",
+    "PupilOptic",
+]
+
+
+class OrientedPupil(EntrancePupil):
+    """An entrance pupil in any frame, with a wavefront and a pointing of its own.
+
+    Parameters
+    ----------
+    amplitude, opd : Tensor, (npix, npix)
+        Amplitude transmission and OPD (m), frame of the entrance pupil. The OPD is what the
+        system has when it is called without one.
+    orientation : Orientation
+        From the frame of the entrance pupil to that of the system.
+    pointing : tuple of float
+        x, y in arcsec on the image, added to every star offset.
+    chromatic : mapping of float to Tensor
+        Wavelength (m) to an OPD (m) that is added whatever the OPD of the call, frame of the
+        entrance pupil.
+    turned : float
+        How far planes behind turn the image, degrees counter-clockwise; a source is tilted the
+        other way, so that it ends up where it was asked for.
+    """
+
+    def __init__(
+        self,
+        amplitude: Tensor,
+        opd: Tensor,
+        diameter: float,
+        dtype: torch.dtype,
+        device: torch.device,
+        name: str,
+        orientation: Orientation,
+        pointing: tuple[float, float] = (0.0, 0.0),
+        chromatic: Mapping[float, Tensor] | None = None,
+        turned: float = 0.0,
+    ) -> None:
+        array = orientation.apply(amplitude).contiguous().to(device)
+        super().__init__(array, diameter, dtype, name)
+        self.opd = opd.to(device, torch.float64)
+        self.orientation = orientation
+        self.pointing = torch.tensor(pointing, dtype=torch.float64, device=device)
+        self.chromatic = {w: extra.to(device) for w, extra in (chromatic or {}).items()}
+        angle = math.radians(-turned)
+        self._tilt = torch.tensor(
+            [[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]],
+            dtype=torch.float64,
+            device=device,
+        )
+
+    def field(self, opd: Tensor, wavelength: float, star_offset: Tensor | None) -> Wavefront:
+        """See `EntrancePupil.field`; `opd` has the frame of the entrance pupil."""
+        if wavelength in self.chromatic:
+            opd = opd + self.chromatic[wavelength]
+        offset = self.pointing if star_offset is None else star_offset + self.pointing
+        offset = offset @ self._tilt
+        return super().field(self.orientation.apply(opd), wavelength, offset)
+
+
+class PupilOptic:
+    """Amplitude and phase in a pupil plane, one array per wavelength.
+
+    Parameters
+    ----------
+    phasors : mapping of float to Tensor
+        Wavelength (m) to complex amplitude transmission, (npix, npix), frame of this plane. A
+        larger array reaches beyond the pupil by as much on every side.
+    npix : int
+        Samples across the pupil.
+    orientation : Orientation
+        From the frame of this plane to that of the system.
+    trainable : bool
+        Make the leaf tensors `opd` (m, added) and `transmission` (a factor), both (npix, npix) in
+        the frame of this plane, for whoever wants their gradients.
+    """
+
+    parameters: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        phasors: Mapping[float, Tensor],
+        npix: int,
+        diameter: float,
+        dtype: torch.dtype,
+        device: torch.device,
+        name: str,
+        orientation: Orientation,
+        trainable: bool = False,
+    ) -> None:
+        self.name, self.orientation = name, orientation
+        size = next(iter(phasors.values())).shape[-1]
+        first = -((size - npix) // 2)
+        full = PupilGrid(npix, diameter, (first, first + size), (first, first + size))
+        used = torch.stack([p != 0 for p in {id(p): p for p in phasors.values()}.values()])
+        self.grid = full.around(orientation.apply(used.any(dim=0)))
+        done: dict[int, Tensor] = {}
+        for phasor in phasors.values():
+            if id(phasor) not in done:
+                turned = full.crop(orientation.apply(phasor), self.grid).contiguous()
+                done[id(phasor)] = turned.to(device, dtype.to_complex())
+        self._phasors = {wavelength: done[id(phasor)] for wavelength, phasor in phasors.items()}
+        self._full, self._dtype = full, dtype
+        self.opd: Tensor | None = None
+        self.transmission: Tensor | None = None
+        if trainable:
+            self.opd = torch.zeros(size, size, dtype=dtype, device=device).requires_grad_()
+            self.transmission = torch.ones_like(self.opd).requires_grad_()
+
+    def window(self, values: Values) -> PupilGrid:
+        """Where it lets light through at some wavelength."""
+        return self.grid
+
+    def _turned(self, array: Tensor) -> Tensor:
+        return self._full.crop(self.orientation.apply(array), self.grid).to(self._dtype)
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        """Multiply by the phasor, and by what is being trained."""
+        field = wavefront.grid.crop(wavefront.field, self.grid)
+        field = field * self._phasors[wavefront.wavelength]
+        if self.opd is not None and self.transmission is not None:
+            phase = (2 * math.pi / wavefront.wavelength) * self._turned(self.opd)
+            field = field * torch.polar(torch.ones_like(phase), phase)
+            field = field * self._turned(self.transmission)
+        return replace(wavefront, field=field, grid=self.grid)
+
+
+class MovableStop(PupilOptic):
+    """A stop known from its samples only, that can be shifted and turned.
+
+    At rest the samples are taken as they are. Elsewhere they are interpolated with cubic
+    polynomials, which shifts by whole samples leave exact. Parameters as of `planes.LyotStop`.
+    """
+
+    parameters = ("lyot_shift", "lyot_rotation")
+    margin = 0.06
+    """Room for shifts and rotations, as a fraction of the diameter."""
+
+    def _moves(self, values: Values) -> bool:
+        return any(name in values for name in self.parameters)
+
+    def window(self, values: Values) -> PupilGrid:
+        """See `PupilOptic.window`; with some room where it may move."""
+        return (
+            self.grid.widened(self.margin * self._full.diameter)
+            if self._moves(values)
+            else (self.grid)
+        )
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        """Multiply by the stop where it is."""
+        if not self._moves(values):
+            return super().apply(wavefront, values, onto)
+        window = self.window(values)
+        field = wavefront.grid.crop(wavefront.field, window)
+        phasor = self.grid.crop(self._phasors[wavefront.wavelength], window)
+        device = phasor.device
+        zero = torch.zeros(2, dtype=torch.float64, device=device)
+        shift = values.get("lyot_shift", zero) * self._full.diameter
+        angle = torch.deg2rad(values.get("lyot_rotation", zero[:1])).reshape(())
+        x = window.x.to(device)[None, :] - shift[0]
+        y = window.y.to(device)[:, None] - shift[1]
+        # From where the light of each sample is taken: the motion backwards.
+        from_x = torch.cos(angle) * x + torch.sin(angle) * y
+        from_y = -torch.sin(angle) * x + torch.cos(angle) * y
+        middles = [(axis[0] + axis[-1]) / 2 for axis in (window.x, window.y)]
+        rows, columns = window.shape
+        positions = torch.stack(
+            [
+                (from_x - middles[0]) / (columns * window.spacing / 2),
+                (from_y - middles[1]) / (rows * window.spacing / 2),
+            ],
+            dim=-1,
+        )
+        parts = torch.stack([phasor.real, phasor.imag])[None]
+        moved = torch.nn.functional.grid_sample(
+            parts, positions[None].to(parts.dtype), mode="bicubic", align_corners=False
+        )[0]
+        return replace(wavefront, field=field * torch.complex(moved[0], moved[1]), grid=window)
+
+
+class AberrationOptic(PupilOptic):
+    """An aberration known from its samples, plus free Zernikes as `planes.InternalAberration`."""
+
+    parameters = ("si_zernikes",)
+    _known: tuple[PupilGrid, Tensor] | None = None
+
+    def _basis(self, count: int, wavefront: Wavefront) -> Tensor:
+        grid = wavefront.grid
+        # Looked at once, for another thread may put its own there at any moment.
+        known = self._known
+        if known is None or known[0] != grid or len(known[1]) != count:
+            basis = zernike_basis(count, grid.x, grid.y, grid.diameter / 2)
+            known = (grid, basis.to(wavefront.field.device))
+            self._known = known
+        return known[1]
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        """Multiply by the phasor, and by that of the Zernikes."""
+        wavefront = super().apply(wavefront, values, onto)
+        if "si_zernikes" not in values:
+            return wavefront
+        coefficients = values["si_zernikes"]
+        opd = torch.tensordot(coefficients, self._basis(len(coefficients), wavefront), dims=1)
+        phase = ((2 * math.pi / wavefront.wavelength) * opd).to(self._dtype)
+        phasor = torch.polar(torch.ones_like(phase), phase)
+        return replace(wavefront, field=wavefront.field * phasor)
+
+
+@dataclass
+class Gain:
+    """A uniform factor; 1 for a plane that is there in name only.
+
+    Attributes
+    ----------
+    name : str
+    factor : complex
+        Amplitude transmission.
+    """
+
+    name: str
+    factor: complex = 1.0
+    parameters: tuple[str, ...] = ()
+
+    def window(self, values: Values) -> None:
+        """Takes what comes."""
+        return None
+
+    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        """Multiply."""
+        if self.factor == 1:
+            return wavefront
+        return replace(wavefront, field=wavefront.field * self.factor)
+
+
+@dataclass
+class OffsetDetector(Detector):
+    """A detector whose middle is beside the optical axis.
+
+    Attributes
+    ----------
+    centre : tuple of float
+        x, y of its middle on the image, arcsec.
+    """
+
+    centre: tuple[float, float] = (0.0, 0.0)
+
+    def axes(self, values: Values) -> tuple[Tensor, Tensor]:
+        """See `Detector.axes`."""
+        x, y = super().axes(values)
+        return x + self.centre[0] * ARCSEC, y + self.centre[1] * ARCSEC

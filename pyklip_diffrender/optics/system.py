@@ -1,0 +1,410 @@
+"""`OpticalSystem`: the ordered planes of a coronagraph as one differentiable function."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.io.units import (
+    require_finite,
+    require_shape,
+    to_metres,
+    to_unit,
+    warn_of_rms,
+)
+from pyklip_diffrender.optics.bandpass import Bandpass
+from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.fast.path import LatticeRoute
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.planes import (
+    CompactOcculter,
+    EntrancePupil,
+    Plane,
+    Values,
+    Wavefront,
+)
+from pyklip_diffrender.optics.psf_file import recipe_psf
+from pyklip_diffrender.parameters import parameter
+
+__all__ = ["OpticalSystem"]
+
+Value = Tensor | ArrayLike | float
+
+_ON_AXIS = (0.0, 0.0)
+
+
+class OpticalSystem:
+    """A coronagraph: entrance pupil, planes behind it, detector.
+
+    Call it with an OPD to get the image of a star; everything is differentiable in torch.
+
+    Parameters
+    ----------
+    entrance : EntrancePupil
+    planes : sequence of Plane
+        What lies between, in order. Each is linear in the field.
+    detector : Detector
+    bandpass : Bandpass
+        Wavelengths and weights.
+    recipe : mapping, optional
+        What the system was made from, for provenance and for `with_fidelity`.
+    remake : callable, optional
+        Makes the same system from a changed recipe.
+    route : "auto", "lattice" or "planes"
+        How light gets to the detector: by convolution on cells that fit the detector (`cells`),
+        which is for one round occulter between pupils, or plane by plane, which is for all.
+        "auto" takes the first where it can be had and the detector is not very fine.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For the route "lattice" through planes that it does not take.
+    """
+
+    def __init__(
+        self,
+        entrance: EntrancePupil,
+        planes: Sequence[Plane],
+        detector: Detector,
+        bandpass: Bandpass,
+        recipe: dict[str, Any] | None = None,
+        remake: Callable[..., OpticalSystem] | None = None,
+        route: str = "auto",
+    ) -> None:
+        self.entrance = entrance
+        self.planes = tuple(planes)
+        self.detector = detector
+        self.bandpass = bandpass
+        self.recipe = dict(recipe or {})
+        self._remake = remake
+        if route not in ("auto", "lattice", "planes"):
+            raise IncompatibleSetupError(
+                f"route: got {route!r}, expected 'auto', 'lattice' or 'planes'"
+            )
+        self._lattice: LatticeRoute | None = None
+        if route != "planes" and LatticeRoute.serves(self.planes):
+            lattice = LatticeRoute(self.planes, detector)
+            if route == "lattice" or lattice.pays(bandpass.wavelengths):
+                self._lattice = lattice
+        if route == "lattice" and self._lattice is None:
+            raise IncompatibleSetupError(
+                "route 'lattice': the planes are not one round occulter between factors in "
+                "pupils; use 'auto' or 'planes'"
+            )
+
+    def __repr__(self) -> str:
+        names = ", ".join(
+            [self.entrance.name, *(plane.name for plane in self.planes), self.detector.name]
+        )
+        waves = len(self.bandpass.wavelengths)
+        return (
+            f"<OpticalSystem: {names}; {self.npix} px pupil, {waves} wavelength"
+            f"{'s' if waves > 1 else ''} about {self.bandpass.mean_wavelength * 1e6:.2f} um, "
+            f"{self.detector.shape[1]} x {self.detector.shape[0]} px>"
+        )
+
+    @property
+    def route(self) -> str:
+        """How light gets to the detector: "lattice" or "planes"."""
+        return "planes" if self._lattice is None else "lattice"
+
+    @property
+    def npix(self) -> int:
+        """Samples across the pupil array."""
+        return self.entrance.full.npix
+
+    @property
+    def diameter(self) -> float:
+        """Side of the pupil array, m."""
+        return self.entrance.full.diameter
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Real type of the computation."""
+        return self.entrance.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where the computation runs."""
+        return self.detector.device
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that this system takes besides the OPD."""
+        between = [name for plane in self.planes for name in plane.parameters]
+        return (*self.entrance.parameters, *between, *self.detector.parameters)
+
+    def with_fidelity(self, **changes: Any) -> Self | OpticalSystem:
+        """The same system with other numerical settings, such as ``npix=256``.
+
+        Parameters
+        ----------
+        **changes
+            Arguments of the function that made this system.
+        """
+        if self._remake is None:
+            raise TypeError(
+                "this system was put together from planes and has no recipe to change; make a "
+                "second one with the settings you want"
+            )
+        return self._remake(**{**self.recipe, **changes})
+
+    def opd(self, opd: Value | None) -> Tensor:
+        """Check an OPD and bring it to the system's device: (..., npix, npix) in m.
+
+        None is the system's own wavefront, flat unless it came with one. Tensors pass through
+        unchanged in value, so that gradients flow; everything else goes through the unit gate.
+
+        Warns
+        -----
+        DiffrenderWarning
+            For an array whose rms inside the pupil is that of a wavefront in another unit.
+        """
+        if opd is None and self.entrance.opd is not None:
+            return self.entrance.opd
+        if opd is None:
+            return torch.zeros(self.npix, self.npix, dtype=self.dtype, device=self.device)
+        if not isinstance(opd, Tensor):
+            array = to_metres(opd, "opd")
+            if array.ndim < 2:
+                raise ShapeError(f"opd: got shape {array.shape}, expected (..., npix, npix)")
+            require_finite(array, "opd (NaN is only allowed outside the pupil; set it to 0)")
+            self._warn_of_unit(opd, array)
+            opd = torch.from_numpy(array)
+        if opd.shape[-2:] != (self.npix, self.npix):
+            require_shape(
+                np.empty(opd.shape[-2:]),
+                (self.npix, self.npix),
+                "opd",
+                f"This system samples the pupil with {self.npix} pixels: make it with "
+                f"npix={opd.shape[-1]}, or resample the map with opd.resample",
+            )
+        return opd.to(self.device)
+
+    def _warn_of_unit(self, given: Any, array: NDArray[np.float64]) -> None:
+        """Of bare nanometres: arrays only, for tensors are what fits move, and maps know theirs."""
+        lit = self.entrance.lit.cpu().numpy()
+        if isinstance(given, np.ndarray) and array.shape[-2:] == lit.shape and lit.any():
+            # Small ones are fair: what a mode of 1 pm does is a thing to ask a model.
+            rms = float(array[..., lit].std(axis=-1).max())
+            warn_of_rms(rms, "opd", stacklevel=6, small=False)
+
+    def values(self, given: Mapping[str, Value | None]) -> dict[str, Tensor]:
+        """Check named parameter values and make them float64 tensors, (components,) each.
+
+        Quantities are converted to the unit of the parameter table.
+
+        Raises
+        ------
+        TypeError
+            For a name that this system does not take.
+        ShapeError
+            For a wrong number of components.
+        UnitError
+            For a Quantity of another kind.
+        """
+        checked = {}
+        for name, value in given.items():
+            if value is None:
+                continue
+            if name not in self.parameters:
+                raise TypeError(f"{name!r} is not a parameter of this system: {self.parameters}")
+            if not isinstance(value, Tensor):
+                value = to_unit(value, parameter(name).unit, name)
+            tensor = torch.as_tensor(value, dtype=torch.float64).to(self.device)
+            tensor = tensor.reshape(1) if tensor.ndim == 0 else tensor
+            if tensor.shape[-1] != parameter(name).size:
+                raise ShapeError(
+                    f"{name}: got {tensor.shape[-1]} components, expected {parameter(name).size}"
+                )
+            checked[name] = tensor
+        return checked
+
+    def pupil_field(self, opd: Tensor, wavelength: float, values: Values) -> Wavefront:
+        """The field behind the entrance pupil, the only step that is not linear."""
+        return self.entrance.field(opd, wavelength, values.get("star_offset"))
+
+    def windows(self, values: Values) -> list[PupilGrid]:
+        """For every plane, the pupil window that it should hand on, given what follows it."""
+        needed = self.entrance.full
+        handed: list[PupilGrid] = []
+        for plane in reversed(self.planes):
+            handed.append(needed)
+            needed = plane.window(values) or needed
+        return handed[::-1]
+
+    def propagate(self, wavefront: Wavefront, values: Values) -> Tensor:
+        """Field on the detector's samples from the field behind the entrance pupil; linear."""
+        windows = self.windows(values)
+        if self._lattice is not None:
+            return self._lattice.field(wavefront, values, windows)
+        for plane, onto in zip(self.planes, windows, strict=True):
+            wavefront = plane.apply(wavefront, values, onto)
+        return self.detector.field(wavefront, values)
+
+    def _field(self, opd: Tensor, wavelength: float, values: Values) -> Tensor:
+        found = None
+        if self._lattice is not None:
+            windows = self.windows(values)
+            found = self._lattice.star(self.entrance, opd, wavelength, values, windows)
+        if found is None:
+            found = self.propagate(self.pupil_field(opd, wavelength, values), values)
+        return found
+
+    def fields(self, opd: Value | None = None, **parameters: Value) -> list[Tensor]:
+        """Complex field on the detector's samples at each wavelength, each (..., ny, nx)."""
+        tensor, values = self.opd(opd), self.values(parameters)
+        return [self._field(tensor, wavelength, values) for wavelength in self.bandpass.wavelengths]
+
+    def __call__(
+        self,
+        opd: Value | None = None,
+        star_offset: Value = _ON_AXIS,
+        *,
+        weights: Tensor | None = None,
+        **parameters: Value,
+    ) -> Tensor:
+        """Image of a point source.
+
+        Parameters
+        ----------
+        opd : Tensor, Quantity or array, (..., npix, npix), optional
+            OTE OPD in entrance-pupil orientation; bare numbers are metres.
+        star_offset : (..., 2)
+            x, y of the source in arcsec, image orientation. Batches broadcast against `opd`.
+        weights : Tensor, (wavelengths,), optional
+            In place of the bandpass's weights.
+        **parameters
+            Any of `self.parameters`, in the units of the parameter table.
+
+        Returns
+        -------
+        Tensor, (..., ny, nx)
+            Light per detector pixel as a fraction of what the entrance pupil collects.
+        """
+        given = dict(parameters)
+        if star_offset is not _ON_AXIS:  # Who passes zeros may want their derivative.
+            given["star_offset"] = star_offset
+        return self.image_of(self.fields(opd, **given), self.values(given), weights)
+
+    def image_of(
+        self, fields: Sequence[Tensor], values: Values, weights: Tensor | None = None
+    ) -> Tensor:
+        """Image from the fields at all wavelengths; arguments as in a call.
+
+        Parameters
+        ----------
+        fields : sequence of Tensor
+            What `fields` returns.
+        values : mapping of str to Tensor
+            What `values` returns; the detector's parameters matter here.
+        weights : Tensor, (wavelengths,), optional
+        """
+        spectrum = self.bandpass.weights if weights is None else weights
+        intensity = torch.zeros((), dtype=self.dtype, device=self.device)
+        for field, weight in zip(fields, spectrum, strict=True):
+            intensity = intensity + weight * (field.real**2 + field.imag**2)
+        return self.detector.image(intensity, values)
+
+    def calc_psf(
+        self,
+        outfile: str | os.PathLike[str] | None = None,
+        source: Any = None,
+        nlambda: int | None = None,
+        monochromatic: float | None = None,
+        fov_arcsec: float | None = None,
+        fov_pixels: int | tuple[int, int] | None = None,
+        oversample: int | None = None,
+        detector_oversample: int | None = None,
+        fft_oversample: int | None = None,
+        overwrite: bool = True,
+        display: bool = False,
+        return_intermediates: bool = False,
+        normalize: str = "first",
+        opd: Value | None = None,
+        **parameters: Value,
+    ) -> Any:
+        """PSF as an HDUList, with the arguments of `calc_psf` of poppy's and webbpsf's instruments.
+
+        Arguments that are not given are those that the system was made with.
+
+        Parameters
+        ----------
+        oversample, detector_oversample, fft_oversample : int, optional
+            Samples per pixel, and per lambda/D on the occulter; the first sets both.
+        outfile : path, optional
+            Write the result there.
+        display : bool
+            Taken for poppy's sake; nothing is drawn.
+        return_intermediates : bool
+            Return (HDUList, `debug` of the first wavelength).
+        normalize : str
+            "first", "last", "exit_pupil" or "none", as in poppy.
+        opd, **parameters
+            As in a call of the system.
+
+        Returns
+        -------
+        HDUList
+            Extensions OVERSAMP and DET_SAMP.
+        """
+        samples = detector_oversample if detector_oversample is not None else oversample
+        sampling = fft_oversample if fft_oversample is not None else oversample
+        changes = {
+            "source": source,
+            "nlambda": nlambda,
+            "monochromatic": monochromatic,
+            "fov_arcsec": fov_arcsec,
+            "fov_pixels": fov_pixels,
+            "oversample": samples,
+            "occulter_sampling": sampling,
+        }
+        changes = {name: value for name, value in changes.items() if value is not None}
+        system: OpticalSystem = self
+        if changes:
+            # One way of giving a size or a band takes the place of the other.
+            for name, rival in (
+                ("fov_pixels", "fov_arcsec"),
+                ("fov_arcsec", "fov_pixels"),
+                ("nlambda", "monochromatic"),
+                ("source", "monochromatic"),
+            ):
+                if name in changes and rival not in changes:
+                    changes[rival] = None
+            system = self.with_fidelity(**changes)
+        hdus = recipe_psf(system, normalize, outfile, overwrite, opd, **parameters)
+        if return_intermediates:
+            return hdus, system.debug(opd, None, **parameters)
+        return hdus
+
+    def debug(
+        self, opd: Value | None = None, wavelength: float | None = None, **parameters: Value
+    ) -> dict[str, Tensor]:
+        """The field at every named plane, in order.
+
+        Returns
+        -------
+        dict of str to Tensor
+            Pupil planes: the field behind the plane on its window of the pupil. Occulters: the
+            field in front of the mask, on its cells ("... focus"), then back in the pupil.
+            The detector: the field on its samples.
+        """
+        tensor, values = self.opd(opd), self.values(parameters)
+        wavelength = wavelength or self.bandpass.wavelengths[0]
+        wavefront = self.pupil_field(tensor, wavelength, values)
+        found = {self.entrance.name: wavefront.field}
+        for plane, onto in zip(self.planes, self.windows(values), strict=True):
+            if isinstance(plane, CompactOcculter):
+                found[f"{plane.name} focus"] = plane.focal_field(wavefront)
+            wavefront = plane.apply(wavefront, values, onto)
+            found[plane.name] = wavefront.field
+        # As in a call, which may take another route than the planes above.
+        found[self.detector.name] = self._field(tensor, wavelength, values)
+        return found

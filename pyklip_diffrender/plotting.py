@@ -1,0 +1,288 @@
+"""Figures. The only module that imports matplotlib, and only when a figure is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyklip_diffrender.demo import DemoResult
+from pyklip_diffrender.detection import Detection
+from pyklip_diffrender.instrument.jwst import maskrnd_openings
+from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
+from pyklip_diffrender.refinement import Refinement
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["draw_bench", "draw_demo", "draw_detection", "draw_image", "draw_subtraction", "save"]
+
+_INK = "#1b1f24"
+
+
+def save(figure: Figure, path: str | Path, dpi: int = 150) -> None:
+    """Write a figure in one step."""
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=dpi, facecolor="white")
+
+
+def draw_image(
+    ax: Axes,
+    image: NDArray[np.float64],
+    pixelscale: float,
+    *,
+    limits: tuple[float, float],
+    cmap: str,
+    title: str,
+    norm: Any = None,
+) -> Any:
+    """Show an image with its axes in arcseconds from the middle, y up.
+
+    Returns
+    -------
+    AxesImage
+    """
+    half_y, half_x = (n * pixelscale / 2 for n in image.shape)
+    shown = ax.imshow(
+        image,
+        origin="lower",
+        extent=(-half_x, half_x, -half_y, half_y),
+        cmap=cmap,
+        interpolation="nearest",
+        **({"norm": norm} if norm is not None else {"vmin": limits[0], "vmax": limits[1]}),
+    )
+    ax.set_title(title, fontsize=10, color=_INK, loc="left")
+    ax.tick_params(labelsize=8, colors=_INK)
+    return shown
+
+
+def draw_demo(result: DemoResult) -> Figure:
+    """The demo in one figure: frame, four subtractions in units of the noise, wavefronts."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(16, 7.6), layout="constrained")
+    axes = figure.subplots(2, 4)
+    scale = result.model.detector.pixelscale[0]
+    frame = result.observation.data[0]
+    shown = draw_image(
+        axes[0, 0], np.maximum(frame, 1), scale, limits=(0, 1), cmap="magma",
+        norm=LogNorm(float(np.percentile(frame, 2)), float(frame.max())),
+        title="The frame: the occulted star\nhides the planet (circle)",
+    )  # fmt: skip
+    figure.colorbar(shown, ax=axes[0, 0], label="photons", shrink=0.85)
+
+    planet = result.scene.planets[0]
+    axes[0, 0].plot(*planet.offset, "o", mfc="none", mec="white", ms=13, mew=1.2)
+    places = ((0, 1, "initial"), (0, 2, "KLIP"), (0, 3, "optimal"), (1, 0, "detected"))
+    titles = {
+        "initial": f"Star from the {result.table.meta['hours']:.0f} h old wavefront",
+        "KLIP": "KLIP, nine dithered references",
+        "optimal": "True star (the best there is)",
+        "detected": "Star refined, the planet found in the model",
+    }
+    for row, column, name in places:
+        ax = axes[row, column]
+        facts = result.table[list(result.table["star model"]).index(name)]
+        share = 100 * facts["planet throughput"]
+        # Where the star is left over, the planet's share of the light means nothing.
+        kept = f", planet light kept {share:.0f} %" if facts["star error"] < 20 else ""
+        shown = draw_image(
+            ax, result.images[name] / result.noise, scale, limits=(-6, 6), cmap="RdBu_r",
+            title=f"{titles[name]}\nSNR {facts['annulus SNR']:.1f}{kept}",
+        )  # fmt: skip
+        ax.plot(*planet.offset, "o", mfc="none", mec=_INK, ms=13, mew=1.2, clip_on=True)
+        figure.colorbar(shown, ax=ax, label="residual / noise", shrink=0.85)
+
+    grid = PupilGrid.full(result.model.npix, result.model.diameter)
+    stop = polygon_coverage(maskrnd_openings(), grid).numpy() > 0.5
+    true_change = 1e9 * (result.true_opd - result.measured.data)
+    found_change = 1e9 * (result.fit.opd - result.measured.data)
+    limit = float(np.percentile(np.abs(true_change[stop]), 99.5))
+    for ax, change, title in (
+        (axes[1, 1], true_change, "True change of the wavefront\nseen through the Lyot stop"),
+        (axes[1, 2], found_change, "Change found from one frame\n(prior, no reference star)"),
+    ):
+        seen = np.where(stop, change - change[stop].mean(), np.nan)
+        shown = draw_image(
+            ax, seen, grid.spacing, limits=(-limit, limit), cmap="PuOr_r", title=title
+        )
+        ax.set_xlabel("m", fontsize=8)
+        figure.colorbar(shown, ax=ax, label="nm", shrink=0.85)
+
+    _draw_found(axes[1, 3], figure, result)
+    for ax in (*axes[0], axes[1, 0], axes[1, 3]):
+        ax.set_xlabel("arcsec", fontsize=8)
+    return figure
+
+
+def _draw_found(ax: Axes, figure: Figure, result: DemoResult) -> None:
+    """S/N of point sources, and what the candidates are."""
+    found, planet = result.detection, result.scene.planets[0]
+    scale = result.model.detector.pixelscale[0]
+    table = found.table
+    facts = "nothing above 5 sigma"
+    if len(table):
+        facts = (
+            f"S/N {table['snr'][0]:.1f}, flux {table['contrast'][0] / planet.contrast:.2f} "
+            f"± {table['contrast_error'][0] / planet.contrast:.2f} of true"
+        )
+    shown = draw_image(
+        ax, found.snr, scale, limits=(-6, 6), cmap="RdBu_r",
+        title=f"Wavefront integrated out:\n{facts}",
+    )  # fmt: skip
+    ax.plot(*planet.offset, "o", mfc="none", mec=_INK, ms=13, mew=1.2)
+    figure.colorbar(shown, ax=ax, label="S/N of a point source", shrink=0.85)
+
+
+def draw_subtraction(fit: Refinement) -> Figure:
+    """A fit to real frames: data, star, what is left, and what is left in units of the noise."""
+    from matplotlib.colors import SymLogNorm
+    from matplotlib.figure import Figure
+
+    combined = fit.observation.combined()
+    data, noise = combined.data[0], combined.error[0]
+    residual = np.where(combined.valid[0], data - fit.star_image, np.nan)
+    scale = fit.model.detector.pixelscale[0]
+    unit = str(fit.observation.unit)
+    limit = float(np.nanpercentile(data, 99.8))
+    norm = SymLogNorm(limit / 30, vmin=-limit / 30, vmax=limit)
+    span = float(np.nanpercentile(np.abs(residual), 99.5))
+    ratio = np.where(combined.valid[0], residual / noise, np.nan)
+
+    figure = Figure(figsize=(15.5, 4.4), layout="constrained")
+    axes = figure.subplots(1, 4)
+    panels: tuple[tuple[NDArray[np.float64], dict[str, Any], str, str], ...] = (
+        (data, {"norm": norm, "cmap": "magma"}, "Data, mean of the integrations", unit),
+        (fit.star_image, {"norm": norm, "cmap": "magma"}, "Rendered star", unit),
+        (residual, {"limits": (-span, span), "cmap": "RdBu_r"}, "Data - star", unit),
+        (ratio, {"limits": (-8, 8), "cmap": "RdBu_r"}, "(Data - star) / noise", "sigma"),
+    )
+    star = np.zeros(2)
+    for name in ("detector_shift", "star_offset"):
+        star = star + fit.values.get(name, np.zeros(2))
+    for ax, (image, style, title, label) in zip(axes, panels, strict=True):
+        settings: dict[str, Any] = {"limits": (0.0, 1.0), **style}
+        shown = draw_image(ax, image, scale, title=title, **settings)
+        figure.colorbar(shown, ax=ax, label=label, shrink=0.8)
+        ax.set_xlabel("arcsec from the middle of the array", fontsize=8)
+        for _, x, y in fit.companions:
+            ax.plot(star[0] + x, star[1] + y, "o", mfc="none", mec="#2f9e44", ms=16, mew=1.4)
+    return figure
+
+
+def draw_detection(found: Detection) -> Figure:
+    """The frame less the star, S/N map, the same without the candidates, contrast curve."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(18.5, 4.4), layout="constrained")
+    frame, left, middle, right = figure.subplots(1, 4)
+    noise = found.fits[0].observation.combined().error[0]
+    (x0, y0), (x1, y1) = found.grid[0, 0], found.grid[-1, -1]
+    pixel = found.fits[0].model.detector.pixelscale
+    extent = (x0 - pixel[0] / 2, x1 + pixel[0] / 2, y0 - pixel[1] / 2, y1 + pixel[1] / 2)
+    table = found.table
+    above = f"{len(table)} above {found.threshold:g}"
+    for ax, image, title, label in (
+        (frame, found.subtracted[0] / noise, "First frame less the star", "light / noise"),
+        (left, found.snr, f"S/N of a point source, {above}", "S/N"),
+        (middle, found.residual_snr, "S/N once those are taken out", "S/N"),
+    ):
+        shown = ax.imshow(image, origin="lower", extent=extent, cmap="RdBu_r", vmin=-8, vmax=8)
+        figure.colorbar(shown, ax=ax, shrink=0.85, label=label)
+        ax.plot(0, 0, "+", color=_INK, ms=9)
+        ax.plot(table["x"].value, table["y"].value, "o", mfc="none", mec="#2f9e44", ms=15, mew=1.4)
+        ax.set_title(title, fontsize=10, color=_INK, loc="left")
+        ax.set_xlabel("arcsec from the star", fontsize=8)
+    curve = found.contrast_curve
+    separation = curve["separation"].value
+    right.fill_between(
+        separation, curve["lowest"], curve["highest"], color="#5b3f95", alpha=0.15, lw=0
+    )
+    right.semilogy(separation, curve["contrast"], color="#5b3f95", label="wavefront free")
+    if found.scatter > 1:
+        right.semilogy(
+            separation, curve["small_sample"], ":", color="#5b3f95", label="with few elements"
+        )
+    right.semilogy(separation, curve["known_star"], "--", color=_INK, label="star known")
+    right.semilogy(
+        table["separation"].value, table["contrast"], "o", mfc="none", mec="#2f9e44", ms=9
+    )
+    right.set_xlabel("arcsec", fontsize=9)
+    right.set_title("5 sigma contrast, median and range of angles", fontsize=10, loc="left")
+    right.set_box_aspect(1.0)
+    right.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def draw_bench(table: Table) -> Figure:
+    """Error against time of every way to make an image, without and with its derivative.
+
+    Parameters
+    ----------
+    table : Table
+        What `bench.run_bench` gave.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 5.2), layout="constrained")
+    labelled = []
+    for ax, row in zip(figure.subplots(1, 2), ("forward", "forward + backward"), strict=True):
+        measured = np.isfinite(table["seconds"]) & (table["error"] > 0)
+        chosen = table[(table["row"] == row) & measured]
+        chosen.sort("seconds")
+        names: dict[str, tuple[float, float]] = {}
+        for line in chosen:
+            ours = str(line["column"]).startswith(("this package", "multi-fidelity", "coarse"))
+            colour = "#5b3f95" if ours else "#c0631a"
+            filled = colour if line["precision"] == "float64" else "none"
+            ax.loglog(line["seconds"], line["error"], "o", color=colour, mfc=filled, ms=7)
+            if line["precision"] == "float64":  # Next to its own kind in float32.
+                name = str(line["column"])
+                names[name if ours else name.split(",")[0]] = (line["seconds"], line["error"])
+        # Nothing is both faster and better than these.
+        order = np.argsort(chosen["seconds"])
+        best = np.minimum.accumulate(np.asarray(chosen["error"])[order])
+        front = np.asarray(chosen["seconds"])[order]
+        ax.step(front, best, where="post", color="0.75", lw=1, zorder=0)
+        ax.margins(0.15)
+        ax.set_xlabel("seconds", fontsize=9)
+        ax.set_title(f"{row[0].upper()}{row[1:]}", fontsize=10, color=_INK, loc="left")
+        ax.tick_params(labelsize=8, colors=_INK)
+        if row == "forward":
+            ax.set_ylabel("largest error / peak", fontsize=9)
+            ax.plot([], [], "o", color=_INK, label="float64")
+            ax.plot([], [], "o", color=_INK, mfc="none", label="float32")
+            ax.legend(frameon=False, fontsize=8)
+        labelled.append((ax, names))
+    figure.draw_without_rendering()
+    for ax, names in labelled:
+        _label_apart(ax, names)
+    return figure
+
+
+def _label_apart(ax: Axes, names: Mapping[str, tuple[float, float]]) -> None:
+    """Names beside their points, where they neither cover each other nor leave the axes."""
+    taken: list[Any] = []
+    for name, point in names.items():
+        for up, right in product((5, -9, 17, -21, 29, -33), (True, False)):
+            label = ax.annotate(
+                name, point, xytext=(7 if right else -7, up), textcoords="offset points",
+                fontsize=7, ha="left" if right else "right", color=_INK,
+            )  # fmt: skip
+            box = label.get_window_extent()
+            inside = ax.bbox.x0 < box.x0 and box.x1 < ax.bbox.x1
+            if inside and not any(box.overlaps(other) for other in taken):
+                break
+            label.remove()
+        else:
+            label = ax.annotate(name, point, fontsize=7, color=_INK)
+            box = label.get_window_extent()
+        taken.append(box)

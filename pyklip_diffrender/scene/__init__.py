@@ -1,0 +1,1 @@
+"""What is observed: stars and planets, observed frames, simulated frames."""

@@ -1,0 +1,133 @@
+"""What is in the sky and how bright: a star, its planets, and the photons that they send.
+
+The calibration is that of appendix A of B. Y. Feng et al., "Exoplanet Imaging via Differentiable
+Rendering" (2025): beta Pictoris, two hours, NIRCam F444W.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from pyklip_diffrender.io.units import ARCSEC
+
+__all__ = [
+    "ALPHA_PICTORIS_W2",
+    "BETA_PICTORIS_W2",
+    "PAPER_SEGMENT_GAP",
+    "UNOCCULTED_PEAK",
+    "Planet",
+    "Scene",
+    "Star",
+]
+
+BETA_PICTORIS_W2 = 3.182
+"""WISE W2 magnitude (4.6 um) of the paper's target."""
+
+ALPHA_PICTORIS_W2 = 0.979
+"""WISE W2 magnitude of the paper's reference star."""
+
+PAPER_SEGMENT_GAP = 0.0
+"""Width of the mirror's segment gaps, m, at which the paper's photon levels come out: webbpsf's
+sampled pupil, which the paper used, hardly resolves them (they are 7 mm). Light that leaks through
+the coronagraph from gaps of their true width makes the star 1.5 times as bright."""
+
+UNOCCULTED_PEAK = 3.71638e-3
+"""Share of the light collected by the pupil that falls on the brightest pixel of the paper's star
+with the Lyot stop but without the occulter, at 4.5 um."""
+
+
+@dataclass(frozen=True)
+class Star:
+    """A star with an exposure, and the calibration that turns both into photons.
+
+    Attributes
+    ----------
+    w2_magnitude : float
+        WISE W2, 4.6 um.
+    exposure : float
+        Seconds.
+    zero_point : float
+        Flux density of magnitude 0 in F444W, Jy.
+    mjysr_per_cps : float
+        MJy/sr that make one count per second (PHOTMJSR of F444W behind MASK335R).
+    gain : float
+        Electrons per count.
+    quantum_efficiency : float
+        Electrons per photon.
+    pixel_area : float
+        Solid angle of a pixel, sr.
+    peak_fraction : float
+        Share of a point source's calibrated flux that falls on its brightest pixel. The paper
+        does not state it; 0.0148002 is what its other numbers imply for its 1.0334e10 photons
+        at contrast 1.
+    """
+
+    w2_magnitude: float = BETA_PICTORIS_W2
+    exposure: float = 7200.0
+    zero_point: float = 184.1
+    mjysr_per_cps: float = 2.516
+    gain: float = 1.82
+    quantum_efficiency: float = 0.8
+    pixel_area: float = (0.062424185 * ARCSEC) ** 2
+    peak_fraction: float = 0.0148002
+
+    @property
+    def peak_photons(self) -> float:
+        """Photons in the brightest pixel of the unocculted star, the paper's contrast of 1."""
+        flux = self.zero_point * 10 ** (-0.4 * self.w2_magnitude)
+        counts_per_second = flux * 1e-6 / self.pixel_area * self.peak_fraction / self.mjysr_per_cps
+        return counts_per_second * self.exposure * self.gain / self.quantum_efficiency
+
+    @property
+    def photons(self) -> float:
+        """Photons that the star sends into the entrance pupil during the exposure."""
+        return self.peak_photons / UNOCCULTED_PEAK
+
+
+@dataclass(frozen=True)
+class Planet:
+    """A point source beside the star.
+
+    Attributes
+    ----------
+    contrast : float
+        Its light before the coronagraph relative to the star's.
+    separation : float
+        arcsec.
+    position_angle : float
+        Degrees, counter-clockwise from +y of the image.
+    """
+
+    contrast: float
+    separation: float
+    position_angle: float = 0.0
+
+    @property
+    def offset(self) -> tuple[float, float]:
+        """x, y relative to the star, arcsec, image orientation."""
+        angle = math.radians(self.position_angle)
+        return -self.separation * math.sin(angle), self.separation * math.cos(angle)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A star, its planets, and the detector's noise.
+
+    Attributes
+    ----------
+    star : Star
+    planets : tuple of Planet
+    star_offset : tuple of float
+        x, y of the star relative to the occulter, arcsec.
+    read_noise : float
+        Photons per pixel, Gaussian.
+    background : float
+        Photons per pixel.
+    """
+
+    star: Star = field(default_factory=Star)
+    planets: tuple[Planet, ...] = ()
+    star_offset: tuple[float, float] = (0.0, 0.0)
+    read_noise: float = 42.0
+    background: float = 0.0

@@ -1,0 +1,332 @@
+"""Frames to be explained: pixel values, their errors, what is masked, where the star is."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from astropy.io import fits
+from astropy.time import Time
+from numpy.typing import NDArray
+
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    NoValidPixelsError,
+    ShapeError,
+    UnitError,
+)
+from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.io.headers import header_date, header_number, header_text, merged_header
+from pyklip_diffrender.io.units import (
+    native_float64,
+    require_finite,
+    require_shape,
+    to_arcsec,
+    to_unit,
+)
+
+__all__ = ["BAD_PIXEL_BITS", "Observation"]
+
+BAD_PIXEL_BITS = 1 | 2 | 512 | 1024
+"""JWST data-quality bits that take a pixel out of the fit: DO_NOT_USE, SATURATED, NON_SCIENCE,
+DEAD. A jump (4) that the ramp fit has repaired, or a hot pixel (2048) that was dark-subtracted,
+may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
+
+
+def _spread(array: NDArray[np.float64], shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
+    """Copy of an array, repeated to a shape."""
+    try:
+        return np.broadcast_to(array, shape).copy()
+    except ValueError as error:
+        raise ShapeError(f"{name}: got shape {array.shape}, expected {shape}") from error
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A stack of coronagraphic frames.
+
+    Attributes
+    ----------
+    data : ndarray, (frames, ny, nx), float64
+        Pixel values; what is not valid is 0.
+    error : ndarray, (frames, ny, nx)
+        Standard deviations, in the same unit; 1 where not valid.
+    valid : ndarray of bool, (frames, ny, nx)
+    unit : Unit
+        Of data and error; photons for simulations.
+    pixelscale : tuple of float
+        (x, y) arcsec per pixel.
+    center : ndarray, (frames, 2)
+        Approximate x, y of the star, 0-indexed pixels.
+    filter : str or None
+    date : Time or None
+    position_angles : ndarray, (frames,)
+        Degrees.
+    reference : bool
+        Another star, whose frames show the wavefront but none of the target's companions.
+    name : str
+    header : Header
+        Primary and science headers of the file, merged.
+    """
+
+    data: NDArray[np.float64]
+    error: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    unit: u.UnitBase
+    pixelscale: tuple[float, float]
+    center: NDArray[np.float64]
+    filter: str | None = None
+    date: Time | None = None
+    position_angles: NDArray[np.float64] | None = None
+    name: str = "observation"
+    reference: bool = False
+    header: fits.Header = field(default_factory=fits.Header)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        data: Any,
+        error: Any,
+        *,
+        valid: Any = None,
+        unit: str | u.UnitBase = "photon",
+        pixelscale: float | tuple[float, float],
+        center: Any = None,
+        **details: Any,
+    ) -> Observation:
+        """Make an observation of one frame or a stack, checking and copying.
+
+        Parameters
+        ----------
+        data, error : array or Quantity, ([frames,] ny, nx)
+            Pixels where either is not finite, or the error is not positive, are masked.
+            Quantities are converted to `unit`.
+        valid : array of bool, optional
+        unit : str or Unit
+        pixelscale : float, Quantity or (x, y)
+            arcsec.
+        center : (2,) or (frames, 2), optional
+            x, y of the star, 0-indexed; default the middle of the array.
+        **details
+            Other attributes.
+
+        Raises
+        ------
+        ShapeError
+            Shapes that do not go together, or no frames.
+        UnitError
+            A unit that is not known, or does not convert.
+        NonFiniteError
+            A star position that is not a number.
+        IncompatibleSetupError
+            A pixel scale that is not a positive number.
+        NoValidPixelsError
+            A frame in which nothing is left.
+        """
+        name = details.get("name", "observation")
+        try:
+            unit = u.Unit(unit)
+        except (ValueError, TypeError) as reason:
+            raise UnitError(
+                f"{name}: got the unit {unit!r}, expected one that astropy knows, such as 'MJy/sr'"
+            ) from reason
+        values = to_unit(data, unit, f"{name}: data")
+        values = values[None] if values.ndim == 2 else values
+        if values.ndim != 3 or values.size == 0:
+            raise ShapeError(
+                f"{name}: data: got shape {np.shape(data)}, expected ([frames,] ny, nx)"
+            )
+        sigma = to_unit(error, unit, f"{name}: error")
+        sigma = sigma[None] if sigma.ndim == 2 else sigma
+        require_shape(sigma, values.shape, f"{name}: error", "Give one error for every pixel")
+        good = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
+        if valid is not None:
+            given = np.asarray(valid, dtype=bool)
+            given = given[None] if given.ndim == 2 else given
+            require_shape(given, values.shape, f"{name}: valid", "Say it for every pixel")
+            good &= given
+        empty = np.flatnonzero(~good.any(axis=(1, 2)))
+        if len(empty):
+            raise NoValidPixelsError(
+                f"{name}: all {values[0].size} pixels of frame {int(empty[0])} are masked, not "
+                "finite or without an error. Look at its DQ"
+            )
+        frames, ny, nx = values.shape
+        where = native_float64([(nx - 1) / 2, (ny - 1) / 2] if center is None else center)
+        require_finite(where, f"{name}: center")
+        scale = _spread(to_arcsec(pixelscale, "pixelscale"), (2,), f"{name}: pixelscale")
+        if not (np.isfinite(scale) & (scale > 0)).all():
+            raise IncompatibleSetupError(
+                f"{name}: pixelscale: got {pixelscale}, expected a positive number of arcsec per "
+                "pixel, such as 0.0624"
+            )
+        return cls(
+            np.where(good, values, 0.0),
+            np.where(good, sigma, 1.0),
+            good,
+            unit,
+            (float(scale[0]), float(scale[1])),
+            _spread(where, (frames, 2), f"{name}: center"),
+            **details,
+        )
+
+    @classmethod
+    def from_fits(cls, path: str | os.PathLike[str]) -> Observation:
+        """Read a JWST stage-2 coronagraphic file (calints).
+
+        Uses SCI, ERR and DQ, BUNIT, FILTER, DATE-BEG, the aperture's pixel area, and the star's
+        position from STARCENX/Y, else CRPIX1/2 (1-indexed).
+
+        Raises
+        ------
+        CorruptFileError
+            No such file, truncated, without an image in SCI, ERR or DQ, or with a card that does
+            not hold what it should.
+        UnitError
+            SCI has no unit.
+        ShapeError, NoValidPixelsError
+            As `from_arrays`.
+        """
+        path = Path(path)
+        with open_fits(path) as hdus:
+            if "SCI" not in hdus:
+                raise CorruptFileError(
+                    f"{path.name}: no SCI extension, only {[h.name for h in hdus]}; expected a "
+                    "JWST calints file"
+                )
+            science = hdus["SCI"]
+            header = merged_header(hdus[0].header, science.header, path.name)
+            for hdu in hdus:
+                if hdu.name in ("SCI", "ERR", "DQ") and not hdu.is_image:
+                    raise CorruptFileError(f"{path.name}: {hdu.name} is a table, not an image")
+                if hdu.name in ("SCI", "ERR", "DQ") and hdu.data is None:
+                    raise CorruptFileError(f"{path.name}: {hdu.name} has no data, so no frames")
+            data = native_float64(science.data)
+            if "ERR" not in hdus:
+                raise CorruptFileError(f"{path.name}: no ERR extension; the fit needs errors")
+            error = native_float64(hdus["ERR"].data)
+            if "DQ" in hdus:
+                quality = np.asarray(hdus["DQ"].data)
+                if quality.dtype.kind not in "iu":
+                    raise CorruptFileError(
+                        f"{path.name}: DQ holds {quality.dtype.name}, expected integers (flags)"
+                    )
+            else:
+                warnings.warn(
+                    f"{path.name}: no DQ extension; only NaN pixels are masked",
+                    DiffrenderWarning,
+                    stacklevel=2,
+                )
+                quality = np.zeros(data.shape, dtype=np.uint32)
+        return cls.from_jwst(data, error, quality, header, name=path.name)
+
+    @classmethod
+    def from_jwst(
+        cls,
+        data: NDArray[Any],
+        error: NDArray[Any],
+        quality: NDArray[Any],
+        header: fits.Header,
+        name: str,
+    ) -> Observation:
+        """Make an observation of JWST arrays and their merged header; see `from_fits`."""
+
+        def number(key: str, default: float) -> float:
+            found = header_number(header, key, name)
+            return default if found is None else found
+
+        unit = header_text(header, "BUNIT", name)
+        if unit is None:
+            raise UnitError(f"{name}: SCI has no BUNIT; expected one such as 'MJy/sr'")
+        frames = 1 if np.ndim(data) == 2 else len(data)
+        star = [
+            number(key, number(fallback, np.nan)) for key, fallback in
+            (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
+        ]  # fmt: skip
+        angle = number("ROLL_REF", 0.0) - number("V3I_YANG", 0.0) * number("VPARITY", -1)
+        area = number("PIXAR_A2", 0.0)
+        if area == 0:
+            raise UnitError(f"{name}: the header has no PIXAR_A2 (pixel area, arcsec^2)")
+        if area < 0:
+            raise CorruptFileError(
+                f"{name}: PIXAR_A2 is {area}, expected a pixel area in arcsec^2, such as 0.0039. "
+                "Correct the header, or fetch the file again"
+            )
+        return cls.from_arrays(
+            data,
+            error,
+            valid=(np.asarray(quality).astype(np.uint32) & BAD_PIXEL_BITS) == 0,
+            unit=unit,
+            pixelscale=area**0.5,
+            center=None if np.isnan(star).any() else np.array(star) - 1,
+            filter=header_text(header, "FILTER", name),
+            date=header_date(header, ("DATE-BEG", "DATE-OBS"), name),
+            position_angles=np.full(frames, angle),
+            name=name,
+            header=header,
+        )
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        return self.data.shape[1], self.data.shape[2]
+
+    def cutout(self, size: int) -> Observation:
+        """The `size` x `size` pixels about the star (whole pixels, so nothing is resampled).
+
+        Raises
+        ------
+        ShapeError
+            If that sticks out of the frame.
+        """
+        corners = np.round(self.center - (size - 1) / 2).astype(int)
+        ny, nx = self.shape
+        if corners.min() < 0 or (corners + size > (nx, ny)).any():
+            raise ShapeError(
+                f"{self.name}: {size} x {size} pixels about {tuple(self.center[0])} do not fit "
+                f"into {nx} x {ny}. Ask for fewer"
+            )
+
+        def cut(stack: NDArray[Any]) -> NDArray[Any]:
+            return np.stack(
+                [frame[y : y + size, x : x + size] for frame, (x, y) in
+                 zip(stack, corners, strict=True)]
+            )  # fmt: skip
+
+        return replace(
+            self,
+            data=cut(self.data),
+            error=cut(self.error),
+            valid=cut(self.valid),
+            center=self.center - corners,
+        )
+
+    def combined(self) -> Observation:
+        """One frame, the mean of all weighted by their inverse variances pixel by pixel.
+
+        Only for frames that see the star at the same place under the same wavefront.
+        """
+        # What is masked may be anything where somebody has replaced data, NaN too.
+        weight = np.where(self.valid, np.where(self.valid, self.error, 1.0) ** -2, 0.0)
+        total = weight.sum(axis=0)
+        seen = total > 0
+        safe = np.where(seen, total, 1.0)
+        light = np.where(self.valid, self.data, 0.0)
+        return replace(
+            self,
+            data=((weight * light).sum(axis=0) / safe)[None],
+            error=np.where(seen, safe**-0.5, 1.0)[None],
+            valid=seen[None],
+            center=self.center.mean(axis=0, keepdims=True),
+            position_angles=None if self.position_angles is None else self.position_angles[:1],
+        )

@@ -1,0 +1,77 @@
+"""Simulated observations: the model's image of a scene, with shot and read noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.scene.objects import Planet, Scene
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["expected_photons", "planet_photons", "simulate", "star_photons"]
+
+
+def star_photons(model: OpticalSystem, scene: Scene, opd: Any) -> NDArray[np.float64]:
+    """Expected photons of the star alone, (ny, nx)."""
+    with torch.no_grad():
+        image = model(opd, scene.star_offset)
+    return scene.star.photons * image.double().cpu().numpy()
+
+
+def planet_photons(
+    model: OpticalSystem, scene: Scene, planet: Planet, opd: Any
+) -> NDArray[np.float64]:
+    """Expected photons of one planet, seen through the mask where it is, (ny, nx)."""
+    offset = np.add(scene.star_offset, planet.offset)
+    with torch.no_grad():
+        image = model(opd, tuple(offset))
+    return planet.contrast * scene.star.photons * image.double().cpu().numpy()
+
+
+def expected_photons(model: OpticalSystem, scene: Scene, opd: Any) -> NDArray[np.float64]:
+    """Expected photons of star, planets and background, (ny, nx)."""
+    total = star_photons(model, scene, opd) + scene.background
+    for planet in scene.planets:
+        total = total + planet_photons(model, scene, planet, opd)
+    return total
+
+
+def simulate(
+    model: OpticalSystem, scene: Scene, opd: Any, *, seed: int, frames: int = 1
+) -> Observation:
+    """Simulate an observation.
+
+    Parameters
+    ----------
+    model : OpticalSystem
+    scene : Scene
+    opd : array, Quantity or OPDMap
+        The true wavefront, (npix, npix), m.
+    seed : int
+        Of the noise; the same seed gives the same frames.
+    frames : int
+        Independent exposures of the same scene.
+
+    Returns
+    -------
+    Observation
+        In photons. The error is what an observer would know, sqrt(counts + read noise^2), from
+        the frame itself.
+    """
+    expected = expected_photons(model, scene, opd)
+    generator = np.random.default_rng(seed)
+    counts = generator.poisson(expected, size=(frames, *expected.shape)).astype(np.float64)
+    counts += generator.normal(0.0, scene.read_noise, size=counts.shape)
+    error = np.sqrt(np.maximum(counts, 0.0) + scene.read_noise**2)
+    return Observation.from_arrays(
+        counts,
+        error,
+        unit="photon",
+        pixelscale=model.detector.pixelscale,
+        filter=model.recipe.get("filter"),
+        name=f"simulation(seed={seed})",
+    )

@@ -1,0 +1,1 @@
+"""Wavefront maps, the modes that describe their changes, and priors on those."""

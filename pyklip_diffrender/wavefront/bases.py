@@ -1,0 +1,225 @@
+"""Bases for wavefront changes: rigid segment motions and Fourier modes.
+
+A coefficient is the rms of its mode in metres (over the segment, or over the full array), so that
+one prior scale means the same for every mode of a kind. Modes are analytic: they can be sampled
+on any pupil grid, which is what lets a coarse model serve a fine one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.instrument.jwst import TABULATED_GAP, jwst_segments
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
+
+__all__ = ["Basis", "FourierModes", "JointBasis", "SegmentMotions", "default_basis"]
+
+
+class Basis(Protocol):
+    """A set of OPD modes."""
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Kinds of mode, each with a prior scale of its own."""
+
+    @property
+    def group_index(self) -> Tensor:
+        """For every mode the index of its group, (modes,), int64."""
+
+    @property
+    def frequencies(self) -> Tensor:
+        """Cycles across the pupil of every mode, (modes,); 0 for segment motions."""
+
+    def __len__(self) -> int: ...
+
+    def modes(self, grid: PupilGrid, start: int, stop: int) -> Tensor:
+        """OPD of some modes at coefficient 1, (stop - start, rows, columns), float64."""
+
+    def opd(self, coefficients: Tensor, grid: PupilGrid) -> Tensor:
+        """Sum of all modes, (rows, columns), m; differentiable in the coefficients."""
+
+
+class SegmentMotions:
+    """Piston, and tips about x and y, of each of the 18 segments: 54 modes."""
+
+    groups = ("segment",)
+
+    def __init__(self) -> None:
+        self.names = tuple(
+            f"{name} {motion}" for name in jwst_segments() for motion in ("piston", "tip", "tilt")
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def group_index(self) -> Tensor:
+        return torch.zeros(len(self), dtype=torch.int64)
+
+    @property
+    def frequencies(self) -> Tensor:
+        return torch.zeros(len(self), dtype=torch.float64)
+
+    def modes(self, grid: PupilGrid, start: int, stop: int) -> Tensor:
+        segments = _sampled_segments(_whole(grid))
+        return torch.stack(
+            [segments[k // 3][0].crop(segments[k // 3][1][k % 3], grid) for k in range(start, stop)]
+        )
+
+    def opd(self, coefficients: Tensor, grid: PupilGrid) -> Tensor:
+        total = torch.zeros(grid.shape, dtype=torch.float64)
+        for (window, modes), motion in zip(
+            _sampled_segments(_whole(grid)), coefficients.reshape(-1, 3), strict=True
+        ):
+            rigid = torch.tensordot(motion, modes, dims=1)
+            total = total + window.crop(rigid, grid)
+        return total
+
+
+def _whole(grid: PupilGrid) -> PupilGrid:
+    """Of the whole segment, whatever part of it `grid` holds: the modes stay the same."""
+    return PupilGrid.full(grid.npix, grid.diameter)
+
+
+@lru_cache(maxsize=4)
+def _sampled_segments(grid: PupilGrid) -> list[tuple[PupilGrid, Tensor]]:
+    """For each segment the window that holds it and its three modes there."""
+    # Half the gap on every side: each point of the gaps belongs to a segment too.
+    return [
+        _sampled_segment(widen_polygon(outline, TABULATED_GAP / 2), grid)
+        for outline in jwst_segments().values()
+    ]
+
+
+def _sampled_segment(outline: Tensor, grid: PupilGrid) -> tuple[PupilGrid, Tensor]:
+    pixel = outline / grid.spacing + grid.npix / 2
+    low, high = pixel.min(dim=0).values.floor().int(), pixel.max(dim=0).values.ceil().int()
+    rows = (max(grid.rows[0], int(low[1])), min(grid.rows[1], int(high[1])))
+    columns = (max(grid.columns[0], int(low[0])), min(grid.columns[1], int(high[0])))
+    window = replace(grid, rows=rows, columns=columns)
+    cover = polygon_coverage([outline], window)
+    area = cover.sum()
+    modes = [cover]
+    for axis in (window.x[None, :], window.y[:, None]):
+        ramp = axis - (cover * axis).sum() / area
+        rms = torch.sqrt((cover * ramp**2).sum() / area)
+        modes.append(cover * ramp / rms)
+    return window, torch.stack(modes)
+
+
+class FourierModes:
+    """Cosines and sines with whole cycles across the pupil array, up to `max_cycles`.
+
+    Parameters
+    ----------
+    max_cycles : float
+        Highest radial frequency. MASKRND's narrow openings spread light over 11 lambda/D, so a
+        5 arcsec field at 4.5 um hears frequencies to about 24.
+    min_cycles : float
+        Lowest radial frequency.
+    """
+
+    groups = ("texture",)
+
+    def __init__(self, max_cycles: float = 24.0, min_cycles: float = 0.5) -> None:
+        reach = math.floor(max_cycles)
+        pairs = [
+            (fx, fy)
+            for fy in range(reach + 1)
+            for fx in range(-reach, reach + 1)
+            if (fy > 0 or fx > 0) and min_cycles <= math.hypot(fx, fy) <= max_cycles
+        ]
+        pairs.sort(key=lambda pair: (pair[0] ** 2 + pair[1] ** 2, pair))
+        self.cycles = torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2)
+        self._reach = reach
+
+    def __len__(self) -> int:
+        return 2 * len(self.cycles)
+
+    @property
+    def group_index(self) -> Tensor:
+        return torch.zeros(len(self), dtype=torch.int64)
+
+    @property
+    def frequencies(self) -> Tensor:
+        return torch.linalg.vector_norm(self.cycles.double(), dim=1).repeat_interleave(2)
+
+    def modes(self, grid: PupilGrid, start: int, stop: int) -> Tensor:
+        pairs = self.cycles[start // 2 : (stop + 1) // 2].double()
+        waves = []
+        for axis, positions in ((0, grid.x), (1, grid.y)):
+            angle = (2 * math.pi / grid.diameter) * pairs[:, axis, None] * positions
+            waves.append(math.sqrt(2) ** 0.5 * torch.complex(torch.cos(angle), torch.sin(angle)))
+        # A plane wave is a product of one in x and one in y: no trigonometry on the full grid.
+        product = waves[1][:, :, None] * waves[0][:, None, :]
+        both = torch.stack([product.real, product.imag], dim=1)
+        first = 2 * (start // 2)
+        return both.flatten(0, 1)[start - first : stop - first]
+
+    def opd(self, coefficients: Tensor, grid: PupilGrid) -> Tensor:
+        # sum c cos + s sin = Re sum (c - i s) exp(i ...): two small matrix products.
+        reach = self._reach
+        table = torch.zeros(reach + 1, 2 * reach + 1, dtype=torch.complex128)
+        pairs = coefficients.double().reshape(-1, 2)
+        table = table.index_put(
+            (self.cycles[:, 1], self.cycles[:, 0] + reach), torch.complex(pairs[:, 0], -pairs[:, 1])
+        )
+        fx = torch.arange(-reach, reach + 1).double()
+        fy = torch.arange(reach + 1).double()
+        in_x = 2 * math.pi / grid.diameter * fx[:, None] * grid.x
+        in_y = 2 * math.pi / grid.diameter * grid.y[:, None] * fy
+        waves_x = torch.complex(torch.cos(in_x), torch.sin(in_x))
+        waves_y = torch.complex(torch.cos(in_y), torch.sin(in_y))
+        return math.sqrt(2) * (waves_y @ table @ waves_x).real
+
+
+class JointBasis:
+    """Several bases side by side."""
+
+    def __init__(self, parts: Sequence[SegmentMotions | FourierModes]) -> None:
+        self.parts = tuple(parts)
+        self.groups = tuple(name for part in self.parts for name in part.groups)
+
+    def __len__(self) -> int:
+        return sum(len(part) for part in self.parts)
+
+    @property
+    def group_index(self) -> Tensor:
+        index, offset = [], 0
+        for part in self.parts:
+            index.append(part.group_index + offset)
+            offset += len(part.groups)
+        return torch.cat(index)
+
+    @property
+    def frequencies(self) -> Tensor:
+        return torch.cat([part.frequencies for part in self.parts])
+
+    def modes(self, grid: PupilGrid, start: int, stop: int) -> Tensor:
+        pieces, offset = [], 0
+        for part in self.parts:
+            low, high = max(start - offset, 0), min(stop - offset, len(part))
+            if low < high:
+                pieces.append(part.modes(grid, low, high))
+            offset += len(part)
+        return torch.cat(pieces)
+
+    def opd(self, coefficients: Tensor, grid: PupilGrid) -> Tensor:
+        total = torch.zeros(grid.shape, dtype=torch.float64)
+        offset = 0
+        for part in self.parts:
+            total = total + part.opd(coefficients[offset : offset + len(part)], grid)
+            offset += len(part)
+        return total
+
+
+def default_basis(max_cycles: float = 24.0) -> JointBasis:
+    """Segment motions and Fourier modes: 1,846 modes up to 24 cycles."""
+    return JointBasis([SegmentMotions(), FourierModes(max_cycles)])

@@ -1,0 +1,297 @@
+"""Gaussian priors on wavefront changes, and their scales from the evidence of the data.
+
+Each group of modes (segment motions, texture) has one scale; within a group the standard
+deviation follows a fixed shape. The scale is where the evidence, the probability of the data with
+the modes integrated out, is stationary (D. MacKay, "Bayesian interpolation", Neural Computation 4,
+415, 1992).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtri
+from scipy.optimize import minimize
+from torch import Tensor
+
+from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
+from pyklip_diffrender.wavefront.bases import Basis
+from pyklip_diffrender.wavefront.opd import resample
+
+__all__ = [
+    "EvidenceUpdate",
+    "WavefrontPrior",
+    "learn_prior",
+    "scale_ratios",
+    "solve_with_evidence",
+]
+
+
+_ROUNDING = 1e-12
+"""Relative error of the curvature's elements."""
+
+
+@dataclass(frozen=True)
+class WavefrontPrior:
+    """Standard deviations of wavefront coefficients.
+
+    Attributes
+    ----------
+    scales : dict of str to float
+        Group name to scale, nm rms per mode at zero frequency. Starting values when
+        `fit_scales` is true.
+    knee : float
+        Cycles across the pupil at which the deviation has fallen to half.
+    slope : float
+        Beyond the knee the deviation falls as frequency to minus this power.
+    fit_scales : bool
+        Maximise the evidence over the scales.
+    amplitude_cycles : float
+        Modes up to this frequency may change the amplitude across the pupil as well.
+    amplitude_scale : float
+        Prior deviation of amplitude modes, nm of an imaginary OPD (at 4.4 um 1 nm changes the
+        amplitude by 0.14 %); 0 keeps the amplitude as it is.
+    amplitude_slope : float
+        Beyond the knee the amplitude's deviation falls as frequency to minus this power.
+    """
+
+    scales: dict[str, float] = field(default_factory=lambda: {"segment": 4.0, "texture": 0.1})
+    knee: float = 8.0
+    slope: float = 1.0
+    fit_scales: bool = True
+    amplitude_cycles: float = 0.0
+    amplitude_scale: float = 0.0
+    amplitude_slope: float = 1.0
+
+    def amplitude_modes(self, basis: Basis) -> int:
+        """Number of modes, the first of the basis, that the pupil's amplitude has as well."""
+        if self.amplitude_scale <= 0:
+            return 0
+        beyond = torch.nonzero(basis.frequencies > self.amplitude_cycles).flatten()
+        return int(beyond[0]) if len(beyond) else len(basis)
+
+    def amplitude_deviation(self, basis: Basis) -> Tensor:
+        """Prior deviation of the amplitude modes, in nm of an imaginary OPD."""
+        frequency = basis.frequencies[: self.amplitude_modes(basis)]
+        return self.amplitude_scale / (1 + (frequency / self.knee) ** self.amplitude_slope)
+
+    def shape(self, basis: Basis) -> Tensor:
+        """Standard deviation of every mode relative to its group's scale, (modes,)."""
+        return 1 / (1 + (basis.frequencies / self.knee) ** self.slope)
+
+
+@dataclass(frozen=True)
+class EvidenceUpdate:
+    """The solution of a linearised problem.
+
+    Attributes
+    ----------
+    step : Tensor, (parameters,)
+        Most probable values.
+    variance : Tensor, (parameters,), or None if it was not asked for
+        Diagonal of the covariance.
+    scales : Tensor, (groups,)
+    effective : float
+        Number of wavefront parameters that the data determine (with the scales before the last
+        update, where no errors were asked for).
+    log_evidence : float
+        Up to a constant that does not depend on the scales.
+    """
+
+    step: Tensor
+    variance: Tensor | None
+    scales: Tensor
+    effective: float
+    log_evidence: float
+
+    def in_units(self, unit: Tensor) -> EvidenceUpdate:
+        """The same for unknowns measured in other units, `unit` of the new ones to the old."""
+        variance = None if self.variance is None else self.variance * unit**2
+        return replace(self, step=self.step * unit, variance=variance)
+
+
+def learn_prior(
+    maps: Sequence[NDArray[np.float64]],
+    basis: Basis,
+    *,
+    diameter: float = JWST_DIAMETER,
+    npix: int = 128,
+    ridge: float = 1e-3,
+) -> WavefrontPrior:
+    """A prior for wavefront changes from the differences of successive wavefront maps.
+
+    Parameters
+    ----------
+    maps : sequence of ndarray, (n, n)
+        At least two, m, entrance-pupil orientation; 0 or constant outside the mirror.
+    basis : Basis
+    diameter : float
+        Side of the maps, m.
+    npix : int
+        Samples on which modes are fitted; the maps are averaged onto them.
+    ridge : float
+        Of the fit, relative to the modes' own norms: modes that the mirror does not tell apart
+        share what they explain.
+
+    Returns
+    -------
+    WavefrontPrior
+        Scales of the groups, knee and slope at which the fitted coefficients are most probable.
+        Scales are not fixed: `refine` starts from them.
+
+    Raises
+    ------
+    ShapeError
+        For fewer than two maps, or maps of different shapes.
+    """
+    stack = np.asarray([np.asarray(each, dtype=float) for each in maps])
+    if stack.ndim != 3 or len(stack) < 2:
+        raise ShapeError(f"maps: got shape {stack.shape}, expected at least two square maps")
+    changes = np.diff(stack, axis=0) * 1e9
+    grid = PupilGrid.full(npix, diameter)
+    averaged = np.stack([resample(change, npix) for change in changes])
+    lit = torch.from_numpy(np.abs(averaged).max(axis=0) > 0)
+    inside = basis.modes(grid, 0, len(basis))[:, lit]
+    system = inside @ inside.T
+    system.diagonal().mul_(1 + ridge)
+    right = inside @ torch.from_numpy(averaged)[:, lit].T
+    coefficients = torch.linalg.solve(system, right).square().mean(dim=1).sqrt().numpy()
+    frequency, group = basis.frequencies.numpy(), basis.group_index.numpy()
+
+    def deviations(logs: NDArray[np.float64]) -> NDArray[np.float64]:
+        scales, knee, slope = np.exp(logs[:-2]), np.exp(logs[-2]), np.exp(logs[-1])
+        return np.asarray(scales[group] / (1 + (frequency / knee) ** slope))
+
+    def surprise(logs: NDArray[np.float64]) -> float:
+        expected = deviations(logs)
+        return float(np.sum(np.log(expected) + 0.5 * (coefficients / expected) ** 2))
+
+    groups = len(basis.groups)
+    typical = [0.5 * np.log(np.mean(coefficients[group == k] ** 2) + 1e-12) for k in range(groups)]
+    answer = minimize(
+        surprise,
+        np.array([*typical, np.log(8.0), 0.0]),
+        method="L-BFGS-B",
+        bounds=[(None, None)] * groups + [(0.0, np.log(1e3)), (np.log(0.1), np.log(6.0))],
+    )
+    scales = np.exp(answer.x[:-2])
+    return WavefrontPrior(
+        scales={name: float(s) for name, s in zip(basis.groups, scales, strict=True)},
+        knee=float(np.exp(answer.x[-2])),
+        slope=float(np.exp(answer.x[-1])),
+    )
+
+
+def _inverse_of_lower(factor: Tensor) -> Tensor:
+    """Inverse of a lower triangle, in half the time that solving for the identity takes."""
+    # LAPACK wants columns contiguous: the transpose of a row-major lower triangle is an upper one.
+    inverse, failure = dtrtri(factor.numpy().T, lower=0)
+    assert not failure, "a Cholesky factor has no zero on its diagonal"
+    return torch.from_numpy(inverse.T)
+
+
+def solve_with_evidence(
+    curvature: Tensor,
+    gradient: Tensor,
+    shape: Tensor,
+    group: Tensor,
+    scales: Tensor,
+    fixed_deviation: Tensor,
+    *,
+    iterations: int,
+    damping: float = 0.0,
+    current: Tensor | None = None,
+    errors: bool = False,
+    floor: float = 1e-4,
+    ceiling: float = 100.0,
+) -> EvidenceUpdate:
+    """Solve a whitened linear least-squares problem with Gaussian priors about zero.
+
+    Parameters
+    ----------
+    curvature : Tensor, (n, n)
+        G^T G of the whitened Jacobian, float64; the wavefront modes last.
+    gradient : Tensor, (n,)
+        G^T of the whitened residual at zero.
+    shape : Tensor, (modes,)
+        Relative prior deviation of the modes.
+    group : Tensor, (modes,), int64
+        Group of every mode.
+    scales : Tensor, (groups,)
+        Starting scales.
+    fixed_deviation : Tensor, (n - modes,)
+        Prior deviation of what comes before those modes; inf where there is none.
+    iterations : int
+        Updates of the scales; 0 keeps them.
+    damping : float
+        Levenberg-Marquardt: steps away from `current` cost this much of the prior's penalty.
+    current : Tensor, (n,), optional
+        Where the unknowns are now.
+    errors : bool
+        Also compute the variances.
+    floor, ceiling : float
+        Smallest and largest scale: an absent group must not end in a division by zero, nor what
+        no wavefront explains (a bright companion that is not in the model) in a prior so wide
+        that the equations cannot be solved.
+    """
+    others = len(fixed_deviation)
+    effective = float("nan")
+    for k in range(iterations + 1):
+        deviation = torch.cat([fixed_deviation, scales[group] * shape])
+        precision = deviation**-2
+        system = curvature.clone()
+        # Rounding in the curvature is as large as a wide prior's precision.
+        system.diagonal().mul_(1 + _ROUNDING).add_((1 + damping) * precision)
+        factor = torch.linalg.cholesky(system)
+        pulled = gradient if current is None else gradient + damping * precision * current
+        step = torch.cholesky_solve(pulled[:, None], factor)[:, 0]
+        if k == iterations and not errors:
+            break
+        variance = _inverse_of_lower(factor).square_().sum(dim=0)
+        # How many of a group's modes the data determine, and the scale that they have.
+        determined = 1 - precision[others:] * variance[others:]
+        effective = float(determined.sum())
+        if k == iterations:
+            break
+        power = (step[others:] / shape) ** 2
+        counted = torch.zeros_like(scales).index_add(0, group, determined)
+        summed = torch.zeros_like(scales).index_add(0, group, power)
+        scales = torch.sqrt(summed / counted.clamp(min=1e-3)).clamp(min=floor, max=ceiling)
+    known = torch.isfinite(deviation)
+    log_evidence = float(
+        0.5 * gradient @ step - factor.diagonal().log().sum() - deviation[known].log().sum()
+    )
+    return EvidenceUpdate(step, variance if errors else None, scales, effective, log_evidence)
+
+
+def scale_ratios(
+    step: Tensor, variance: Tensor, deviation: Tensor, group: Tensor, *, enough: float = 20.0
+) -> Tensor:
+    """How large the modes of each group are, relative to what their prior says.
+
+    At the scales of the highest evidence, the sum of (step / deviation)^2 is the number of modes
+    that the data determine.
+
+    Parameters
+    ----------
+    step, variance, deviation : Tensor, (modes,)
+        Most probable values, their variance, and the prior's standard deviation.
+    group : Tensor, (modes,), int64
+    enough : float
+        Groups of which fewer modes are determined are left out.
+
+    Returns
+    -------
+    Tensor, (groups,)
+        1 where all is well or nothing can be said; above 1 for a prior that is too narrow.
+    """
+    count = int(group.max()) + 1
+    determined = torch.zeros(count, dtype=step.dtype)
+    determined.index_add_(0, group, 1 - variance / deviation**2)
+    size = torch.zeros_like(determined).index_add_(0, group, (step / deviation) ** 2)
+    return torch.where(determined > enough, (size / determined).clamp(min=0).sqrt(), 1.0)

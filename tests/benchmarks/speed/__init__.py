@@ -1,0 +1,219 @@
+"""Error beside time, always in one run, for this package and for others.
+
+A row is something to be done (one image, one image with its derivative, a refinement ...); its
+cases are ways of doing it. All cases of a row are timed in turns, in one process, warm, and the
+shortest duration counts; the answer that is timed is also the one whose error is taken.
+"""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import math
+import os
+import platform
+import time
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from astropy.table import Table
+
+from pyklip_diffrender.io.files import replacing
+from tests.benchmarks.speed.case import Case, Found
+from tests.benchmarks.speed.memory import peak_memory
+from tests.benchmarks.speed.page import write_page
+from tests.benchmarks.speed.rows import ROWS, Row, chosen_rows
+from tests.benchmarks.speed.scaling import SCALING, limits
+from tests.benchmarks.speed.setting import Setting
+from tests.benchmarks.speed.timing import exponent, interleaved, processor
+
+__all__ = ["ROWS", "Setting", "run_bench", "write_page", "write_table"]
+
+_log = logging.getLogger(__name__)
+
+_ONCE = 3
+"""What takes longer than so many budgets is not called again: its first call counts."""
+
+_COLUMNS = {
+    "row": str,
+    "column": str,
+    "precision": str,
+    "mode": str,
+    "device": str,
+    "seconds": float,
+    "times": float,
+    "ratio": float,
+    "error": float,
+    "sigma": float,
+    "memory": float,
+    "size": float,
+    "note": str,
+}
+
+
+def run_bench(
+    here: Setting,
+    rows: Sequence[str] | None = None,
+    *,
+    budget: float = 2.0,
+    memory: bool = True,
+    command: str = "",
+) -> Table:
+    """Measure.
+
+    Parameters
+    ----------
+    here : Setting
+    rows : sequence of str, optional
+        Beginnings of names of `ROWS`; default all.
+    budget : float
+        Seconds for the repetitions of each case. What takes more than three times as long is
+        called once.
+    memory : bool
+        Also the memory of those cases for which it is asked, in processes of their own.
+    command : str
+        For the provenance.
+
+    Returns
+    -------
+    Table
+        One row a case: seconds (for the whole: where `times` is not 1, of a piece times that
+        number), how many times faster than the row's reference (`ratio`), `error` (see `ROWS`),
+        `sigma` (rms in units of the paper scene's noise), `memory` (bytes), `size` (for scaling).
+        What could not be measured has a NaN and a note. In `meta`: provenance, the reference of
+        every row, exponents, and the machine's limits.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For a row that there is not.
+    """
+    chosen = chosen_rows(list(rows or []))
+    began = time.perf_counter()
+    lines: list[dict[str, Any]] = []
+    references: dict[str, str] = {}
+    for row in chosen:
+        found = _measured(row, here, budget, memory)
+        if row.name != SCALING:
+            references[row.name] = _with_ratios(found)
+        lines += found
+    table = Table(
+        rows=[[line[name] for name in _COLUMNS] for line in lines],
+        names=list(_COLUMNS),
+        dtype=list(_COLUMNS.values()),
+    )
+    for name, kind in _COLUMNS.items():
+        if kind is float:
+            table[name].info.format = ".4g"
+    table.meta = {
+        "command": command,
+        "date": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}",
+        "machine": f"{os.cpu_count()} cores of {processor()}",
+        "threads": torch.get_num_threads(),
+        "device": _device(here.device),
+        "versions": _versions(),
+        "pupil": here.npix,
+        "field": here.fov,
+        "quick": here.quick,
+        "errors": {row.name: row.error for row in chosen},
+        "references": references,
+        "exponents": _exponents(table),
+        "limits": limits(here) if any(row.name == SCALING for row in chosen) else [],
+    }
+    table.meta["seconds"] = round(time.perf_counter() - began)
+    return table
+
+
+def _measured(row: Row, here: Setting, budget: float, memory: bool) -> list[dict[str, Any]]:
+    lines, works, timed, repeated = [], [], [], []
+    for case in row.cases(here):
+        line = _blank(case, here)
+        lines.append(line)
+        if case.make is None:
+            continue
+        _log.info("%s", case.key)
+        work = case.make()
+        start = time.perf_counter()
+        answer = work()
+        first = time.perf_counter() - start
+        found: Found = case.judge(answer)
+        del answer
+        line.update(error=found.error, sigma=found.sigma)
+        line["seconds"] = first * case.times
+        timed.append((case, line))
+        if first < _ONCE * budget:
+            works.append(work)
+            repeated.append((case, line))
+    durations = interleaved(works, budget, here.device)
+    del works
+    for (case, line), duration in zip(repeated, durations, strict=True):
+        line["seconds"] = duration * case.times
+    if memory:
+        for case, line in timed:
+            if case.memory:
+                _log.info("memory of %s", case.key)
+                line["memory"] = peak_memory(case, here)
+    for case, line in timed:
+        line["_reference"] = case.reference
+    return lines
+
+
+def _blank(case: Case, here: Setting) -> dict[str, Any]:
+    line: dict[str, Any] = dict.fromkeys(_COLUMNS, math.nan)
+    line.update(
+        row=case.row,
+        column=case.column,
+        precision=case.precision,
+        mode=case.mode,
+        device=here.device,
+        times=case.times,
+        size=case.size,
+        note=case.note,
+    )
+    return line
+
+
+def _with_ratios(lines: list[dict[str, Any]]) -> str:
+    """Put in how many times faster than the reference each is; the reference's name."""
+    found = [line for line in lines if line.get("_reference")]
+    if not found:
+        return ""
+    for line in lines:
+        line["ratio"] = found[-1]["seconds"] / line["seconds"]
+    return str(found[-1]["column"])
+
+
+def _exponents(table: Table) -> dict[str, float]:
+    found = {}
+    for name in dict.fromkeys(table["row"]):
+        here = table[(table["row"] == name)]
+        if str(name).startswith(SCALING) and len(here) > 1:
+            found[str(name)] = round(exponent(here["size"], here["seconds"]), 2)
+    return found
+
+
+def _device(name: str) -> str:
+    if torch.device(name).type == "cuda":
+        return str(torch.cuda.get_device_name(name))
+    return name
+
+
+def _versions() -> str:
+    words = [f"Python {platform.python_version()}"]
+    for name in ("torch", "numpy", "poppy", "stpsf", "prysm", "hcipy"):
+        try:
+            words.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            words.append(f"{name} not installed")
+    return ", ".join(words)
+
+
+def write_table(table: Table, folder: str | os.PathLike[str]) -> Path:
+    """Write the table as performance.ecsv; returns the path."""
+    path = Path(folder) / "performance.ecsv"
+    with replacing(path) as temporary:
+        table.write(temporary, format="ascii.ecsv", overwrite=True)
+    return path

@@ -1,0 +1,271 @@
+"""Rows on one image: forward, and forward with the derivative."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from functools import partial
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
+from pyklip_diffrender.optics.system import OpticalSystem
+from tests.benchmarks.speed.case import Case, Found, missing
+from tests.benchmarks.speed.multifidelity import MultiFidelity
+from tests.benchmarks.speed.rivals import hcipy_image, load, paper_recipe, prysm_image
+from tests.benchmarks.speed.setting import CELLS, WAVELENGTH, Arrays, Setting
+
+__all__ = ["FORWARD", "STEP", "forward", "step"]
+
+FORWARD, STEP = "forward", "forward + backward"
+
+Model = OpticalSystem | MultiFidelity
+
+_NAMES = {torch.float64: "float64", torch.float32: "float32"}
+
+
+def _models(here: Setting) -> Iterator[tuple[str, torch.dtype, Callable[[], Model]]]:
+    """This package at several fidelities: name, precision, how to make it."""
+    for dtype in _NAMES:
+        yield f"this package, {here.npix}", dtype, partial(here.model.with_fidelity, dtype=dtype)
+    for npix in here.coarse[::-1]:
+        for dtype in _NAMES:
+            mixed = partial(MultiFidelity, here.model, here.measured, npix=npix, dtype=dtype)
+            yield f"multi-fidelity, {npix}", dtype, mixed
+    coarsest = here.coarse[-1]
+    alone = partial(here.model.with_fidelity, npix=coarsest)
+    yield f"coarse alone, {coarsest}", torch.float64, alone
+
+
+def _opd_for(model: Model, here: Setting) -> Tensor:
+    if here.npix == model.npix:
+        return here.opd
+    return torch.nn.functional.avg_pool2d(here.opd[None], here.npix // model.npix)[0]
+
+
+def _without_derivatives(make: Callable[[], Model], here: Setting) -> Callable[[], Tensor]:
+    model = make()
+    opd = _opd_for(model, here)
+
+    def image() -> Tensor:
+        with torch.no_grad():
+            return model(opd)
+
+    return image
+
+
+def _captured(make: Callable[[], Model], here: Setting) -> Callable[[], Tensor]:
+    """The forward model as one CUDA graph: no time is lost to starting its many small kernels."""
+    work = _without_derivatives(make, here)
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            work()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        image = work()
+
+    def replay() -> Tensor:
+        graph.replay()
+        return image
+
+    return replay
+
+
+def forward(here: Setting) -> list[Case]:
+    """One image of the star, monochromatic, by everyone."""
+    cases = []
+    for name, dtype, make in _models(here):
+        cases.append(
+            Case(
+                FORWARD,
+                name,
+                partial(_without_derivatives, make, here),
+                here.judge,
+                precision=_NAMES[dtype],
+                memory=dtype == torch.float64,
+            )
+        )
+        if torch.device(here.device).type == "cuda" and "multi" in name:
+            cases.append(
+                Case(
+                    FORWARD,
+                    name,
+                    partial(_captured, make, here),
+                    here.judge,
+                    precision=_NAMES[dtype],
+                    mode="graph",
+                )
+            )
+    if torch.device(here.device).type != "cuda":
+        cases.append(missing(FORWARD, "this package as a CUDA graph", "no GPU was asked for"))
+    cases.append(Case(FORWARD, "the paper's recipe", lambda: _paper(here), here.judge, memory=True))
+    for name, rival in (("prysm", prysm_image), ("hcipy", hcipy_image)):
+        try:
+            load(name)
+        except ImportError as error:
+            cases.append(missing(FORWARD, name, f"{error} (extra 'bench')"))
+            continue
+        cases.append(
+            Case(
+                FORWARD,
+                f"{name}, {CELLS} cells per lambda/D",
+                partial(_on_arrays, rival, here),
+                lambda image: here.judge(_scaled(image, here)),
+                memory=True,
+            )
+        )
+    cases.append(
+        Case(
+            FORWARD,
+            "poppy, FFT, oversample 4",
+            lambda: _poppy(here),
+            here.judge,
+            reference=True,
+            memory=True,
+        )
+    )
+    return cases + _stpsf_cases(here)
+
+
+def _paper(here: Setting) -> Callable[[], Tensor]:
+    image = paper_recipe(here.arrays, here.device)
+
+    def work() -> Tensor:
+        with torch.no_grad():
+            return image(here.opd)
+
+    return work
+
+
+def _on_arrays(rival: Callable[[Arrays], Callable[[], Any]], here: Setting) -> Callable[[], Any]:
+    return rival(here.arrays)
+
+
+def _scaled(image: Any, here: Setting) -> Any:
+    """Codes differ in what they count light in: the factor that fits the truth best."""
+    return image * (float((image * here.truth).sum()) / float((image**2).sum()))
+
+
+def _poppy(here: Setting) -> Callable[[], Any]:
+    from pyklip_diffrender.bridges.plain import plain_poppy
+
+    arrays = here.arrays
+    return plain_poppy(
+        arrays.amplitude,
+        arrays.opd,
+        arrays.stop,
+        diameter=arrays.diameter,
+        wavelength=WAVELENGTH,
+        pixelscale=NIRCAM_LW_PIXELSCALE,
+        fov_pixels=here.fov,
+        oversample=4,
+    )
+
+
+def _stpsf_cases(here: Setting) -> list[Case]:
+    """calc_psf, and this package's model of the same instrument."""
+    name = "stpsf calc_psf, fft_oversample 4"
+    if find_spec("stpsf") is None:
+        return [missing(FORWARD, name, "stpsf is not installed (extra 'webbpsf')")]
+    if here.data is None:
+        return [missing(FORWARD, name, "no data directory (--stpsf-path or STPSF_PATH)")]
+    os.environ["STPSF_PATH"] = str(here.data)
+    from pyklip_diffrender.bridges import from_webbpsf
+    from pyklip_diffrender.bridges.plain import plain_stpsf
+
+    try:
+        instrument = plain_stpsf(here.data, 256 if here.quick else here.npix)
+    except DiffrenderError as error:
+        return [missing(FORWARD, name, str(error))]
+    call: dict[str, Any] = {
+        "monochromatic": WAVELENGTH,
+        "fov_pixels": here.fov,
+        "fft_oversample": 4,
+        "detector_oversample": 1,
+        "add_distortion": False,
+    }
+    kept: list[Any] = []
+
+    def judge(image: Any) -> Found:
+        if not kept:
+            with torch.no_grad():
+                kept.append(from_webbpsf(instrument, occulter_sampling=16.0, **call)().numpy())
+        difference = np.asarray(image) - kept[0]
+        return Found(float(np.abs(difference).max() / kept[0].max()))
+
+    def converted() -> Callable[[], Tensor]:
+        model = from_webbpsf(instrument, occulter_sampling=3.0, **call)
+        opd = model.opd(None)
+
+        def image() -> Tensor:
+            with torch.no_grad():
+                return model(opd)
+
+        return image
+
+    note = "of stpsf's own arrays; the error is to 16 cells per lambda/D"
+    return [
+        Case(
+            FORWARD,
+            name,
+            lambda: lambda: np.asarray(instrument.calc_psf(**call)["DET_SAMP"].data),
+            judge,
+            reference=True,
+            memory=True,
+            note=note,
+        ),
+        Case(FORWARD, "this package from the stpsf object", converted, judge, note=note),
+    ]
+
+
+def step(here: Setting) -> list[Case]:
+    """The loss of the paper and its derivative with respect to every sample of the fine OPD."""
+    data = torch.from_numpy(here.observation.data[0]).to(here.device)
+    photons = here.scene.star.photons
+
+    def differentiated(
+        make: Callable[[], Callable[[Tensor], Tensor]],
+    ) -> Callable[[], tuple[Tensor, Tensor]]:
+        image = make()
+        opd = here.opd.clone().requires_grad_()
+
+        def work() -> tuple[Tensor, Tensor]:
+            found = image(opd)
+            loss = (photons * found - data).abs().mean()
+            (slope,) = torch.autograd.grad(loss, opd)
+            return found, slope
+
+        return work
+
+    cases = []
+    for name, dtype, make in _models(here):
+        if "alone" not in name:
+            cases.append(
+                Case(
+                    STEP,
+                    name,
+                    partial(differentiated, make),
+                    lambda answer: here.judge(answer[0]),
+                    precision=_NAMES[dtype],
+                    memory=dtype == torch.float64,
+                )
+            )
+    cases.append(
+        Case(
+            STEP,
+            "the paper's recipe",
+            lambda: differentiated(lambda: paper_recipe(here.arrays, here.device)),
+            lambda answer: here.judge(answer[0]),
+            reference=True,
+            memory=True,
+        )
+    )
+    return cases

@@ -1,0 +1,76 @@
+"""Which rows there are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+from tests.benchmarks.speed.case import Case
+from tests.benchmarks.speed.images import FORWARD, STEP, forward, step
+from tests.benchmarks.speed.inference import (
+    CONTRAST,
+    JACOBIAN,
+    MAP,
+    REFINEMENT,
+    contrast,
+    jacobian,
+    refinement,
+    snr_map,
+)
+from tests.benchmarks.speed.scaling import SCALING, scaling
+from tests.benchmarks.speed.setting import Setting
+
+__all__ = ["ROWS", "Row", "cases_of", "chosen_rows"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Something that is done, and in what its errors are.
+
+    Attributes
+    ----------
+    name : str
+    cases : callable
+    error : str
+        What the column "error" is.
+    """
+
+    name: str
+    cases: Callable[[Setting], list[Case]]
+    error: str
+
+
+ROWS = (
+    Row(FORWARD, forward, "largest difference from the converged image, over its peak"),
+    Row(STEP, step, "of the image: largest difference from the converged one, over its peak"),
+    Row(JACOBIAN, jacobian, "of the derivatives of some modes, relative L2"),
+    Row(REFINEMENT, refinement, "of the star model, rms in units of the noise"),
+    Row(MAP, snr_map, "of S/N at some positions, largest difference"),
+    Row(CONTRAST, contrast, "limit and light kept of an injected planet, relative"),
+    Row(SCALING, scaling, "none"),
+)
+"""In the order of the table."""
+
+
+def chosen_rows(names: list[str] | None) -> list[Row]:
+    """Rows by their names, or by what their names begin with.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For a name that none begins with.
+    """
+    if not names:
+        return list(ROWS)
+    for name in names:
+        if not any(row.name.startswith(name) for row in ROWS):
+            known = ", ".join(repr(row.name) for row in ROWS)
+            raise IncompatibleSetupError(f"rows: got {name!r}, expected some of {known}")
+    return [row for row in ROWS if any(row.name.startswith(name) for name in names)]
+
+
+def cases_of(row: str, here: Setting) -> list[Case]:
+    """All cases of the row that a case belongs to."""
+    (found,) = (r for r in ROWS if r.name == row.split(":")[0])
+    return found.cases(here)

@@ -1,0 +1,199 @@
+"""The scene that all rows share: the paper's, with wavefronts from the embedded generator."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pyklip_diffrender.instrument.nircam import (
+    MASK335R_RADIUS,
+    NIRCAM_LW_PIXELSCALE,
+    nircam_coronagraph,
+)
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.scene.objects import PAPER_SEGMENT_GAP, Planet, Scene
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.simulation import simulate
+from pyklip_diffrender.wavefront.opd import random_drift, random_opd
+from tests.benchmarks.speed.case import Found
+
+__all__ = ["Arrays", "Setting"]
+
+Array = NDArray[np.float64]
+
+WAVELENGTH = 4.5e-6
+HOURS = 40.0
+CELLS = 4
+"""Samples per lambda/D on the occulter, of the codes that are compared with."""
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """The model as arrays on the full grids, for other codes.
+
+    Attributes
+    ----------
+    amplitude : ndarray, (npix, npix)
+        Of the entrance pupil; it collects 1.
+    stop : ndarray, (npix, npix), complex
+        All that follows the occulter.
+    opd : ndarray, (npix, npix)
+        m.
+    diameter : float
+        Of the arrays, m.
+    cell, pixel : float
+        On the occulter and on the detector, radians.
+    cells, pixels : int
+        Along one axis; enough cells for the occulter's disc.
+    """
+
+    amplitude: Array
+    stop: NDArray[np.complex128]
+    opd: Array
+    diameter: float
+    cell: float
+    pixel: float
+    cells: int
+    pixels: int
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all rows are measured on.
+
+    Attributes
+    ----------
+    quick : bool
+        A coarse pupil and a small field: to see whether everything runs.
+    device : str
+        Of this package and the paper's recipe; the other codes run on the processor.
+    stpsf_path : str
+        stpsf's data; default the environment variable STPSF_PATH.
+    """
+
+    quick: bool = False
+    device: str = "cpu"
+    stpsf_path: str = ""
+
+    @property
+    def npix(self) -> int:
+        """Samples across the fine pupil."""
+        return 128 if self.quick else 1024
+
+    @property
+    def fov(self) -> int:
+        """Pixels along a side of the image."""
+        return 24 if self.quick else 80
+
+    @property
+    def coarse(self) -> tuple[int, ...]:
+        """Pupil samples of the coarse models."""
+        return (32, 64) if self.quick else (128, 256, 512)
+
+    @property
+    def data(self) -> Path | None:
+        """The data directory of stpsf, if there is one."""
+        named = self.stpsf_path or os.environ.get("STPSF_PATH", "")
+        return Path(named) if named and Path(named).is_dir() else None
+
+    @cached_property
+    def model(self) -> OpticalSystem:
+        """The package's model as it comes, 1024 samples unless quick."""
+        return nircam_coronagraph(
+            "F444W",
+            monochromatic=WAVELENGTH,
+            fov_pixels=self.fov,
+            segment_gap=PAPER_SEGMENT_GAP,
+            npix=self.npix,
+            device=self.device,
+        )
+
+    @cached_property
+    def host_model(self) -> OpticalSystem:
+        """The same on the processor."""
+        return self.model.with_fidelity(device="cpu")
+
+    @cached_property
+    def measured(self) -> Tensor:
+        """The wavefront that is known, m."""
+        return torch.from_numpy(random_opd(1, npix=self.npix).data).to(self.device)
+
+    @cached_property
+    def opd(self) -> Tensor:
+        """The true one, 40 hours later, m."""
+        change = random_drift(1001, HOURS, npix=self.npix).data
+        return self.measured + torch.from_numpy(change).to(self.device)
+
+    @cached_property
+    def converged(self) -> OpticalSystem:
+        """Plane by plane, the occulter on 16 cells per lambda/D (8 if quick)."""
+        return self.host_model.with_fidelity(
+            route="planes", occulter_sampling=8.0 if self.quick else 16.0
+        )
+
+    @cached_property
+    def truth(self) -> Array:
+        """The converged image, (ny, nx)."""
+        with torch.no_grad():
+            return self.converged(self.opd.cpu()).numpy()
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The paper's: beta Pictoris for two hours, and a planet."""
+        return Scene(planets=(Planet(1e-6, 0.6, 54.0),))
+
+    @cached_property
+    def star(self) -> Array:
+        """Photons that are expected from the star."""
+        return self.scene.star.photons * self.truth
+
+    @cached_property
+    def noise(self) -> Array:
+        """Standard deviation of a pixel, photons."""
+        return np.sqrt(self.star + self.scene.read_noise**2)
+
+    @cached_property
+    def observation(self) -> Observation:
+        """One frame with its noise."""
+        return simulate(self.host_model, self.scene, self.opd.cpu(), seed=1)
+
+    def judge(self, image: Tensor | Array) -> Found:
+        """Errors of an image of the star: largest over the peak, and rms over the noise."""
+        found = image.detach().cpu().numpy() if isinstance(image, Tensor) else image
+        difference = found.astype(np.float64) - self.truth
+        sigma = self.scene.star.photons * difference / self.noise
+        return Found(
+            float(np.abs(difference).max() / self.truth.max()), float(np.sqrt((sigma**2).mean()))
+        )
+
+    @cached_property
+    def arrays(self) -> Arrays:
+        """The model for other codes."""
+        model = self.host_model
+        full = PupilGrid.full(self.npix, model.diameter)
+        entrance = model.entrance
+        stop = model.pupil_field(torch.zeros(self.npix, self.npix), WAVELENGTH, {})
+        # Divided by what came in, the planes behind the occulter are what they do to a 1.
+        stop = type(stop)(torch.ones(full.shape, dtype=torch.complex128), WAVELENGTH, full)
+        for plane, window in zip(model.planes[1:], model.windows({})[1:], strict=True):
+            stop = plane.apply(stop, {}, window)
+        cell = WAVELENGTH / model.diameter / CELLS
+        return Arrays(
+            amplitude=entrance.grid.crop(entrance.amplitude, full).numpy(),
+            stop=stop.grid.crop(stop.field, full).numpy(),
+            opd=self.opd.cpu().numpy(),
+            diameter=model.diameter,
+            cell=cell,
+            pixel=NIRCAM_LW_PIXELSCALE * ARCSEC,
+            cells=2 * int(np.ceil(MASK335R_RADIUS * ARCSEC / cell)) + 2,
+            pixels=self.fov,
+        )
