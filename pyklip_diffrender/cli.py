@@ -50,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     refine.add_argument("opd", type=Path, help="OPD map (FITS)")
     refine.add_argument("-o", "--output", type=Path, required=True, help="FITS file to write")
     refine.add_argument("--fov-pixels", type=int, default=80)
-    refine.add_argument("--fidelity", choices=("as given", "planned"), help="see refine")
+    refine.add_argument("--plan", choices=("auto", "off"), default="auto", help="model fidelity")
     refine.set_defaults(run=_refine)
 
     detect = commands.add_parser(
@@ -60,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     detect.add_argument("opd", type=Path, help="OPD map (FITS)")
     detect.add_argument("-o", "--output", type=Path, required=True, help="folder to write into")
     detect.add_argument("--fov-pixels", type=int, default=80)
-    detect.add_argument("--fidelity", choices=("as given", "planned"), help="see refine")
+    detect.add_argument("--plan", choices=("auto", "off"), default="auto", help="model fidelity")
     detect.add_argument("--threshold", type=float, default=5.0, help="S/N of a candidate")
     detect.set_defaults(run=_detect)
 
@@ -137,17 +137,14 @@ def _psf(options: argparse.Namespace) -> None:
 
 
 def _fitted(options: argparse.Namespace) -> Refinement:
-    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
     from pyklip_diffrender.refinement import refine
-    from pyklip_diffrender.refinement.presets import NIRCAM_FIT, NIRCAM_MODEL
     from pyklip_diffrender.scene.observation import Observation
+    from pyklip_diffrender.scene.real_frames import model_for
 
-    observation = Observation.from_fits(options.frames).cutout(options.fov_pixels)
-    model = nircam_coronagraph(
-        observation.filter or "", fov_pixels=options.fov_pixels, **NIRCAM_MODEL
-    )
-    fidelity = options.fidelity
-    fit = refine(model, observation, options.opd, progress=True, fidelity=fidelity, **NIRCAM_FIT)
+    observation = Observation.from_fits(options.frames)
+    model = model_for(observation, options.fov_pixels)
+    cutout = observation.cutout(options.fov_pixels)
+    fit = refine(model, cutout, options.opd, progress=True, plan=options.plan)
     if fit.plan is not None:
         print(f"{fit.plan}\n")
     return fit
@@ -175,15 +172,16 @@ def _refine(options: argparse.Namespace) -> None:
     from pyklip_diffrender.io.files import write_fits
 
     fit = _fitted(options)
+    (frame,) = fit.frames
     primary = fits.PrimaryHDU()
     for key, value in fit.summary().items():
         primary.header[f"HIERARCH {key}"] = value
     hdus = fits.HDUList(
         [
             primary,
-            fits.ImageHDU(fit.residual.astype(np.float32), name="RESIDUAL"),
-            fits.ImageHDU(fit.star_image.astype(np.float32), name="STAR"),
-            fits.ImageHDU(fit.opd.astype(np.float32), name="OPD"),
+            fits.ImageHDU(frame.residual.astype(np.float32), name="RESIDUAL"),
+            fits.ImageHDU(frame.star.astype(np.float32), name="STAR"),
+            fits.ImageHDU(fit.wavefront.real.astype(np.float32), name="OPD"),
         ]
     )
     hdus["OPD"].header["BUNIT"] = "m"

@@ -141,7 +141,7 @@ def run_demo(
     images = {
         "initial": frame - outdated,
         "KLIP": klip,
-        "refined": fit.residual[0],
+        "refined": fit.frames[0].residual[0],
         "detected": without_star,
         "optimal": frame - star,
     }
@@ -186,7 +186,7 @@ def write_demo(result: DemoResult, folder: Path) -> list[Path]:
     for name, opd in (
         ("OPD_MEASURED", result.measured.data),
         ("OPD_TRUE", result.true_opd),
-        ("OPD_REFINED", result.fit.opd),
+        ("OPD_REFINED", result.fit.wavefront),
     ):
         hdu = fits.ImageHDU(opd.astype(np.float32), name=name)
         hdu.header["BUNIT"] = "m"

@@ -104,7 +104,7 @@ def draw_demo(result: DemoResult) -> Figure:
     grid = PupilGrid.full(result.model.npix, result.model.diameter)
     stop = polygon_coverage(maskrnd_openings(), grid).numpy() > 0.5
     true_change = 1e9 * (result.true_opd - result.measured.data)
-    found_change = 1e9 * (result.fit.opd - result.measured.data)
+    found_change = 1e9 * (result.fit.wavefront - result.measured.data)
     limit = float(np.percentile(np.abs(true_change[stop]), 99.5))
     for ax, change, title in (
         (axes[1, 1], true_change, "True change of the wavefront\nseen through the Lyot stop"),
@@ -147,11 +147,12 @@ def draw_subtraction(fit: Refinement) -> Figure:
     from matplotlib.colors import SymLogNorm
     from matplotlib.figure import Figure
 
-    combined = fit.observation.combined()
+    frame = fit.frames[0]
+    combined = frame.observation.combined()
     data, noise = combined.data[0], combined.error[0]
-    residual = np.where(combined.valid[0], data - fit.star_image, np.nan)
+    residual = np.where(combined.valid[0], data - frame.star, np.nan)
     scale = fit.model.detector.pixelscale[0]
-    unit = str(fit.observation.unit)
+    unit = str(frame.observation.unit)
     limit = float(np.nanpercentile(data, 99.8))
     norm = SymLogNorm(limit / 30, vmin=-limit / 30, vmax=limit)
     span = float(np.nanpercentile(np.abs(residual), 99.5))
@@ -161,13 +162,13 @@ def draw_subtraction(fit: Refinement) -> Figure:
     axes = figure.subplots(1, 4)
     panels: tuple[tuple[NDArray[np.float64], dict[str, Any], str, str], ...] = (
         (data, {"norm": norm, "cmap": "magma"}, "Data, mean of the integrations", unit),
-        (fit.star_image, {"norm": norm, "cmap": "magma"}, "Rendered star", unit),
+        (frame.star, {"norm": norm, "cmap": "magma"}, "Rendered star", unit),
         (residual, {"limits": (-span, span), "cmap": "RdBu_r"}, "Data - star", unit),
         (ratio, {"limits": (-8, 8), "cmap": "RdBu_r"}, "(Data - star) / noise", "sigma"),
     )
     star = np.zeros(2)
     for name in ("detector_shift", "star_offset"):
-        star = star + fit.values.get(name, np.zeros(2))
+        star = star + frame.values.get(name, np.zeros(2))
     for ax, (image, style, title, label) in zip(axes, panels, strict=True):
         settings: dict[str, Any] = {"limits": (0.0, 1.0), **style}
         shown = draw_image(ax, image, scale, title=title, **settings)
@@ -184,7 +185,7 @@ def draw_detection(found: Detection) -> Figure:
 
     figure = Figure(figsize=(18.5, 4.4), layout="constrained")
     frame, left, middle, right = figure.subplots(1, 4)
-    noise = found.fits[0].observation.combined().error[0]
+    noise = found.fits[0].frames[0].observation.combined().error[0]
     (x0, y0), (x1, y1) = found.grid[0, 0], found.grid[-1, -1]
     pixel = found.fits[0].model.detector.pixelscale
     extent = (x0 - pixel[0] / 2, x1 + pixel[0] / 2, y0 - pixel[1] / 2, y1 + pixel[1] / 2)

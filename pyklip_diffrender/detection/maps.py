@@ -38,7 +38,7 @@ class Maps:
         self.groups, self.progress = tuple(groups), progress
         ny, nx = self.groups[0][1].grid.shape[:2]
         self.shape = (ny, nx)
-        frames = sum(len(templates.fits) for _, templates in self.groups)
+        frames = sum(len(templates.frames) for _, templates in self.groups)
         self._keeps = 4.0 * frames * (ny * nx) ** 2 <= _KEEP
         self._kept: dict[tuple[int, int], dict[int, Tensor]] = {}
         total = np.zeros((3, ny * nx))

@@ -16,13 +16,14 @@ from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.relinearise import star_only, without_light
+from pyklip_diffrender.detection.relinearise import has_only_reference_stars, without_light
 from pyklip_diffrender.detection.scale import scale_errors
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.files import replacing, write_fits
+from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.refinement import FrameFit, Refinement
 
 __all__ = ["Detection", "amplitudes"]
 
@@ -39,7 +40,7 @@ def amplitudes(
     groups: Sequence[tuple[LinearModel, Templates]], offsets: ArrayLike, scatter: float
 ) -> QTable:
     """Contrasts of point sources at some positions, one at a time; see `Detection.measure`."""
-    places = torch.as_tensor(np.atleast_2d(np.asarray(offsets, dtype=float)))
+    places = torch.from_numpy(np.atleast_2d(to_arcsec(offsets, "offsets")))
     if places.ndim != 2 or places.shape[1] != 2:
         raise ShapeError(f"offsets: got shape {tuple(places.shape)}, expected (k, 2)")
     numerator = torch.zeros(len(places), dtype=torch.float64)
@@ -69,10 +70,10 @@ def _amplitude(linear: LinearModel, frame: int, shape: torch.Tensor) -> tuple[fl
     return float(weighed.numerator[0]) / information, information**-0.5
 
 
-def _less_star(fit: Refinement) -> Image:
-    """What a fit leaves of its frame; for reference stars that share nothing with the others."""
-    combined = fit.observation.combined()
-    return np.where(combined.valid[0], combined.data[0] - fit.star_image, np.nan)
+def _less_star(frame: FrameFit) -> Image:
+    """Residual of a frame of a reference star that shares nothing with the others."""
+    combined = frame.observation.combined()
+    return np.where(combined.valid[0], combined.data[0] - frame.star, np.nan)
 
 
 @dataclass(frozen=True)
@@ -217,12 +218,13 @@ class Detection:
         shape = torch.as_tensor(np.asarray(image, dtype=float))
         if shape.shape != self.snr.shape:
             raise ShapeError(f"image: got {tuple(shape.shape)}, expected {self.snr.shape}")
-        fit, linear, scatter = self.fits[0], self.groups[0][0], self.scatter
-        amplitude, error = _amplitude(linear, fit.frame, shape)
+        linear, scatter = self.groups[0][0], self.scatter
+        amplitude, error = _amplitude(linear, 0, shape)
         total, bright = amplitude, amplitude > relinearise * error
-        for _ in range(_ROUNDS if bright and len(self.fits) == 1 else 0):
+        alone = len(self.fits) == 1 and len(self.fits[0].frames) == 1
+        for _ in range(_ROUNDS if bright and alone else 0):
             fit = without_light(self.fits[0], total * shape.numpy())
-            amplitude, error = _amplitude(star_only([fit]), fit.frame, shape)
+            amplitude, error = _amplitude(fit.star_only, 0, shape)
             total += amplitude
             scatter = 1.0 if fit.status.calibrated else self.scatter
             if abs(amplitude) < _SETTLED * error:
@@ -238,20 +240,23 @@ class Detection:
         the threshold do. In the order of `fits`, (ny, nx) each, in the data's unit; frames that
         were refined as one observation are averaged; NaN where the data are masked.
         """
-        images: dict[int, Image] = {}
-        for linear, templates in self.groups:
+        images: list[Image] = []
+        groups = iter(self.groups)
+        for fit in self.fits:
+            if has_only_reference_stars(fit):
+                images += [_less_star(frame) for frame in fit.frames]
+                continue
+            linear, templates = next(groups)
             light = self.candidates.light(templates)
-            # Taken out before the star is found, and put back afterwards.
+            # Taken out before the star is estimated, and put back afterwards.
             imitated = linear.clean(light) if len(self.candidates) else {}
-            for fit in self.fits:
-                if fit.linear is not templates.fits[0].linear:
-                    continue
-                frame, left = linear.frames[fit.frame], linear.cleaned[fit.frame]
+            for k, frame in enumerate(linear.frames):
+                left = linear.cleaned[k]
                 if imitated:
-                    left = left - imitated[fit.frame][0]
-                image = left / frame.weight + light.get(fit.frame, torch.zeros(1))[0]
-                images[id(fit)] = torch.where(frame.weight > 0, image, torch.nan).numpy()
-        return tuple(images[id(f)] if id(f) in images else _less_star(f) for f in self.fits)
+                    left = left - imitated[k][0]
+                image = left / frame.weight + light.get(k, torch.zeros(1))[0]
+                images.append(torch.where(frame.weight > 0, image, torch.nan).numpy())
+        return tuple(images)
 
     @cached_property
     def left_out(self) -> tuple[Image, Image]:
@@ -259,7 +264,7 @@ class Detection:
 
         And its standard deviation (without `scatter`), both (ny, nx) in the data's unit.
         """
-        residual, deviation = self.groups[0][0].left_out(5, self.fits[0].frame)
+        residual, deviation = self.groups[0][0].left_out(5, 0)
         return residual.numpy(), deviation.numpy()
 
     def _provenance(self) -> dict[str, object]:
@@ -267,7 +272,7 @@ class Detection:
 
         return {
             "software": f"pyklip_diffrender {__version__}",
-            "frames": [fit.observation.name for fit in self.fits],
+            "frames": [f.observation.name for fit in self.fits for f in fit.frames],
             **{key: value for key, value in self.fits[0].summary().items()},
             "scatter": self.scatter,
             "threshold": self.threshold,
@@ -281,7 +286,7 @@ class Detection:
         for key, value in self._provenance().items():
             text = ", ".join(value) if isinstance(value, list) else value
             primary.header[f"HIERARCH {key}"] = text
-        unit = self.fits[0].observation.unit.to_string("fits")
+        unit = self.fits[0].frames[0].observation.unit.to_string("fits")
         hdus = fits.HDUList([primary])
         for name, image, image_unit in (
             ("SNR", self.snr, ""),

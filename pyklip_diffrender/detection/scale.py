@@ -11,7 +11,6 @@ from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.linear.model import LinearFrame, LinearModel
 from pyklip_diffrender.linear.response import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["scale_errors"]
 
@@ -42,36 +41,36 @@ def scale_errors(
     -------
     Tensor, (k,), float64
     """
-    frames = sum(len(templates.fits) for _, templates in groups)
+    frames = sum(len(templates.frames) for _, templates in groups)
     variance = torch.zeros(len(offsets), dtype=torch.float64)
     for linear, templates in groups:
         changes = torch.zeros(len(linear.vector), len(offsets), dtype=torch.float64)
-        for k, fit in enumerate(templates.fits):
-            frame = linear.frames[fit.frame]
+        for k, fitted in templates.frames.items():
+            frame = linear.frames[k]
             on_rows = torch.zeros(len(frame.rows), len(offsets), dtype=torch.float64)
-            for row, unknown in enumerate(frame.rows[: frame.modes].tolist()):
-                if linear.names[unknown].startswith("flux["):
-                    on_rows[row] = 1 / float(fit.values["flux"][0])
+            for row, unknown in enumerate(frame.rows[: frame.first_mode].tolist()):
+                if linear.unknowns[unknown].name == "flux":
+                    on_rows[row] = 1 / fitted.flux
             for j in torch.nonzero(significance > _CLEAR).flatten().tolist():
-                on_rows[frame.modes :, j] = _by_modes(templates, k, fit, frame, offsets[j])
+                on_rows[frame.first_mode :, j] = _by_modes(templates, k, frame, offsets[j])
             changes += frame.onto_unknowns(on_rows, len(linear.vector)) / frames
         variance += linear.variances(changes)
     return variance.sqrt()
 
 
-def _by_modes(
-    templates: Templates, k: int, fit: Refinement, frame: LinearFrame, offset: Tensor
-) -> Tensor:
+def _by_modes(templates: Templates, k: int, frame: LinearFrame, offset: Tensor) -> Tensor:
     """By what share every mode changes a source's light as its template sees it, per nm.
 
     The part of the image's change that looks like the image; the rest only adds information.
     """
-    modes = torch.zeros(len(frame.rows) - frame.modes, dtype=torch.float64)
+    modes = torch.zeros(len(frame.rows) - frame.first_mode, dtype=torch.float64)
     if not len(modes):
         return modes  # The wavefront was not fitted.
     modes.requires_grad_()
-    grid = PupilGrid.full(fit.model.npix, fit.model.diameter)
-    image = templates.image(k, offset, fit.settings.basis.opd(modes * NANOMETRE, grid))
+    model, basis = templates.frames[k].model, templates.fit.basis
+    assert basis is not None
+    grid = PupilGrid.full(model.npix, model.diameter)
+    image = templates.image(k, offset, basis.opd(modes * NANOMETRE, grid))
     seen = image.detach() * frame.weight.to(image.device) ** 2
     share = (seen * image).sum() / (seen * image.detach()).sum()
     return torch.autograd.grad(share, modes)[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -16,7 +15,7 @@ from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.linear.forward_mode import jacfwd
 from pyklip_diffrender.linear.response import coarse_copy, downsample
 from pyklip_diffrender.optics.fast.point_sources import PointSources
-from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.refinement import FrameFit, Refinement
 
 __all__ = ["Templates"]
 
@@ -35,21 +34,30 @@ class Templates:
 
     Parameters
     ----------
-    fits : sequence of Refinement
-        Sharing a linear model. Reference stars show no planets and are left out.
-    origin : Refinement
-        The first frame, whose pixels and orientation positions refer to.
+    fit : Refinement
+        Reference stars among its frames show no planets and are left out.
+    origin : FrameFit
+        The frame whose pixels and orientation positions refer to.
+
+    Attributes
+    ----------
+    frames : dict of int to FrameFit
+        Frames of the target, by their place in the fit.
     """
 
-    def __init__(self, fits: Sequence[Refinement], origin: Refinement) -> None:
-        self.fits = [fit for fit in fits if not fit.observation.reference]
-        if not self.fits or origin.observation.reference:
+    def __init__(self, fit: Refinement, origin: FrameFit) -> None:
+        self.fit, self.origin = fit, origin
+        self.frames = {
+            k: frame for k, frame in enumerate(fit.frames) if not frame.observation.reference
+        }
+        if not self.frames or origin.observation.reference:
             raise IncompatibleSetupError(
                 "detect: expected frames of the target, the first of all included; got a "
                 "reference star"
             )
-        self.origin = origin
-        self.rolls = [_roll(fit, origin) for fit in self.fits]
+        self.rolls = {
+            k: frame.observation.roll_from(origin.observation) for k, frame in self.frames.items()
+        }
         self._sources: dict[int, PointSources] = {}
         ny, nx = origin.model.detector.shape
         rows, columns = np.divmod(np.arange(ny * nx), nx)
@@ -65,8 +73,8 @@ class Templates:
         """x, y of all the first frame's pixels from the star, (ny, nx, 2), arcsec."""
 
     @staticmethod
-    def _star(fit: Refinement) -> Tensor:
-        return fit.optical_values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu()
+    def _star(frame: FrameFit) -> Tensor:
+        return frame.optical_values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu()
 
     def _turned(self, k: int, offsets: Tensor) -> Tensor:
         """Positions in frame k, from the star, of positions in the first frame."""
@@ -79,19 +87,21 @@ class Templates:
 
     def _points(self, k: int) -> PointSources:
         if k not in self._sources:
-            fit = self.fits[k]
-            self._sources[k] = PointSources(fit.model, _as_tensor(fit.opd), fit.optical_values)
+            frame = self.frames[k]
+            self._sources[k] = PointSources(
+                frame.model, _as_tensor(frame.opd), frame.optical_values
+            )
         return self._sources[k]
 
     def _aligned(self, k: int) -> bool:
         """Whether planets at the first frame's pixel centres are at pixel centres in frame k."""
-        moved = self._axis(self.fits[k]) - self._axis(self.origin)
+        moved = self._axis(self.frames[k]) - self._axis(self.origin)
         return abs(self.rolls[k]) < _ALIGNED and float(moved.abs().max()) < _ALIGNED
 
-    def _axis(self, fit: Refinement) -> Tensor:
+    def _axis(self, frame: FrameFit) -> Tensor:
         """Place of the star on the pixels, up to a constant."""
-        shift = fit.optical_values.get("detector_shift", torch.zeros(2, dtype=torch.float64))
-        return shift.cpu() + self._star(fit)
+        shift = frame.optical_values.get("detector_shift", torch.zeros(2, dtype=torch.float64))
+        return shift.cpu() + self._star(frame)
 
     def at_pixels(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> dict[int, Tensor]:
         """Planets at pixel centres of the first frame.
@@ -102,20 +112,20 @@ class Templates:
             By the frame's place in the linear model.
         """
         offsets = torch.from_numpy(self.grid[rows, columns])
-        found = {}
-        for k, fit in enumerate(self.fits):
+        images = {}
+        for k, frame in self.frames.items():
             if self._aligned(k):
-                images = self._points(k).images(rows, columns)
+                sources = self._points(k).images(rows, columns)
             else:
-                images = self._many(fit, self._turned(k, offsets))
-            found[fit.frame] = (float(fit.values["flux"][0]) * images).cpu()
-        return found
+                sources = self._many(frame, self._turned(k, offsets))
+            images[k] = (frame.flux * sources).cpu()
+        return images
 
-    def _many(self, fit: Refinement, offsets: Tensor) -> Tensor:
-        model = coarse_copy(fit.model, _MANY_NPIX)
-        opd = downsample(_as_tensor(fit.opd).to(model.device), model.npix)
-        star = self._star(fit)
-        values = {n: v for n, v in fit.optical_values.items() if n != "star_offset"}
+    def _many(self, frame: FrameFit, offsets: Tensor) -> Tensor:
+        model = coarse_copy(frame.model, _MANY_NPIX)
+        opd = downsample(_as_tensor(frame.opd).to(model.device), model.npix)
+        star = self._star(frame)
+        values = {n: v for n, v in frame.optical_values.items() if n != "star_offset"}
         with torch.no_grad():
             parts = [model(opd, star + part, **values).float() for part in offsets.split(8)]
         return torch.cat(parts)
@@ -134,8 +144,8 @@ class Templates:
         -------
         dict of int to Tensor, (k, ny, nx), or (3, k, ny, nx) with slopes; float64
         """
-        found = {}
-        for k, fit in enumerate(self.fits):
+        images = {}
+        for k, frame in self.frames.items():
             image = partial(self.image, k)
             rows = []
             for offset in offsets:
@@ -143,14 +153,12 @@ class Templates:
                     rows.append([image(offset)])
                 if slopes:
                     rows[-1] += list(jacfwd(image)(offset).movedim(-1, 0))
-            stacked = float(fit.values["flux"][0]) * torch.stack(
-                [torch.stack(row) for row in rows], dim=1
-            )
-            found[fit.frame] = (stacked if slopes else stacked[0]).cpu()
-        return found
+            stacked = frame.flux * torch.stack([torch.stack(row) for row in rows], dim=1)
+            images[k] = (stacked if slopes else stacked[0]).cpu()
+        return images
 
     def image(self, k: int, offset: Tensor, change: Tensor | None = None) -> Tensor:
-        """One planet in the frame of `fits[k]`, as a fraction of the star's light, (ny, nx).
+        """One planet in frame k, as a fraction of the star's light, (ny, nx).
 
         Parameters
         ----------
@@ -158,18 +166,13 @@ class Templates:
         offset : Tensor, (2,)
             As for `at`.
         change : Tensor, (npix, npix), optional
-            Of the wavefront that was found, m.
+            Of the fitted wavefront, m.
         """
-        fit = self.fits[k]
-        there = {**fit.optical_values, "star_offset": self._star(fit) + self._turned(k, offset)}
-        opd = _as_tensor(fit.opd)
-        return fit.model(opd if change is None else opd + change, **there).double()
-
-
-def _roll(fit: Refinement, origin: Refinement) -> float:
-    """Degrees by which the sky in a frame is turned, counter-clockwise, from the first one."""
-    here, there = fit.observation.position_angles, origin.observation.position_angles
-    return 0.0 if here is None or there is None else -float(here[0] - there[0])
+        frame = self.frames[k]
+        star = self._star(frame) + self._turned(k, offset)
+        there = {**frame.optical_values, "star_offset": star}
+        opd = _as_tensor(frame.opd)
+        return frame.model(opd if change is None else opd + change, **there).double()
 
 
 def _as_tensor(opd: NDArray[np.float64]) -> Tensor:

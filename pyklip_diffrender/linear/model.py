@@ -25,9 +25,32 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
 
-__all__ = ["LinearFrame", "LinearModel", "Weighed"]
+__all__ = ["LinearFrame", "LinearModel", "TemplateProducts", "Unknown"]
 
 _BATCH = 512
+"""Templates that are weighed at a time."""
+
+
+class Unknown(NamedTuple):
+    """One unknown of a fit.
+
+    Attributes
+    ----------
+    name : str
+        A parameter of the parameter table, or "companions", "amplitude", "modes" or "drift".
+    component : int
+        Index within that parameter.
+    frame : int
+        The frame whose own value it is; -1 if all frames share it.
+    """
+
+    name: str
+    component: int
+    frame: int = -1
+
+    def __str__(self) -> str:
+        own = "" if self.frame < 0 else f" of frame {self.frame}"
+        return f"{self.name}[{self.component}]{own}"
 
 
 @dataclass(frozen=True)
@@ -47,7 +70,7 @@ class LinearFrame:
     drift : Tensor, (some,), int64
         Unknowns by which the last rows of this frame (its wavefront modes, from the first one on)
         may differ from the other frames'.
-    modes : int
+    first_mode : int
         Place of the first wavefront mode among the rows.
     """
 
@@ -56,23 +79,23 @@ class LinearFrame:
     jacobian: Tensor
     rows: Tensor
     drift: Tensor
-    modes: int
+    first_mode: int
 
     def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
         """Sum what stands for every row, (rows, k), over the unknowns, (size, k)."""
         total = torch.zeros(size, *on_rows.shape[1:], dtype=on_rows.dtype)
         total.index_add_(0, self.rows, on_rows)
         count = len(self.drift)
-        return total.index_add_(0, self.drift, on_rows[self.modes : self.modes + count])
+        return total.index_add_(0, self.drift, on_rows[self.first_mode : self.first_mode + count])
 
     def of_unknowns(self, values: Tensor) -> Tensor:
         """Values of the rows from those of the unknowns; the adjoint of `onto_unknowns`."""
         rows = values[self.rows]
-        rows[self.modes : self.modes + len(self.drift)] += values[self.drift]
+        rows[self.first_mode : self.first_mode + len(self.drift)] += values[self.drift]
         return rows
 
 
-class Weighed(NamedTuple):
+class TemplateProducts(NamedTuple):
     """Inner products of templates p, (k,) each.
 
     Attributes
@@ -96,8 +119,7 @@ class LinearModel:
 
     Attributes
     ----------
-    names : tuple of str
-        Of all unknowns.
+    unknowns : tuple of Unknown
     frames : tuple of LinearFrame
     vector : Tensor, (unknowns,)
         Where it is linearised.
@@ -107,7 +129,7 @@ class LinearModel:
         G G^T over all frames, float64.
     """
 
-    names: tuple[str, ...]
+    unknowns: tuple[Unknown, ...]
     frames: tuple[LinearFrame, ...]
     vector: Tensor
     mean: Tensor
@@ -116,7 +138,9 @@ class LinearModel:
 
     def __repr__(self) -> str:
         ny, nx = self.frames[0].residual.shape
-        return f"<LinearModel: {len(self.names)} unknowns, {len(self.frames)} x {ny} x {nx} pixels>"
+        return (
+            f"<LinearModel: {len(self.unknowns)} unknowns, {len(self.frames)} x {ny} x {nx} pixels>"
+        )
 
     @cached_property
     def _scale(self) -> Tensor:
@@ -136,45 +160,10 @@ class LinearModel:
         """Posterior covariance of all unknowns, (unknowns, unknowns)."""
         return torch.cholesky_inverse(self._factor) * self._scale[:, None] * self._scale
 
-    @cached_property
-    def determined(self) -> Tensor:
-        """How far the data determine every unknown, (unknowns,).
-
-        1 less the ratio of posterior to prior variance: near 0 for what the data do not see, 1
-        for what has no prior.
-        """
-        return 1 - self.variances(torch.eye(len(self.vector)).double()) / self.deviation**2
-
     def variances(self, combinations: Tensor) -> Tensor:
         """Posterior variances, (k,), of linear combinations of the unknowns, (unknowns, k)."""
         scaled = combinations * self._scale[:, None]
         return torch.linalg.solve_triangular(self._factor, scaled, upper=False).square_().sum(dim=0)
-
-    def unseen(self, limit: float = 0.01) -> tuple[str, ...]:
-        """Names of the unknowns of which the data determine less than `limit`."""
-        return tuple(
-            name for name, share in zip(self.names, self.determined, strict=True) if share < limit
-        )
-
-    def degenerate(self, limit: float = 0.95) -> list[tuple[str, str, float]]:
-        """Pairs of unknowns that the data hardly tell apart.
-
-        Parameters
-        ----------
-        limit : float
-            Smallest absolute posterior correlation.
-
-        Returns
-        -------
-        list of (name, name, correlation)
-            The strongest first.
-        """
-        covariance = self.covariance
-        deviation = covariance.diagonal().sqrt()
-        correlation = (covariance / deviation[:, None] / deviation).triu(1)
-        found = torch.nonzero(correlation.abs() >= limit).tolist()
-        pairs = [(self.names[i], self.names[j], float(correlation[i, j])) for i, j in found]
-        return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
     @cached_property
     def step(self) -> Tensor:
@@ -226,7 +215,7 @@ class LinearModel:
             self._factor, total * self._scale[:, None], upper=False
         )
 
-    def weigh(self, templates: Mapping[int, Tensor]) -> Weighed:
+    def weigh(self, templates: Mapping[int, Tensor]) -> TemplateProducts:
         """Amplitudes of templates, one at a time, with all unknowns integrated out.
 
         Parameters
@@ -236,7 +225,7 @@ class LinearModel:
 
         Returns
         -------
-        Weighed
+        TemplateProducts
             The amplitude is numerator / information, its standard deviation
             1 / sqrt(information), or 1 / sqrt(photon) if all unknowns were known.
         """
@@ -250,8 +239,8 @@ class LinearModel:
                 whitened = (images * self.frames[k].weight.to(images.dtype)).double()
                 numerator += torch.tensordot(whitened, self.cleaned[k], dims=2)
                 photon += (whitened**2).sum(dim=(1, 2))
-            parts.append(Weighed(numerator, photon - imitated, photon))
-        return Weighed(*(torch.cat(column) for column in zip(*parts, strict=True)))
+            parts.append(TemplateProducts(numerator, photon - imitated, photon))
+        return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
     def clean(self, templates: Mapping[int, Tensor]) -> dict[int, Tensor]:
         """Sigma^-1 p, whitened, of templates (k, ny, nx) by frame; for every frame of the model.
@@ -292,11 +281,11 @@ class LinearModel:
         Parameters
         ----------
         name : str
-            Of the unknowns, up to the bracket.
+            Of the unknowns.
         light : mapping of int to array, (ny, nx)
             What those unknowns render in each frame.
         """
-        keeps = torch.tensor([not label.startswith(f"{name}[") for label in self.names])
+        keeps = torch.tensor([unknown.name != name for unknown in self.unknowns])
         place = torch.cumsum(keeps, 0) - 1
         frames = []
         for k, frame in enumerate(self.frames):
@@ -310,12 +299,12 @@ class LinearModel:
                     jacobian=frame.jacobian[rows],
                     rows=place[frame.rows[rows]],
                     drift=place[frame.drift],
-                    modes=frame.modes - int((~rows[: frame.modes]).sum()),
+                    first_mode=frame.first_mode - int((~rows[: frame.first_mode]).sum()),
                 )
             )
         kept = torch.nonzero(keeps).flatten()
         return LinearModel(
-            tuple(self.names[k] for k in kept.tolist()),
+            tuple(self.unknowns[k] for k in kept.tolist()),
             tuple(frames),
             self.vector[kept],
             self.mean[kept],

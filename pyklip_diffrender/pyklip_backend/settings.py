@@ -24,6 +24,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 
 if TYPE_CHECKING:
     from pyklip_diffrender.planning import Plan
+    from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
     from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["ATTRIBUTE", "DiffrenderSettings", "OPDLike", "Options", "settings_of"]
@@ -43,11 +44,12 @@ class Options(TypedDict, total=False):
     fit_pixels: int
     error: ArrayLike
     unit: u.UnitBase
-    method: str
     seed: int
-    fidelity: Plan | str
+    fit: GaussNewton | Adam
+    start: Mapping[str, Any]
+    systematics: Systematics
+    plan: Plan | str
     keep_detected: bool
-    refine_options: Mapping[str, Any]
     model_options: Mapping[str, Any]
     subtractor: Callable[..., Any]
 
@@ -79,20 +81,22 @@ class DiffrenderSettings:
         where there is one, else estimated from the frames.
     unit : Unit, optional
         Unit of the frames. Read from BUNIT where there is one, else dimensionless.
-    method : str, optional
-        Passed to `refine`; "gauss-newton" by default.
     seed : int, optional
         Passed to `refine`; 0 by default.
-    fidelity : Plan or str, optional
-        Passed to `refine`: "as given", "planned", or a plan that was made before, which serves
-        for all fits of a reduction.
+    fit : GaussNewton or Adam, optional
+        Settings of the fit; see `refine`.
+    start : dict, optional
+        Starting values by parameter name; see `refine`.
+    systematics : Systematics, optional
+        What is known of the model's error; see `refine`.
+    plan : Plan or str, optional
+        "auto" (the default), "off", or a plan that was made before, which serves for all fits of a
+        reduction; see `refine`.
     keep_detected : bool, optional
         Look for companions in the fits (`detect`) and refine the star once more with them in the
         model, so that none of their light is taken for the star's; False by default. What is not
         detected loses as much as before: bright injected companions then say nothing about how
         much of a faint one is left.
-    refine_options : mapping, optional
-        Further keywords of `refine`, such as ``free`` and ``prior``.
     model_options : mapping, optional
         Further keywords of `nircam_coronagraph`, such as ``npix`` and ``nlambda``.
     subtractor : Subtractor, optional
@@ -106,11 +110,12 @@ class DiffrenderSettings:
     fit_pixels: int | None = None
     error: ArrayLike | None = None
     unit: u.UnitBase | None = None
-    method: str | None = None
     seed: int | None = None
-    fidelity: Plan | str | None = None
+    fit: GaussNewton | Adam | None = None
+    start: Mapping[str, Any] | None = None
+    systematics: Systematics | None = None
+    plan: Plan | str | None = None
     keep_detected: bool | None = None
-    refine_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
 

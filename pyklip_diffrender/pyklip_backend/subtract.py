@@ -7,7 +7,6 @@ import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
@@ -17,20 +16,21 @@ from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.refinement import Refinement
 
-__all__ = ["FIT_PIXELS", "Fit", "Subtraction", "Subtractor", "model_for", "subtract_by_refinement"]
+__all__ = ["FIT_PIXELS", "Fit", "Subtraction", "Subtractor", "subtract_by_refinement"]
 
 logger = logging.getLogger(__name__)
 
 FIT_PIXELS = 80
 """Side of the fitted square unless something else is asked for: 5 arcsec, the occulter's reach."""
 
-METHOD, SEED = "gauss-newton", 0
+SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,20 +125,25 @@ def subtract_by_refinement(
     RefinementError
         If a refinement has no usable result.
     """
-    model = model_for(observation, settings)
+    model = model_of(observation, settings)
     # Only now, with all input found good, the part that takes a second to import.
     from pyklip_diffrender.refinement import refine
 
-    method = METHOD if settings.method is None else settings.method
     seed = SEED if settings.seed is None else settings.seed
     groups = list(_alike(observation))
     windows = [Window.about(group.center[0], model.detector.shape) for _, group in groups]
     results: list[Refinement] = []
     for (_, group), window in zip(groups, windows, strict=True):
-        options = {**_defaults(observation, method), **settings.refine_options}
-        if settings.fidelity is not None:
-            options["fidelity"] = settings.fidelity
-        result = refine(model, window.of(group), opd, method=method, seed=seed, **options)
+        result = refine(
+            model,
+            window.of(group),
+            opd,
+            settings=settings.fit,
+            start=settings.start,
+            systematics=settings.systematics,
+            plan="auto" if settings.plan is None else settings.plan,
+            seed=seed,
+        )
         if not result.status.usable:
             raise RefinementError(f"{group.name}: {result.status.message}", result)
         results.append(result)
@@ -151,34 +156,20 @@ def subtract_by_refinement(
         logger.info("%s: %s, chi2/pixel %.4g", group.name, status, result.chi2_per_pixel)
         star[frames] = _everywhere(result, group, window)
         fits.append(Fit(tuple(map(int, frames)), status, float(result.chi2_per_pixel), result))
-    return Subtraction(star, method, seed, tuple(fits))
+    return Subtraction(star, results[0].method, seed, tuple(fits))
 
 
 def _with_companions(results: list[Refinement]) -> list[Refinement]:
     """The fits once more, with what is detected in all of them together as companions."""
     from pyklip_diffrender.detection import detect
-    from pyklip_diffrender.detection.relinearise import lacking, with_companions
+    from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
 
     # Refined again below, faint ones too: a second S/N map in between would be for nothing.
     found = detect(results, relinearise=math.inf)
     logger.info("companions that keep their light: %s", found.table)
-    if not lacking(results, found.candidates):
+    if not lacks_candidates(results, found.candidates):
         return results
     return with_companions(results, found.candidates)
-
-
-def _defaults(observation: Observation, method: str) -> dict[str, Any]:
-    """Options of `refine` that real frames need and simulated ones do not."""
-    from pyklip_diffrender.refinement.presets import NIRCAM_FIT
-
-    if method != METHOD or not _is_nircam(observation):
-        return {}
-    return dict(NIRCAM_FIT)
-
-
-def _is_nircam(observation: Observation) -> bool:
-    """Whether the frames are NIRCam's own, with its detector's scale and shear."""
-    return bool(observation.header.get("INSTRUME") == "NIRCAM")
 
 
 def _alike(observation: Observation) -> Iterator[tuple[NDArray[np.intp], Observation]]:
@@ -214,19 +205,17 @@ def _everywhere(result: Refinement, group: Observation, window: Window) -> NDArr
     inside &= window.x + window.shape[1] >= box.x + box.shape[1]
     if not inside and result.model.recipe:
         x, y = group.center[0] - (box.x, box.y)
-        return box.paste(result.render(fov_pixels=box.shape, center=(x, y)), group.shape)
+        return box.paste(result.frames[0].render(fov_pixels=box.shape, center=(x, y)), group.shape)
     if not inside:
         logger.warning(
             "%s: the model was not made by nircam_coronagraph or a bridge; pixels outside its %d "
             "x %d are NaN", group.name, window.shape[1], window.shape[0],
         )  # fmt: skip
-    return window.paste(np.asarray(result.star_image), group.shape)
+    return window.paste(np.asarray(result.frames[0].star), group.shape)
 
 
-def model_for(observation: Observation, settings: DiffrenderSettings) -> OpticalSystem:
-    """The model that was given, else NIRCam's coronagraph in the observation's filter.
-
-    For real frames, whose headers say NIRCam, the settings are those of `refinement.presets`.
+def model_of(observation: Observation, settings: DiffrenderSettings) -> OpticalSystem:
+    """The model that was given, else that of the coronagraph in the observation's filter.
 
     Raises
     ------
@@ -241,33 +230,8 @@ def model_for(observation: Observation, settings: DiffrenderSettings) -> Optical
             "filter='F444W' (say) or model=nircam_coronagraph(...) to register, to backend or to "
             "DiffrenderSettings"
         )
-    options: dict[str, Any] = {
-        "fov_pixels": settings.fit_pixels or min(FIT_PIXELS, *extent(observation).shape),
-        "pixelscale": observation.pixelscale,
-    }
-    if _is_nircam(observation) and settings.pixelscale is None:
-        from pyklip_diffrender.instrument.spectrum import filter_throughput
-        from pyklip_diffrender.optics.grid import samples_for_field
-        from pyklip_diffrender.refinement.presets import NIRCAM_MODEL
-
-        options |= NIRCAM_MODEL
-        # What is subtracted covers the whole frame.
-        (ny, nx), (x, y) = extent(observation).shape, options["pixelscale"]
-        shortest = float(filter_throughput(observation.filter)[0][0])
-        while options["npix"] < samples_for_field(max(nx * x, ny * y), shortest):
-            options["npix"] *= 2
-    key = tuple(sorted({**options, **settings.model_options}.items()))
-    try:
-        return _build_once(observation.filter, key)
-    except TypeError:
-        # An option that cannot be a key, such as a spectrum in arrays.
-        return _build(observation.filter, key)
-
-
-def _build(filter_name: str, options: tuple[tuple[str, Any], ...]) -> OpticalSystem:
-    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-
-    return nircam_coronagraph(filter_name, **dict(options))
-
-
-_build_once = lru_cache(maxsize=4)(_build)
+    options = dict(settings.model_options)
+    if settings.pixelscale is not None:
+        options = {"pixelscale": observation.pixelscale, **options}
+    size = settings.fit_pixels or min(FIT_PIXELS, *extent(observation).shape)
+    return model_for(observation, size, **options)

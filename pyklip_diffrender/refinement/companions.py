@@ -18,7 +18,7 @@ from scipy.signal import fftconvolve
 from torch import Tensor
 
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement.misfit import Misfit, State
+from pyklip_diffrender.refinement.objective import Objective, State
 from pyklip_diffrender.scene.objects import Planet
 
 __all__ = ["bright_companions", "standing_out"]
@@ -108,13 +108,13 @@ def bright_companions(
 
 
 def standing_out(
-    misfit: Misfit, state: State, kappa: float, *, most: int, threshold: float
+    misfit: Objective, state: State, kappa: float, *, most: int, threshold: float
 ) -> list[Planet]:
     """Companions that stand out of the first science frame, as they stand in the first frame.
 
     Parameters
     ----------
-    misfit : Misfit
+    misfit : Objective
     state : State
     kappa : float
         Share of the star that the model may miss.

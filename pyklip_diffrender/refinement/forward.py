@@ -16,19 +16,20 @@ from pyklip_diffrender.linear.response import (
     parameter_jacobian,
 )
 from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.refinement.problem import Problem
-from pyklip_diffrender.refinement.unknowns import Unknowns
 
 __all__ = ["Forward", "Point"]
 
 
 @dataclass(frozen=True)
 class Point:
-    """Unknowns and what they render.
+    """FrameLayout and what they render.
 
     Attributes
     ----------
-    unknowns : Unknowns
+    unknowns : FrameLayout
     vector : Tensor
     opd : Tensor, (npix, npix)
         m; complex where the pupil's amplitude is free.
@@ -36,17 +37,20 @@ class Point:
         The star's field at each wavelength, at flux 1.
     image : Tensor, (ny, nx)
         The star at flux 1.
+    light : Tensor, (ny, nx)
+        The star in the data's unit, with the known pattern of the model's error.
     star : Tensor, (ny, nx)
-        Star and background, in the data's unit.
+        The same with the background.
     total : Tensor, (ny, nx)
         With the companions.
     """
 
-    unknowns: Unknowns
+    unknowns: FrameLayout
     vector: Tensor
     opd: Tensor
     fields: list[Tensor]
     image: Tensor
+    light: Tensor
     star: Tensor
     total: Tensor
 
@@ -65,51 +69,51 @@ class Forward:
         self.problem, self.model = problem, problem.model
         self.basis, self.responses = responses.basis, responses
         self.coarse = coarse_copy(problem.model, responses.npix)
-        self.grid = PupilGrid.full(problem.model.npix, problem.model.diameter)
-        # None and not itself: a cycle would keep the responses until the collector comes by.
-        self._given = Forward(problem.given, responses) if problem.given else None
+        self.full_model = problem.full_model or problem.model
+        self._starting_opds = {
+            model.npix: problem.starting_opd(model.npix) for model in (self.model, self.full_model)
+        }
 
-    @property
-    def exact(self) -> Forward:
-        """By the model as given."""
-        return self._given or self
-
-    def opd(self, unknowns: Unknowns, vector: Tensor) -> Tensor:
-        """The wavefront, (npix, npix), m; complex where the pupil's amplitude is free."""
-        opd = self.problem.opd0
+    def opd(self, unknowns: FrameLayout, vector: Tensor, model: OpticalSystem) -> Tensor:
+        """The wavefront on a model's grid, (npix, npix), m; complex if the amplitude is free."""
+        grid = PupilGrid.full(model.npix, model.diameter)
+        opd = self._starting_opds[model.npix]
         coefficients = vector[unknowns.where("modes")]
         if bool((coefficients != 0).any()):
-            change = self.basis.opd(coefficients * NANOMETRE, self.grid)
+            change = self.basis.opd(coefficients * NANOMETRE, grid)
             opd = opd + change.to(self.model.device)
         amplitude = vector[unknowns.where("amplitude")]
         if not len(amplitude):
             return opd
         padded = torch.zeros(len(self.basis), dtype=torch.float64)
         padded[: len(amplitude)] = amplitude
-        absorption = -self.basis.opd(padded * NANOMETRE, self.grid).to(self.model.device)
+        absorption = -self.basis.opd(padded * NANOMETRE, grid).to(self.model.device)
         return torch.complex(opd, absorption)
 
     def coarse_opd(self, point: Point) -> Tensor:
         """The wavefront on the coarse copy's grid."""
         return downsample(point.opd, self.coarse.npix)
 
-    def at(self, unknowns: Unknowns, vector: Tensor) -> Point:
+    def at(self, unknowns: FrameLayout, vector: Tensor) -> Point:
         """Render a point."""
-        values, opd = unknowns.values(vector), self.opd(unknowns, vector)
+        values, opd = unknowns.values(vector), self.opd(unknowns, vector, self.model)
         flux = unknowns.level("flux", vector)
         with torch.no_grad():
             fields = self.model.fields(opd, **values)
             image = self.model.image_of(fields, values).double()
-        star = flux * image + unknowns.level("background", vector)
+        light = flux * self.problem.gain * image
+        star = light + unknowns.level("background", vector)
         total = star
         if unknowns.shows_companions and len(unknowns.companions):
-            whole = opd if self.exact is self else self.exact.opd(unknowns, vector)
+            model = self.full_model
+            full = opd if model.npix == self.model.npix else self.opd(unknowns, vector, model)
             for source in unknowns.sources(vector):
                 there = self._towards(values, unknowns.turn @ source[1:])
-                # Neither by a plan's model nor by the coarse copy: a percent of S/N 1000 is seen.
+                # Neither the plan's model nor the coarse copy will do: an error of a percent shows
+                # for a companion of S/N 1000.
                 with torch.no_grad():
-                    total = total + flux * source[0] * self.exact.model(whole, **there).double()
-        return Point(unknowns, vector, opd, fields, image, star, total)
+                    total = total + flux * source[0] * model(full, **there).double()
+        return Point(unknowns, vector, opd, fields, image, light, star, total)
 
     @staticmethod
     def _towards(values: dict[str, Tensor], offset: Tensor) -> dict[str, Tensor]:
@@ -123,7 +127,7 @@ class Forward:
         """
         unknowns, vector = point.unknowns, point.vector
         values, opd = unknowns.values(vector), self.coarse_opd(point)
-        flux = unknowns.level("flux", vector)
+        flux, gain = unknowns.level("flux", vector), self.problem.gain
         count = unknowns.where("companions").stop
         if modes:
             count = unknowns.where("modes").start + modes
@@ -136,9 +140,9 @@ class Forward:
                 if response is not None
                 else parameter_jacobian(self.coarse, opd, values, unknowns.optical, point.fields)
             )
-            rows[: len(slopes)] = flux * slopes
+            rows[: len(slopes)] = flux * gain * slopes
         if "flux" in unknowns.linear:
-            rows[unknowns.where("flux")] = point.image
+            rows[unknowns.where("flux")] = gain * point.image
         if "background" in unknowns.linear:
             rows[unknowns.where("background")] = 1.0
         companions = unknowns.where("companions")
@@ -157,7 +161,7 @@ class Forward:
             slopes = response.image(point.fields, values, unknowns.amplitude_modes, modes)
             rows[amplitude] = slopes[modes:]
             rows[amplitude.stop :] = slopes[:modes]
-            rows[amplitude.start :] *= flux
+            rows[amplitude.start :] *= flux * gain
         return rows
 
     def _response_at(self, point: Point) -> WavefrontResponse:

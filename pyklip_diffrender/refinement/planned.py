@@ -1,11 +1,11 @@
-"""Refinement by a plan: with the cheap model, then back to the one that was given."""
+"""Refinement with a planned, cheaper model, whose result is put back onto the model as given."""
 
 from __future__ import annotations
 
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,70 +13,60 @@ import numpy as np
 import torch
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.linear.response import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import Error, Plan, plan
-from pyklip_diffrender.refinement.growth import gauss_newton
-from pyklip_diffrender.refinement.options import GaussNewtonOptions
+from pyklip_diffrender.refinement.continuation import (
+    continued,
+    fit_with_growing_basis,
+    warm_start,
+)
 from pyklip_diffrender.refinement.problem import Problem
-from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.scene.objects import Planet
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.wavefront.opd import OPDMap
+from pyklip_diffrender.refinement.result import FrameFit, Refinement
+from pyklip_diffrender.refinement.settings import GaussNewton
 
-__all__ = ["make_plan", "refine_by_plan", "require_plan_for"]
+__all__ = ["fit_problems", "make_plan", "refine_again", "require_plan_for"]
 
 _log = logging.getLogger(__name__)
 
 
-def make_plan(
-    model: OpticalSystem,
-    observations: Sequence[Observation],
-    wavefront: OPDMap,
-    options: GaussNewtonOptions,
-    start: dict[str, Any],
-    seed: int,
-) -> Plan:
-    """A plan for a fit with given settings; what they decide is not up to the plan.
+def make_plan(problems: Sequence[Problem], settings: GaussNewton, seed: int) -> Plan:
+    """Plan the model fidelity of a fit; what the settings decide is left alone.
 
     Parameters
     ----------
-    model : OpticalSystem
-    observations : sequence of Observation
-        To be fitted together. The plan is made for the first that is of the target.
-    wavefront : OPDMap
-    options : GaussNewtonOptions
-    start : dict
-        Of that observation.
+    problems : sequence of Problem
+        To be fitted together. The plan is made for the first that is not of a reference star.
+    settings : GaussNewton
     seed : int
+        Of the wavefronts that the plan draws.
     """
-    cycles = options.cycles or (24.0,)
-    several = len(observations) > 1
+    science = next((p for p in problems if not p.observation.reference), problems[0])
+    cycles = settings.cycles or (24.0,)
     keep: dict[str, Any] = {}
-    fixed = (options.basis, options.drift, options.resume)
-    if any(each is not None for each in fixed) or not options.wavefront or not options.cycles:
+    fixed = settings.basis is not None or settings.drift is not None
+    if fixed or not settings.wavefront or not settings.cycles:
         keep["cycles"] = float(cycles[0])
-    if options.prior.amplitude_scale > 0:
+    if settings.prior.amplitude_scale > 0:
         # The amplitude that the fit finds is a map on the model's own grid.
-        keep["npix"] = model.npix
-    if several:
+        keep["npix"] = science.model.npix
+    if len(problems) > 1:
         # A correction belongs to one position of the star.
         keep["multifidelity"] = False
-    science = [each for each in observations if not each.reference] or list(observations)
     return plan(
-        model,
-        science[0],
-        wavefront,
+        science.model,
+        science.observation,
+        science.initial,
         # What one frame hardly sees, many do.
-        error_budget=0.1 / math.sqrt(len(observations)),
+        error_budget=0.1 / math.sqrt(len(problems)),
         keep=keep,
-        start=start,
+        start=science.start,
         # Another basis has groups of its own, which say nothing about the default modes.
-        prior=options.prior if options.basis is None else None,
+        prior=settings.prior if settings.basis is None else None,
         cycles=cycles,
-        response_npix=options.response_npix,
-        model_error=options.kappa_floor,
+        model_error=settings.min_model_error,
         seed=seed,
     )
 
@@ -88,115 +78,130 @@ def require_plan_for(model: OpticalSystem, planned: Plan) -> None:
     ------
     IncompatibleSetupError
     """
-    given = planned.given
+    other = planned.given
     ours = (model.npix, model.detector.shape, model.bandpass, model.parameters)
-    theirs = (given.npix, given.detector.shape, given.bandpass, given.parameters)
+    theirs = (other.npix, other.detector.shape, other.bandpass, other.parameters)
     if ours != theirs:
         raise IncompatibleSetupError(
-            f"fidelity: the plan was made for {given!r}, the model is {model!r}. Make one for it "
-            "with plan(model, observation, opd)"
+            f"plan: it was made for {other!r}, the model is {model!r}. Make one for it with "
+            "plan(model, observation, opd)"
         )
 
 
-def refine_by_plan(
-    planned: Plan,
+def fit_problems(
     problems: Sequence[Problem],
-    options: GaussNewtonOptions,
+    settings: GaussNewton,
+    planned: Plan | None,
+    warm: Mapping[Unknown, float] | None = None,
     *,
     seed: int,
     progress: bool,
-) -> list[Refinement]:
-    """Refine with the plan's model, and give back results on the model of the problems.
+) -> Refinement:
+    """Refine with the plan's model, if there is a plan; the result is on the problems' model.
 
-    At the end the star is rendered with the given model. If that differs by more than the plan's
-    budget, the fit goes on from there with the model as given.
+    At the end the star is rendered with the problems' model. If that differs by more than the
+    plan's budget, the fit goes on from there with the model as given.
 
     Parameters
     ----------
-    planned : Plan
     problems : sequence of Problem
-        With the model as given.
-    options : GaussNewtonOptions
-        As given: what the plan chooses takes the place of some of it.
+        One for each frame, with the model as given.
+    settings : GaussNewton
+    planned : Plan or None
+        None to fit with the model as given.
+    warm : mapping of Unknown to float, optional
+        Where to start.
     seed : int
     progress : bool
     """
+    if planned is None:
+        return fit_with_growing_basis(problems, settings, warm, seed=seed, progress=progress)
     began = time.perf_counter()
-    informative = None
-    if not planned.informative.all():
-        informative = torch.from_numpy(planned.informative)
-    cheap = [
-        Problem(planned.model, p.observation, p.initial, p.start, informative, p) for p in problems
-    ]
-    chosen = replace(options, response_npix=planned.refine_options["response_npix"])
-    if options.basis is None:
-        chosen = replace(chosen, cycles=planned.refine_options["cycles"])
-    fits = gauss_newton(cheap, chosen, seed=seed, progress=progress)
-    if not fits[0].status.usable:
-        return [replace(fit, plan=planned) for fit in fits]
-    found = [_as_given(fit, p, planned) for fit, p in zip(fits, problems, strict=True)]
-    error = Error.largest(each for _, each in found)
+    cheap = [problem.with_model(planned.model) for problem in problems]
+    chosen = settings
+    if settings.basis is None and warm is None:
+        chosen = replace(settings, cycles=planned.refine_options["cycles"])
+    fit = fit_with_growing_basis(cheap, chosen, warm, seed=seed, progress=progress)
+    if not fit.status.usable:
+        return replace(fit, plan=planned)
+    finished = [_on_full_model(fit, k, each, settings.free) for k, each in enumerate(problems)]
+    error = Error.largest(change for _, change in finished)
     if planned.allows(error):
-        done = replace(planned, final_error=error)
-        seconds = time.perf_counter() - began
-        return [replace(fit, plan=done, seconds=seconds) for fit, _ in found]
+        return replace(
+            fit,
+            frames=tuple(frame for frame, _ in finished),
+            plan=replace(planned, final_error=error),
+            seconds=time.perf_counter() - began,
+        )
     _log.warning(
-        "the plan's star is %.2g sigma (worst pixel %.2g) from that of the given model, more than "
-        "the budget of %.2g: the fit goes on with the model as given",
+        "the planned model's star differs from that of the given model by %.2g sigma (worst pixel "
+        "%.2g), more than the budget of %.2g: the fit goes on with the model as given",
         error.rms,
         error.worst,
         planned.budget,
     )
-    exact = gauss_newton(problems, _going_on(options, fits), seed=seed, progress=progress)
-    done = replace(planned, final_error=error, abandoned=True)
-    seconds = time.perf_counter() - began
-    return [replace(fit, plan=done, seconds=seconds) for fit in exact]
-
-
-def _as_given(fit: Refinement, problem: Problem, planned: Plan) -> tuple[Refinement, Error]:
-    """A cheap fit on the grid of the given model, its star rendered with that, and the change."""
-    model = problem.model
-    opd = fit.opd
-    if planned.model.npix != model.npix:
-        assert fit.coefficients is not None
-        grid = PupilGrid.full(model.npix, model.diameter)
-        change = fit.settings.basis.opd(fit.coefficients.cpu() * NANOMETRE, grid)
-        opd = problem.opd0.cpu().numpy() + change.numpy()
-    given = {n: torch.from_numpy(v) for n, v in fit.values.items() if n in model.parameters}
-    with torch.no_grad():
-        image = model(torch.from_numpy(np.ascontiguousarray(opd)).to(model.device), **given)
-    # Flux and background at which the given model's star comes nearest to the one fitted.
-    before = torch.from_numpy(fit.star_image).to(model.device)
-    free = tuple(name for name in ("flux", "background") if name in fit.settings.free)
-    start = {name: float(fit.values[name][0]) for name in ("flux", "background")}
-    flux, level = problem.flux_and_background(
-        image.double(), problem.sigma, free, data=before, start=start
+    exact = fit_with_growing_basis(
+        problems, continued(fit), warm_start(fit), seed=seed, progress=progress
     )
-    star = flux * image.double() + level
+    return replace(
+        exact,
+        plan=replace(planned, final_error=error, abandoned=True),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _on_full_model(
+    fit: Refinement, k: int, problem: Problem, free: tuple[str, ...]
+) -> tuple[FrameFit, Error]:
+    """One frame of a planned fit on the given model, and by how much its star changes."""
+    frame, model = fit.frames[k], problem.model
+    opd = frame.opd
+    if frame.model.npix != model.npix:
+        assert fit.basis is not None
+        grid = PupilGrid.full(model.npix, model.diameter)
+        coefficients = torch.from_numpy(frame.coefficients)
+        change = fit.basis.opd(coefficients * NANOMETRE, grid)
+        opd = problem.starting_opd(model.npix).cpu().numpy() + change.numpy()
+    values = {n: torch.from_numpy(v) for n, v in frame.values.items() if n in model.parameters}
+    with torch.no_grad():
+        image = model(torch.from_numpy(np.ascontiguousarray(opd)).to(model.device), **values)
+    image = problem.gain * image.double()
+    # Flux and background at which the given model's star comes nearest to the one fitted.
+    before = torch.from_numpy(frame.star).to(model.device)
+    linear = tuple(name for name in ("flux", "background") if name in free)
+    start = {name: float(frame.values[name][0]) for name in ("flux", "background")}
+    flux, level = problem.flux_and_background(
+        image, problem.sigma, linear, data=before, start=start
+    )
+    star = flux * image + level
     away = ((star - before) / problem.sigma)[problem.valid].abs()
     error = Error(float(away.square().mean().sqrt()), float(away.max()))
-    values = {**fit.values, "flux": np.array([flux]), "background": np.array([level])}
-    finished = replace(fit, model=model, opd=opd, star_image=star.cpu().numpy(), values=values)
-    return finished, error
+    fitted = {**frame.values, "flux": np.array([flux]), "background": np.array([level])}
+    return replace(frame, model=model, opd=opd, star=star.cpu().numpy(), values=fitted), error
 
 
-def _going_on(options: GaussNewtonOptions, fits: Sequence[Refinement]) -> GaussNewtonOptions:
-    """The given settings, from where cheap fits ended."""
-    first = fits[0]
-    scales = {name: first.scales[name] for name in options.prior.scales}
-    drift = options.drift
-    if drift is not None and len(fits) > 1:
-        drift = replace(drift, scales={n: first.scales[f"{n} drift"] for n in drift.scales})
-    planets = options.planets
-    if not first.observation.reference:
-        planets = tuple(
-            Planet(max(c, 0.0), math.hypot(x, y), math.degrees(math.atan2(-x, y)))
-            for c, x, y in first.companions.tolist()
-        )
-    return replace(
-        options,
-        prior=replace(options.prior, scales=scales),
-        drift=drift,
-        planets=planets,
-        resume=first.linear,
+def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> Refinement:
+    """Go on from a refinement with other settings.
+
+    Parameters
+    ----------
+    fit : Refinement
+    progress : bool
+        Show progress bars.
+    **changes
+        Fields of `GaussNewton` with other values, such as `companions`.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If the fit is by another method than Gauss-Newton.
+    """
+    settings = continued(fit, **changes)
+    problems = [
+        Problem(frame.model, frame.observation, fit.initial, frame.start, fit.systematics)
+        for frame in fit.frames
+    ]
+    planned = None if fit.plan is None or fit.plan.abandoned else fit.plan
+    return fit_problems(
+        problems, settings, planned, warm_start(fit), seed=fit.seed, progress=progress
     )

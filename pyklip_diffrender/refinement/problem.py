@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
+from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.opd import OPDMap, resample
 
@@ -33,23 +34,24 @@ class Problem:
     ----------
     model : OpticalSystem
     observation : Observation
-        As given.
+        Before the frames are averaged.
     initial : OPDMap
+        Starting wavefront.
     start : dict
         Starting values of optical parameters (numbers in the units of the parameter table, or
         Quantities), and of "flux" and "background" where known.
-    informative : Tensor of bool, (ny, nx), optional
-        Pixels that say something about the wavefront; default all.
-    given : Problem, optional
-        The same with the model as it was given, where a plan has put a cheaper one in its place.
+    systematics : Systematics, optional
+        What is known of the model's error in these pixels.
+    full_model : OpticalSystem, optional
+        The model that a plan has replaced by the cheaper `model`; it renders the companions.
     """
 
     model: OpticalSystem
     observation: Observation
     initial: OPDMap
     start: dict[str, Any] = field(default_factory=dict)
-    informative: Tensor | None = None
-    given: Problem | None = None
+    systematics: Systematics | None = None
+    full_model: OpticalSystem | None = None
 
     def __post_init__(self) -> None:
         if self.observation.shape != self.model.detector.shape:
@@ -68,8 +70,21 @@ class Problem:
         self.valid = torch.from_numpy(combined.valid[0]).to(device)
         if not bool(self.valid.any()):
             raise NoValidPixelsError(f"{self.observation.name}: all pixels are masked")
-        opd = resample(self.initial.data, self.model.npix)
-        self.opd0 = torch.from_numpy(np.ascontiguousarray(opd)).to(device)
+        self.gain = torch.ones_like(self.data)
+        self.gain_error = torch.zeros_like(self.data)
+        if self.systematics is not None:
+            pattern, error = self.systematics.at(self.observation)
+            self.gain = 1 + torch.from_numpy(pattern).to(device)
+            self.gain_error = torch.from_numpy(error).to(device)
+
+    def starting_opd(self, npix: int) -> Tensor:
+        """The starting wavefront on a pupil array of (npix, npix), m."""
+        opd = resample(self.initial.data, npix)
+        return torch.from_numpy(np.ascontiguousarray(opd)).to(self.model.device)
+
+    def with_model(self, model: OpticalSystem) -> Problem:
+        """The same problem for a cheaper model; companions stay with the present one."""
+        return replace(self, model=model, full_model=self.full_model or self.model)
 
     @property
     def pixels(self) -> int:
@@ -78,11 +93,11 @@ class Problem:
 
     def optical_start(self, names: tuple[str, ...]) -> dict[str, Tensor]:
         """Starting values of the named optical parameters and of any given otherwise."""
-        starts = {n: v for n, v in self.start.items() if n in self.model.parameters}
-        for name in names:
-            entry = parameter(name)
-            starts.setdefault(name, np.full(entry.size, entry.default))
-        return self.model.values(starts)
+        starts = self.model.values(
+            {n: v for n, v in self.start.items() if n in self.model.parameters}
+        )
+        missing = [parameter(name) for name in names if name not in starts]
+        return {**starts, **self.model.values({p.name: np.full(p.size, p.start) for p in missing})}
 
     def require_parameters(self, names: Iterable[str], argument: str = "free") -> None:
         """Raise `IncompatibleSetupError` for a name that is no parameter of this problem."""

@@ -103,6 +103,11 @@ class Planet:
     separation: float
     position_angle: float = 0.0
 
+    @classmethod
+    def from_offset(cls, contrast: float, x: float, y: float) -> Planet:
+        """Make a planet at x, y from the star (arcsec, image orientation)."""
+        return cls(contrast, math.hypot(x, y), math.degrees(math.atan2(-x, y)))
+
     @property
     def offset(self) -> tuple[float, float]:
         """x, y relative to the star, arcsec, image orientation."""

@@ -281,6 +281,28 @@ class Observation:
         """Rows and columns of a frame."""
         return self.data.shape[1], self.data.shape[2]
 
+    @property
+    def is_nircam(self) -> bool:
+        """Whether the header says that these are real frames of NIRCam."""
+        return bool(self.header.get("INSTRUME") == "NIRCAM")
+
+    @property
+    def position_angle(self) -> float:
+        """Position angle of the first frame, degrees; 0 where it is not known."""
+        return 0.0 if self.position_angles is None else float(self.position_angles[0])
+
+    def roll_from(self, other: Observation) -> float:
+        """Angle by which the sky is rotated with respect to another observation.
+
+        Returns
+        -------
+        float
+            Degrees, counter-clockwise on the detector; 0 if either has no position angle.
+        """
+        if self.position_angles is None or other.position_angles is None:
+            return 0.0
+        return other.position_angle - self.position_angle
+
     def cutout(self, size: int) -> Observation:
         """The `size` x `size` pixels about the star (whole pixels, so nothing is resampled).
 

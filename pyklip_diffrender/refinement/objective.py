@@ -1,4 +1,4 @@
-"""Points of a fit to one or several frames, and how far they are from the data."""
+"""Chi-squared of a fit to one or several frames."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.refinement.forward import Forward, Point
-from pyklip_diffrender.refinement.joint import Joint
+from pyklip_diffrender.refinement.joint_layout import JointLayout
 
-__all__ = ["Misfit", "State"]
+__all__ = ["Objective", "State"]
 
 
 @dataclass(frozen=True)
 class State:
-    """Unknowns of all frames and what each frame renders.
+    """FrameLayout of all frames and what each frame renders.
 
     Attributes
     ----------
-    joint : Joint
+    joint : JointLayout
     vector : Tensor, (joint unknowns,)
     points : tuple of Point
         One a frame.
     """
 
-    joint: Joint
+    joint: JointLayout
     vector: Tensor
     points: tuple[Point, ...]
 
@@ -37,7 +37,7 @@ class State:
         return self.points[0].unknowns.level("flux", self.points[0].vector)
 
 
-class Misfit:
+class Objective:
     """Compares states with the data of all frames.
 
     Parameters
@@ -53,7 +53,7 @@ class Misfit:
         self.robust = robust
         self.pixels = sum(forward.problem.pixels for forward in self.forwards)
 
-    def at(self, joint: Joint, vector: Tensor) -> State:
+    def at(self, joint: JointLayout, vector: Tensor) -> State:
         """Render all frames."""
         points = tuple(
             forward.at(unknowns, joint.of_frame(k, vector))
@@ -62,8 +62,13 @@ class Misfit:
         return State(joint, vector, points)
 
     def sigma(self, frame: int, point: Point, kappa: float) -> Tensor:
-        """Noise and, in quadrature, the share of the star that the model may miss."""
-        return torch.sqrt(self.forwards[frame].problem.sigma ** 2 + (kappa * point.total) ** 2)
+        """Noise and, in quadrature, the fraction `kappa` of the star that the model may miss."""
+        return torch.sqrt(self.noise(frame, point) ** 2 + (kappa * point.total) ** 2)
+
+    def noise(self, frame: int, point: Point) -> Tensor:
+        """Noise of the data and, in quadrature, the error of the known pattern."""
+        problem = self.forwards[frame].problem
+        return torch.hypot(problem.sigma, problem.gain_error * point.light)
 
     def whitened(self, frame: int, point: Point, sigma: Tensor) -> Tensor:
         """Residual over `sigma`; 0 where masked."""
@@ -81,9 +86,9 @@ class Misfit:
         return residual, weight
 
     def chi2_per_pixel(self, state: State) -> float:
-        """With the observation's own errors."""
+        """Chi-squared per pixel without a model error."""
         total = sum(
-            float((self.whitened(k, point, self.forwards[k].problem.sigma) ** 2).sum())
+            float((self.whitened(k, point, self.noise(k, point)) ** 2).sum())
             for k, point in enumerate(state.points)
         )
         return total / self.pixels
@@ -91,10 +96,11 @@ class Misfit:
     def model_error(self, state: State) -> float:
         """The share kappa of the star that brings chi2 per pixel to 1; 0 if it is there."""
         residuals, noises, stars = [], [], []
-        for forward, point in zip(self.forwards, state.points, strict=True):
-            valid = forward.problem.valid
-            residuals.append((forward.problem.data - point.total)[valid] ** 2)
-            noises.append(forward.problem.sigma[valid] ** 2)
+        for k, point in enumerate(state.points):
+            problem = self.forwards[k].problem
+            valid = problem.valid
+            residuals.append((problem.data - point.total)[valid] ** 2)
+            noises.append(self.noise(k, point)[valid] ** 2)
             stars.append(point.total[valid] ** 2)
         residual, noise, star = torch.cat(residuals), torch.cat(noises), torch.cat(stars)
         if float((residual / noise).mean()) <= 1:

@@ -1,4 +1,4 @@
-"""The vector of a fit's unknowns: which parameter is where, and what is known beforehand."""
+"""Layout of the unknowns of one frame: where each parameter is, and its prior."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from pyklip_diffrender.parameters import FLUX_AND_BACKGROUND, parameter
 from pyklip_diffrender.scene.objects import Planet
 
-__all__ = ["COMPANION_PRIOR", "Unknowns"]
+__all__ = ["COMPANION_PRIOR", "FrameLayout"]
 
 _LINEAR = tuple(p.name for p in FLUX_AND_BACKGROUND)
 
@@ -21,7 +21,7 @@ COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 
 
 @dataclass
-class Unknowns:
+class FrameLayout:
     """Layout of the vector: optical parameters, flux, background, companions, amplitude, wavefront.
 
     Units are those of the parameter table; a companion is (contrast, x, y) with x, y in arcsec
@@ -127,6 +127,6 @@ class Unknowns:
         planets = torch.tensor(COMPANION_PRIOR, dtype=torch.float64).repeat(len(self.companions))
         return torch.cat([*named, planets])
 
-    def with_companions(self, found: Sequence[Planet]) -> Unknowns:
+    def with_companions(self, added: Sequence[Planet]) -> FrameLayout:
         """A layout with more companions."""
-        return replace(self, companions=[*self.companions, *found])
+        return replace(self, companions=[*self.companions, *added])

@@ -9,13 +9,13 @@ from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
 from pyklip_diffrender.linear.model import LinearFrame
-from pyklip_diffrender.refinement.misfit import Misfit, State
+from pyklip_diffrender.refinement.objective import Objective, State
 
-__all__ = ["Linearised", "linearise"]
+__all__ = ["NormalEquations", "linearise"]
 
 
 @dataclass(frozen=True)
-class Linearised:
+class NormalEquations:
     """A state's normal equations, for the unknowns as distances from their starts.
 
     Attributes
@@ -45,12 +45,12 @@ def _self_product(rows: Tensor) -> Tensor:
     return upper + upper.triu(1).T
 
 
-def linearise(misfit: Misfit, state: State, kappa: float, modes: int) -> Linearised:
+def linearise(objective: Objective, state: State, kappa: float, modes: int) -> NormalEquations:
     """Normal equations about a state.
 
     Parameters
     ----------
-    misfit : Misfit
+    objective : Objective
     state : State
     kappa : float
         Share of the star that the model may miss.
@@ -64,29 +64,18 @@ def linearise(misfit: Misfit, state: State, kappa: float, modes: int) -> Lineari
     curvature = torch.zeros(size, size, dtype=torch.float64)
     gradient = torch.zeros(size, dtype=torch.float64)
     frames = []
-    for k, (forward, point) in enumerate(zip(misfit.forwards, state.points, strict=True)):
-        residual, weight = misfit.weighted(k, point, kappa)
+    for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
+        residual, weight = objective.weighted(k, point, kappa)
         rendered = forward.jacobian(point, modes)
         first = point.unknowns.where("modes").start
         rows = joint.rows(k)[: len(rendered)]
         drift = joint.drift_rows(k) if modes else torch.zeros(0, dtype=torch.int64)
-        seen = forward.problem.informative
-        if seen is not None:
-            # Consistently: here the wavefront does nothing, in the fit and for what uses it.
-            wavefront = point.unknowns.where("amplitude").start
-            rendered[wavefront:, ~seen.to(rendered.device)] = 0.0
         left = torch.where(weight > 0, residual / weight.clamp(min=1e-300), 0.0).cpu()
         slopes = rendered.float().cpu()
         frames.append(LinearFrame(left, weight.cpu(), slopes, rows, drift, first))
         whitened = rendered.mul_(weight).flatten(1).cpu()
         pulled = whitened @ residual.flatten().cpu()
-        if seen is None:
-            product = _self_product(whitened)
-        else:
-            inside = seen.flatten().cpu()
-            product = _self_product(whitened[:, inside].contiguous())
-            others = whitened[:wavefront, ~inside].contiguous()
-            product[:wavefront, :wavefront] += others @ others.T
+        product = _self_product(whitened)
         if len(state.points) == 1:
             curvature, gradient = product, pulled
             continue
@@ -96,4 +85,4 @@ def linearise(misfit: Misfit, state: State, kappa: float, modes: int) -> Lineari
             for onto, other in ((rows, slice(None)), (drift, own)):
                 curvature[to[:, None], onto] += product[which, other]
     gradient = gradient + curvature @ current
-    return Linearised(state, kappa, curvature, gradient, current, tuple(frames))
+    return NormalEquations(state, kappa, curvature, gradient, current, tuple(frames))

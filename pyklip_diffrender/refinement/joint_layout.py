@@ -1,32 +1,31 @@
-"""The unknowns of several frames in one vector: which are shared, which every frame has."""
+"""Layout of the joint unknowns of several frames: which are shared, which are a frame's own."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.refinement.unknowns import Unknowns
+from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.scene.objects import Planet
 
-__all__ = ["Joint"]
+__all__ = ["JointLayout"]
 
 
 @dataclass(frozen=True)
-class Joint:
+class JointLayout:
     """Layout of the joint vector.
 
     First what each frame has of its own, frame by frame; then what all share, in the order of
-    `Unknowns`, wavefront modes last; then how each frame's first modes differ from those.
+    `FrameLayout`, wavefront modes last; then how each frame's first modes differ from those.
 
     Attributes
     ----------
-    frames : tuple of Unknowns
+    frames : tuple of FrameLayout
         Alike but for where they start.
     own : tuple of str
         Names of which every frame has its own value.
@@ -34,7 +33,7 @@ class Joint:
         How many modes, the first of the basis, may differ between frames.
     """
 
-    frames: tuple[Unknowns, ...]
+    frames: tuple[FrameLayout, ...]
     own: tuple[str, ...] = ()
     drift: int = 0
 
@@ -116,33 +115,21 @@ class Joint:
         """The starting vector: the mean of the prior."""
         return self.joined([unknowns.initial() for unknowns in self.frames])
 
-    def resumed(self, earlier: LinearModel) -> Tensor:
-        """Where an earlier fit ended, with the present companions.
+    def warm(self, values: Mapping[Unknown, float]) -> Tensor:
+        """The starting vector with what an earlier fit found.
 
         Parameters
         ----------
-        earlier : LinearModel
-            Of the same frames and free parameters; where there is no drift, it may lack the last
-            wavefront modes.
-
-        Raises
-        ------
-        ShapeError
-            If it does not fit.
+        values : mapping of Unknown to float
+            Unknowns that are not part of this layout are ignored, those that it lacks keep their
+            starting values: the basis may have more or fewer modes than the earlier one, as long
+            as both begin with the same. Companions always start where the layout says.
         """
-        joint, companions = self.initial(), self.where("companions")
-        old = sum(name.startswith("companions[") for name in earlier.names)
-        kept = earlier.vector[companions.start + old :]
-        room = self.size - companions.stop
-        if len(kept) > room or (len(kept) < room and self.drift):
-            raise ShapeError(
-                f"resume: got {len(kept)} unknowns behind the companions, expected {room}. The "
-                "free parameters and the frames must be the same, and the basis must begin with "
-                "the same modes"
-            )
-        joint[: companions.start] = earlier.vector[: companions.start]
-        joint[companions.stop : companions.stop + len(kept)] = kept
-        return joint
+        vector = self.initial()
+        for place, unknown in enumerate(self.unknowns()):
+            if unknown.name != "companions" and unknown in values:
+                vector[place] = values[unknown]
+        return vector
 
     def prior_deviation(self) -> Tensor:
         """Prior deviations of everything before the amplitude and the modes."""
@@ -162,24 +149,26 @@ class Joint:
                 vector[places] = vector[places].clamp(entry.lower, entry.upper)
         return vector
 
-    def with_companions(self, found: Sequence[Planet], vector: Tensor) -> tuple[Joint, Tensor]:
+    def with_companions(
+        self, added: Sequence[Planet], vector: Tensor
+    ) -> tuple[JointLayout, Tensor]:
         """A layout with more companions, and the same point in it."""
-        grown = replace(self, frames=tuple(u.with_companions(found) for u in self.frames))
+        grown = replace(self, frames=tuple(u.with_companions(added) for u in self.frames))
         moved = grown.initial()
         before, after = self.where("companions").stop, grown.where("companions").stop
         moved[:before] = vector[:before]
         moved[after:] = vector[before:]
         return grown, moved
 
-    def names(self) -> tuple[str, ...]:
-        """Of all unknowns, in order."""
-        labels = [""] * self.size
-        for frame, unknowns in reversed(list(enumerate(self.frames))):
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """All unknowns, in order."""
+        labels = [Unknown("", 0)] * self.size
+        for frame, layout in reversed(list(enumerate(self.frames))):
             rows = self.rows(frame)
-            for name in (*unknowns.ordered, "companions", "amplitude", "modes"):
-                suffix = f" of frame {frame}" if name in self.own else ""
-                for k, place in enumerate(rows[unknowns.where(name)].tolist()):
-                    labels[place] = f"{name}[{k}]{suffix}"
+            for name in (*layout.ordered, "companions", "amplitude", "modes"):
+                owner = frame if name in self.own else -1
+                for k, place in enumerate(rows[layout.where(name)].tolist()):
+                    labels[place] = Unknown(name, k, owner)
             for k, place in enumerate(self.drift_rows(frame).tolist()):
-                labels[place] = f"drift[{k}] of frame {frame}"
+                labels[place] = Unknown("drift", k, frame)
         return tuple(labels)

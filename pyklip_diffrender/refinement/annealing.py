@@ -1,0 +1,269 @@
+"""The schedule of a fit: alignment first, then the wavefront, while the model error shrinks.
+
+Far from the data, in units of photon noise, undamped steps diverge: the star is bright and its
+noise small. So the noise is taken as sqrt(sigma^2 + (kappa star)^2). The fraction kappa of the
+star that the model is allowed to miss starts as large as the first residual demands, and shrinks
+to nothing, or to what the model cannot explain.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from tqdm import tqdm
+
+from pyklip_diffrender.linear.model import Unknown
+from pyklip_diffrender.refinement.companions import standing_out
+from pyklip_diffrender.refinement.gauss_newton import Solver, count_modes_below
+from pyklip_diffrender.refinement.objective import State
+from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.result import FrameFit, Refinement, Status
+from pyklip_diffrender.refinement.settings import GaussNewton
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.wavefront.bases import Basis
+
+__all__ = ["Annealing"]
+
+_log = logging.getLogger(__name__)
+
+_EXPLAINED = 1.5
+"""Chi-squared per pixel below which the noise is taken to explain the residual."""
+
+_NEGLIGIBLE = 1e-3
+"""Model error, as a fraction of the star, below which annealing ends."""
+
+_COARSE = 0.01
+"""Model error, as a fraction of the star, above which modes to `_FEW_CYCLES` do as well as all."""
+
+_FEW_CYCLES = 14.0
+
+_NEAR = 0.003
+"""Model error below which a companion that a fit finds has bent the wavefront but little.
+
+Planets of 5e-7 to 2e-6 were found at 0.001 to 0.0026; side lobes of one of 1e-4 at 0.3 arcsec, in
+its place, at 0.005 to 0.1.
+"""
+
+_BRIGHT = 8.0
+"""How far a companion must stand out, in units of the scatter, when the wavefront's fit stalls.
+
+Without companions, peaks reached 6 (drifts of 40 to 400 h); companions that stalled a fit, 12.
+"""
+
+_MOST_BRIGHT = 8
+"""Largest number of companions that a fit may add in this way."""
+
+_ALIGNED = 0.05
+"""Gain in chi-squared per pixel below which the alignment is good enough for the wavefront."""
+
+_ANNEALING = 0.6
+"""Factor by which kappa shrinks at least from step to step."""
+
+
+class Annealing:
+    """One fit with a given basis.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        One for each frame.
+    settings : GaussNewton
+    basis : Basis
+    warm : mapping of Unknown to float, optional
+        Where an earlier fit ended. The wavefront is then free from the first step on.
+    progress : bool
+        Show progress bars.
+    """
+
+    def __init__(
+        self,
+        problems: Sequence[Problem],
+        settings: GaussNewton,
+        basis: Basis,
+        warm: Mapping[Unknown, float] | None,
+        progress: bool,
+    ) -> None:
+        self.settings, self.basis, self.progress = settings, basis, progress
+        self.problems = list(problems)
+        self.solver = Solver(problems, settings, basis, progress)
+        self.objective = self.solver.objective
+        self._few = count_modes_below(basis, _FEW_CYCLES)
+        layout = self.solver.first_layout()
+        self._begin = self.objective.at(
+            layout, layout.initial() if warm is None else layout.warm(warm)
+        )
+        self._is_warm = warm is not None
+        self.history: list[dict[str, Any]] = []
+
+    def run(self, seed: int) -> Refinement:
+        """Fit the alignment, then alignment and wavefront; return the best iterate."""
+        began = time.perf_counter()
+        settings, solver, floor = self.settings, self.solver, self.settings.min_model_error
+        state = aligned = best = self._begin
+        best_error = (math.inf, math.inf)
+        first_scales = solver.scales
+        kappa = max(self.objective.model_error(state), floor)
+        modes = 0
+        if settings.wavefront and (not settings.free or self._is_warm):
+            modes = self._modes_for(kappa)
+        status = Status.ITERATION_LIMIT
+        bar = tqdm(total=settings.max_iterations, desc="refine", disable=not self.progress)
+        left = settings.max_iterations
+        while left:
+            left -= 1
+            state, gain = solver.step(state, kappa, modes)
+            needed, chi2 = self.objective.model_error(state), self.objective.chi2_per_pixel(state)
+            if (needed, chi2) < best_error:
+                best, best_error = state, (needed, chi2)
+            self._record(kappa, modes, chi2, needed, gain)
+            bar.update()
+            bar.set_postfix(chi2=f"{chi2:.3g}", kappa=f"{kappa:.2g}")
+            settled = gain < settings.tolerance
+            if not modes:
+                kappa = max(floor, min(kappa, needed))
+                bright = self._standing_out(state, kappa) if gain < _ALIGNED else []
+                if bright:
+                    state = self._with_companions(state, bright)
+                elif gain < _ALIGNED and settings.wavefront:
+                    # What the alignment alone could not follow says nothing about later steps.
+                    aligned, modes, solver.damping = state, self._modes_for(kappa), 0.0
+                elif settled:
+                    status = _status_of(chi2)
+                    break
+                continue
+            stalled = needed > max(kappa, _NEGLIGIBLE)
+            bright = self._stalling(state, needed) if stalled else []
+            if bright:
+                # Near the solution all is linear, and the wavefront gives back what it took.
+                # Where it has bent too far for that, the fit starts again from the alignment.
+                near = needed < _NEAR
+                best = state = self._with_companions(state if near else aligned, bright)
+                best_error, left = (math.inf, math.inf), settings.max_iterations
+                bar.reset()
+                if not near:
+                    solver.scales, solver.damping, modes = first_scales, 0.0, 0
+                    kappa = max(self.objective.model_error(state), floor)
+                continue
+            if settled and kappa <= floor and modes == len(self.basis):
+                status = _status_of(chi2)
+                break
+            kappa = min(_ANNEALING * kappa, needed / 2)
+            if kappa < max(_NEGLIGIBLE, floor):
+                kappa = floor
+            modes = self._modes_for(kappa)
+        bar.close()
+        if best.flux <= 0:
+            status = Status.DIVERGED
+        return self._conclude(best, status, seed, time.perf_counter() - began)
+
+    def _record(self, kappa: float, modes: int, chi2: float, needed: float, gain: float) -> None:
+        record = {
+            "iteration": len(self.history),
+            "wavefront": modes > 0,
+            "kappa": kappa,
+            "chi2_per_pixel": chi2,
+            "model_error": needed,
+            "gain": gain,
+            "damping": self.solver.damping,
+        }
+        self.history.append(record)
+        _log.info("%s, scales %s", record, self.solver.scales.tolist())
+
+    def _modes_for(self, kappa: float) -> int:
+        """Count the modes worth fitting while the model may miss a fraction kappa of the star."""
+        several = len(self.problems) > 1
+        amplitude = len(self.solver.amplitude_deviation) > 0
+        everything = self.settings.min_model_error > 0 or amplitude or several
+        return len(self.basis) if everything or kappa <= _COARSE else self._few
+
+    def _standing_out(self, state: State, kappa: float) -> list[Planet]:
+        """Companions that stand out of the residual of the alignment fit."""
+        known = len(state.joint.frames[0].companions)
+        return standing_out(
+            self.objective,
+            state,
+            kappa,
+            most=self.settings.max_companions - known,
+            threshold=self.settings.companion_threshold,
+        )
+
+    def _stalling(self, state: State, kappa: float) -> list[Planet]:
+        """The companion that keeps the wavefront's fit from converging, if there is one."""
+        known = len(state.joint.frames[0].companions)
+        if self.settings.min_model_error > 0:
+            return []  # The model error that is allowed for may be all that stands out.
+        if known >= self.settings.max_companions + _MOST_BRIGHT:
+            return []
+        # One at a time: the side lobes of a bright one stand out as well.
+        return standing_out(self.objective, state, kappa, most=1, threshold=_BRIGHT)
+
+    def _with_companions(self, state: State, added: Sequence[Planet]) -> State:
+        _log.info("companions given parameters of their own: %s", added)
+        return self.objective.at(*state.joint.with_companions(added, state.vector))
+
+    def _conclude(self, state: State, status: Status, seed: int, seconds: float) -> Refinement:
+        """Errors at the end, and the result in the form that users see."""
+        chi2 = self.objective.chi2_per_pixel(state)
+        kappa = 0.0 if chi2 < _EXPLAINED else self.objective.model_error(state)
+        modes = len(self.basis) if self.settings.wavefront else 0
+        linear, update = self.solver.linear_model(state, kappa, modes)
+        assert update.variance is not None
+        deviation = update.variance.sqrt()
+        if status is Status.CONVERGED and not self.solver.prior_holds(update):
+            status = Status.PRIOR_MISMATCH
+        frames = []
+        for k, (problem, point) in enumerate(zip(self.problems, state.points, strict=True)):
+            layout = point.unknowns
+            own = deviation[state.joint.rows(k)[: len(linear.frames[k].rows)]]
+            values = {n: v.cpu().numpy() for n, v in layout.values(point.vector).items()}
+            for name in ("flux", "background"):
+                values[name] = layout.start[name].numpy()
+            errors = {name: math.nan * value for name, value in values.items()}
+            for name in layout.ordered:
+                values[name] = point.vector[layout.where(name)].numpy()
+                errors[name] = own[layout.where(name)].numpy()
+            frames.append(
+                FrameFit(
+                    model=problem.model,
+                    observation=problem.observation,
+                    start=problem.start,
+                    opd=point.opd.cpu().numpy(),
+                    star=point.star.cpu().numpy(),
+                    companion_image=(point.total - point.star).cpu().numpy(),
+                    values=values,
+                    errors=errors,
+                    gain=problem.gain.cpu().numpy(),
+                    coefficients=point.vector[layout.where("modes")].numpy(),
+                )
+            )
+        first = state.points[0]
+        sources = first.unknowns.where("companions")
+        rows = state.joint.rows(0)[sources]
+        return Refinement(
+            frames=tuple(frames),
+            initial=self.problems[0].initial,
+            settings=self.settings,
+            basis=self.basis,
+            status=status,
+            chi2_per_pixel=chi2,
+            model_error=kappa,
+            companions=first.unknowns.sources(first.vector).numpy(),
+            companion_errors=deviation[rows].reshape(-1, 3).numpy(),
+            scales=dict(zip(self.solver.scale_names, self.solver.scales.tolist(), strict=True)),
+            effective_parameters=update.effective,
+            log_evidence=update.log_evidence,
+            linear=linear,
+            systematics=self.problems[0].systematics,
+            history=self.history,
+            seconds=seconds,
+            seed=seed,
+        )
+
+
+def _status_of(chi2: float) -> Status:
+    """How a fit that has settled ended."""
+    return Status.CONVERGED if chi2 < _EXPLAINED else Status.MODEL_MISMATCH

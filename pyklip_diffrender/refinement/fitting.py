@@ -1,0 +1,170 @@
+"""`refine`: from frames and a wavefront map to the star in the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pyklip_diffrender.errors import (
+    IncompatibleSetupError,
+    MissingOPDError,
+    NoValidPixelsError,
+    ShapeError,
+)
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.planning import Plan
+from pyklip_diffrender.refinement.adam import adam
+from pyklip_diffrender.refinement.planned import fit_problems, make_plan, require_plan_for
+from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.result import Refinement
+from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
+from pyklip_diffrender.refinement.systematics import Systematics
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import as_opd_map
+
+__all__ = ["refine"]
+
+Start = Mapping[str, Any]
+
+
+def refine(
+    model: OpticalSystem,
+    observation: Observation | Sequence[Observation],
+    opd: Any,
+    *,
+    settings: GaussNewton | Adam | None = None,
+    start: Start | Sequence[Start] | None = None,
+    systematics: Systematics | None = None,
+    plan: Plan | str = "auto",
+    seed: int = 0,
+    progress: bool = False,
+) -> Refinement:
+    """Refine an outdated wavefront until the rendered star matches the data.
+
+    Parameters
+    ----------
+    model : OpticalSystem
+        Its detector must have the shape of the observations.
+    observation : Observation or sequence of Observation
+        The frames of one observation see the same star through the same wavefront and are
+        averaged. Several observations (rolls, dithers, a reference star) are fitted together:
+        each has its own star position, flux and background (`GaussNewton.own`), their wavefront
+        is shared, or differs by as much as `GaussNewton.drift` allows, and companions rotate with
+        the position angle.
+    opd : path, OPDMap, Quantity or array
+        The wavefront to start from, entrance-pupil orientation; bare arrays in metres. It is
+        resampled to the model's pupil.
+    settings : GaussNewton or Adam, optional
+        Default `GaussNewton.nircam()` for frames whose header says NIRCam, else `GaussNewton()`.
+    start : dict or sequence of dict, optional
+        Starting values by parameter name, for all observations or one by one. "detector_shift"
+        follows from the observation's star position unless it is given.
+    systematics : Systematics, optional
+        What is known of the model's error, see `learn_systematics`.
+    plan : "auto", "off" or Plan
+        "auto" first finds out, with `pyklip_diffrender.plan`, what can be made cheaper without a
+        visible error; a plan that was made before is used as it is; "off" fits with the model as
+        given. Either way the result is on the model as given. A basis of the settings' own, or
+        none, switches "auto" off.
+    seed : int
+        Of the wavefronts that a plan draws; the fit itself is deterministic.
+    progress : bool
+        Show progress bars.
+
+    Returns
+    -------
+    Refinement
+        The best iterate; check its `status`.
+
+    Raises
+    ------
+    MissingOPDError
+        If `opd` is None.
+    IncompatibleSetupError
+        For settings, a plan or systematics that do not fit the model and the observations.
+    ShapeError, UnitError, NonFiniteError, NoValidPixelsError, CorruptFileError
+        As their names say.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> frames = dr.simulate(model, dr.Scene(), opd + dr.drift(opd, 3.0, seed=2), seed=3)
+    >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=8))
+    >>> fit.status.name
+    'CONVERGED'
+    """
+    if opd is None:
+        raise MissingOPDError(
+            "refine needs a wavefront to start from: a path to an OPD map, an array in metres, "
+            "or random_opd(seed) to try things out"
+        )
+    if not isinstance(model, OpticalSystem):
+        raise IncompatibleSetupError(
+            f"model: got a {type(model).__name__}, expected an OpticalSystem. The order of the "
+            "arguments is refine(model, observation, opd)"
+        )
+    observations = [observation] if isinstance(observation, Observation) else list(observation)
+    if not observations:
+        raise NoValidPixelsError("observation: got an empty sequence, expected at least one")
+    chosen = settings_for(observations[0]) if settings is None else settings
+    if not isinstance(chosen, GaussNewton | Adam):
+        raise IncompatibleSetupError(
+            f"settings: got a {type(chosen).__name__}, expected GaussNewton or Adam"
+        )
+    wavefront = as_opd_map(opd)
+    problems = [
+        Problem(model, each, wavefront, _with_position(model, each, begin), systematics)
+        for each, begin in zip(observations, _one_by_one(start, len(observations)), strict=True)
+    ]
+    if isinstance(chosen, Adam):
+        if len(problems) > 1:
+            raise IncompatibleSetupError(
+                f"settings: Adam takes one observation, got {len(problems)}; several are fitted "
+                "together by GaussNewton"
+            )
+        if isinstance(plan, Plan):
+            raise IncompatibleSetupError(
+                'plan: the Adam recipe uses the model as given; pass plan="off"'
+            )
+        return adam(problems[0], chosen, seed=seed, progress=progress)
+    planned = _plan(plan, problems, chosen, seed)
+    return fit_problems(problems, chosen, planned, seed=seed, progress=progress)
+
+
+def _plan(
+    plan: Plan | str, problems: Sequence[Problem], settings: GaussNewton, seed: int
+) -> Plan | None:
+    """The plan to follow; None for the model as given."""
+    if isinstance(plan, Plan):
+        require_plan_for(problems[0].model, plan)
+        return plan
+    if plan not in ("auto", "off"):
+        raise IncompatibleSetupError(f"plan: got {plan!r}, expected 'auto', 'off' or a Plan")
+    # A basis of their own, or none, says how fine a fit is meant to be.
+    if plan == "off" or settings.basis is not None or not settings.wavefront:
+        return None
+    return make_plan(problems, settings, seed)
+
+
+def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start]:
+    if start is None or isinstance(start, Mapping):
+        return [start or {}] * count
+    if len(start) != count:
+        raise ShapeError(
+            f"start: got {len(start)} dicts for {count} observations, expected one for each or "
+            "one for all"
+        )
+    return list(start)
+
+
+def _with_position(model: OpticalSystem, observation: Observation, start: Start) -> dict[str, Any]:
+    """Starting values, with the star's position on the detector if the observation has one."""
+    ny, nx = observation.shape
+    away = observation.center[0] - np.array([(nx - 1) / 2, (ny - 1) / 2])
+    if "detector_shift" in start or np.abs(away).max() <= 1e-9:
+        return dict(start)
+    return {**start, "detector_shift": away * np.array(model.detector.pixelscale)}

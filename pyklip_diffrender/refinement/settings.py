@@ -1,0 +1,191 @@
+"""Settings of the refinement methods, and presets for real frames."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.bases import Basis
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
+
+__all__ = ["Adam", "GaussNewton", "settings_for"]
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """Settings of the default method: damped Gauss-Newton on wavefront modes with a prior.
+
+    Attributes
+    ----------
+    free : tuple of str
+        Free parameters besides the wavefront, from the parameter table.
+    own : tuple of str
+        Free parameters of which every frame has a value of its own when several frames are fitted
+        together; the others are shared.
+    wavefront : bool
+        Fit the wavefront; False fits the alignment only.
+    cycles : tuple of float
+        Highest spatial frequencies of the default basis, in cycles across the pupil. The first
+        one is fitted; the next one is tried while the data are not explained.
+    basis : Basis, optional
+        Wavefront modes, in place of the default basis (segment motions and Fourier modes).
+    prior : WavefrontPrior
+        Prior on the wavefront's change from the starting map.
+    drift : WavefrontPrior, optional
+        Prior on the difference between the wavefronts of several frames. By default all frames
+        share one wavefront.
+    drift_cycles : float
+        Highest spatial frequency of such differences.
+    companions : tuple of Planet
+        Companions with free contrast and position from the start; positions relative to the star,
+        in the orientation of the first frame.
+    max_companions : int
+        Largest number of companions that the fit may add by itself, if they stand out of the
+        residual of the alignment fit.
+    companion_threshold : float
+        How far such companions must stand out, in units of the matched filter's scatter.
+    response_npix : int
+        Pupil samples of the coarse copy of the model that computes derivatives.
+    max_iterations : int
+    tolerance : float
+        The fit has converged when a step lowers the penalised chi-squared per pixel by less.
+    min_model_error : float
+        Smallest error of the star model that is assumed, as a fraction of the star's light in a
+        pixel. It is added in quadrature to the noise.
+    relinearise : float
+        Relative change of the pupil field (rms; radians for a phase) beyond which the response to
+        the wavefront is recomputed, see `pyklip_diffrender.linear.response.Responses`.
+    robust : float
+        Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain
+        least squares.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For a value outside its range.
+
+    Examples
+    --------
+    >>> from pyklip_diffrender import GaussNewton
+    >>> GaussNewton(cycles=16).cycles
+    (16.0,)
+    """
+
+    free: tuple[str, ...] = ("star_offset", "lyot_shift", "lyot_rotation", "flux", "background")
+    own: tuple[str, ...] = ("star_offset", "flux", "background")
+    wavefront: bool = True
+    cycles: tuple[float, ...] = (24.0, 32.0)
+    basis: Basis | None = None
+    prior: WavefrontPrior = field(default_factory=WavefrontPrior)
+    drift: WavefrontPrior | None = None
+    drift_cycles: float = 8.0
+    companions: tuple[Planet, ...] = ()
+    max_companions: int = 0
+    companion_threshold: float = 4.0
+    response_npix: int = 128
+    max_iterations: int = 40
+    tolerance: float = 1e-3
+    min_model_error: float = 0.0
+    relinearise: float = 0.05
+    robust: float = math.inf
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cycles", tuple(np.atleast_1d(self.cycles).astype(float).tolist()))
+        for name in ("free", "own"):
+            value = getattr(self, name)
+            if isinstance(value, str):
+                raise IncompatibleSetupError(
+                    f"{name}: got the text {value!r}, expected a tuple of names such as "
+                    f"({value!r},)"
+                )
+            object.__setattr__(self, name, tuple(value))
+        object.__setattr__(self, "companions", tuple(self.companions))
+        if not self.cycles and self.basis is None and self.wavefront:
+            raise IncompatibleSetupError("cycles: got none, expected at least one, such as 24")
+        if any(each <= 0 for each in self.cycles):
+            raise IncompatibleSetupError(f"cycles: got {self.cycles}, expected positive numbers")
+        for name in ("max_iterations", "tolerance", "robust", "relinearise", "response_npix"):
+            if not getattr(self, name) > 0:
+                raise IncompatibleSetupError(
+                    f"{name}: got {getattr(self, name)}, expected a positive number"
+                )
+        for name in ("min_model_error", "max_companions"):
+            if getattr(self, name) < 0:
+                raise IncompatibleSetupError(
+                    f"{name}: got {getattr(self, name)}, expected 0 or more"
+                )
+        if not self.free and not self.wavefront:
+            raise IncompatibleSetupError("free is empty and wavefront is False: nothing to fit")
+
+    @classmethod
+    def nircam(cls, **changes: Any) -> GaussNewton:
+        """Return the settings for real NIRCam frames, where the model is not the telescope.
+
+        The prior is wide and its scales are held, the pupil's amplitude is free as well, a
+        percent of the star stays as model error, outliers lose their weight, and one companion
+        that stands out of the alignment fit gets parameters of its own. The documentation's page
+        on real frames says what each of these buys.
+
+        Parameters
+        ----------
+        **changes
+            Fields with other values.
+        """
+        preset = cls(
+            free=(
+                "star_offset",
+                "lyot_shift",
+                "lyot_rotation",
+                "detector_shift",
+                "blur",
+                "si_zernikes",
+                "flux",
+                "background",
+            ),
+            own=("star_offset", "detector_shift", "flux", "background"),
+            prior=WavefrontPrior(
+                scales={"segment": 20.0, "texture": 18.0},
+                knee=1.0,
+                slope=1.0,
+                fit_scales=False,
+                amplitude_cycles=24.0,
+                amplitude_scale=3.2,
+                amplitude_slope=0.5,
+            ),
+            max_companions=1,
+            companion_threshold=3.0,
+            robust=3.0,
+            min_model_error=0.01,
+            max_iterations=40,
+            relinearise=0.3,
+            tolerance=5e-4,
+        )
+        return replace(preset, **changes)
+
+
+@dataclass(frozen=True)
+class Adam:
+    """The recipe of Feng et al. 2025, section IV: mean absolute error, every OPD pixel free.
+
+    Star offset and alignment are held at their starting values.
+
+    Attributes
+    ----------
+    iterations : int
+    learning_rate : float
+        m.
+    """
+
+    iterations: int = 1000
+    learning_rate: float = 1e-11
+
+
+def settings_for(observation: Observation) -> GaussNewton:
+    """Return the default settings for an observation: the NIRCam preset for real NIRCam frames."""
+    return GaussNewton.nircam() if observation.is_nircam else GaussNewton()

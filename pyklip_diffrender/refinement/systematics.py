@@ -1,0 +1,96 @@
+"""What is known of the error of the star model, pixel by pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["Systematics"]
+
+
+@dataclass(frozen=True, eq=False)
+class Systematics:
+    """A multiplicative pattern that the star model misses, with its uncertainty.
+
+    What no wavefront explains in the image of one star is largely the same fraction of the light
+    in the image of another, on the same pixels. The star in pixel p is taken to be
+    ``model_p * (1 + m_p)``, where m_p is Gaussian with mean `pattern` and standard deviation
+    `error`. Light of companions is not multiplied: nothing of it can be mistaken for the pattern.
+
+    Attributes
+    ----------
+    pattern : ndarray, (ny, nx)
+        Residual over star.
+    error : ndarray, (ny, nx)
+        Its standard deviation.
+    center : tuple of float
+        x, y of the star in the pattern, 0-indexed pixels.
+    unknown : float
+        Standard deviation of the pattern where it has not been measured.
+    filter, image_mask : str or None
+        Set-up that it is for; None where it is not known.
+    name : str
+        Short label for headers.
+    provenance : dict
+        Frames it was learned from, and how.
+    """
+
+    pattern: NDArray[np.float64]
+    error: NDArray[np.float64]
+    center: tuple[float, float]
+    unknown: float
+    filter: str | None = None
+    image_mask: str | None = None
+    name: str = "systematics"
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.pattern.ndim != 2 or self.pattern.shape != self.error.shape:
+            raise ShapeError(
+                f"pattern and error: got shapes {self.pattern.shape} and {self.error.shape}, "
+                "expected two equal shapes (ny, nx)"
+            )
+
+    def __repr__(self) -> str:
+        ny, nx = self.pattern.shape
+        return f"<Systematics {self.name!r}: {self.filter}, {nx} x {ny} pixels>"
+
+    def at(self, observation: Observation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the pattern and its error on the pixels of an observation.
+
+        The pixels are matched by the position of the star, to the nearest whole pixel.
+
+        Returns
+        -------
+        pattern, error : ndarray, (ny, nx)
+            Where nothing was measured the pattern is 0 and its error `unknown`.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If the observation was taken through another filter.
+        """
+        if None not in (self.filter, observation.filter) and self.filter != observation.filter:
+            raise IncompatibleSetupError(
+                f"{observation.name}: these frames were taken through {observation.filter}, the "
+                f"systematics {self.name!r} were learned in {self.filter}"
+            )
+        pattern = np.zeros(observation.shape)
+        error = np.full(observation.shape, self.unknown)
+        x, y = np.round(observation.center[0] - self.center).astype(int)
+        (ny, nx), (height, width) = observation.shape, self.pattern.shape
+        # Overlap of the pattern, moved by (x, y), with the observation's array.
+        rows, columns = slice(max(y, 0), min(y + height, ny)), slice(max(x, 0), min(x + width, nx))
+        own = (
+            slice(rows.start - y, max(rows.stop, rows.start) - y),
+            slice(columns.start - x, max(columns.stop, columns.start) - x),
+        )
+        pattern[rows, columns] = self.pattern[own]
+        error[rows, columns] = self.error[own]
+        return pattern, error
