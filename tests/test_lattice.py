@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from pyklip_diffrender import route
+from pyklip_diffrender.optics.fast import path as route
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.instrument.nircam import SIAF_PIXELSCALE, SIAF_SHEAR, nircam_coronagraph
 from pyklip_diffrender.optics.fast.point_sources import PointSources

@@ -64,8 +64,7 @@ class LatticeRoute:
         behind = planes[self._place + 1 :]
         self._moving = {name for plane in behind for name in plane.parameters}
         self._lattices: dict[float, OcculterLattice] = {}
-        self._stops: dict[float, Wavefront] = {}
-        self._kernels: dict[float, Tensor] = {}
+        self._kept: dict[float, tuple[Any, Wavefront, Tensor]] = {}
         self._stars: dict[float, _StreamedStar] = {}
         self._stream: PupilStream | None = None
 
@@ -104,25 +103,42 @@ class LatticeRoute:
             )
         return self._lattices[wavelength]
 
+    def _behind(
+        self, onto: Sequence[PupilGrid], wavelength: float, values: Values
+    ) -> tuple[Wavefront, Tensor]:
+        """The planes behind the occulter as one stop, and the kernel that goes with it.
+
+        Both are kept for the values that they were last computed with: the response to thousands
+        of modes asks for them again and again.
+        """
+        moving = {n: v for n, v in values.items() if n in self._moving or n == "detector_shift"}
+        key = None
+        if all(is_plain(value) for value in moving.values()):
+            own = tuple((name, tuple(value.flatten().tolist())) for name, value in moving.items())
+            key = (onto[self._place], own)
+            kept = self._kept.get(wavelength)
+            if kept is not None and kept[0] == key:
+                return kept[1], kept[2]
+        stop = self._stop(onto, wavelength, values)
+        kernel = self.lattice(wavelength).kernel(stop, self.detector.axes({}))
+        if key is not None:
+            self._kept[wavelength] = (key, stop, kernel)
+        return stop, kernel
+
     def _stop(self, onto: Sequence[PupilGrid], wavelength: float, values: Values) -> Wavefront:
         """What the planes behind the occulter make of a field of ones.
 
         A shift of the detector is a tilt there, so that the rest does not see it.
         """
-        moves = not self._moving.isdisjoint(values)
-        stop = None if moves else self._stops.get(wavelength)
-        if stop is None:
-            grid = onto[self._place]
-            ones = torch.ones(
-                grid.shape, dtype=self.detector.dtype.to_complex(), device=self.detector.device
-            )
-            stop = Wavefront(ones, wavelength, grid)
-            for plane, window in zip(
-                self.planes[self._place + 1 :], onto[self._place + 1 :], strict=True
-            ):
-                stop = plane.apply(stop, values, window)
-            if not moves:
-                self._stops[wavelength] = stop
+        grid = onto[self._place]
+        ones = torch.ones(
+            grid.shape, dtype=self.detector.dtype.to_complex(), device=self.detector.device
+        )
+        stop = Wavefront(ones, wavelength, grid)
+        for plane, window in zip(
+            self.planes[self._place + 1 :], onto[self._place + 1 :], strict=True
+        ):
+            stop = plane.apply(stop, values, window)
         if "detector_shift" not in values:
             return stop
         x, y = values["detector_shift"].unbind(-1)
@@ -132,15 +148,6 @@ class LatticeRoute:
             for phase in tilt_phases(shift, stop.grid, wavelength)
         ]
         return replace(stop, field=stop.field * factors[0][None, :] * factors[1][:, None])
-
-    def _kernel(self, stop: Wavefront, values: Values) -> Tensor:
-        moves = not {*self._moving, "detector_shift"}.isdisjoint(values)
-        kernel = None if moves else self._kernels.get(stop.wavelength)
-        if kernel is None:
-            kernel = self.lattice(stop.wavelength).kernel(stop, self.detector.axes({}))
-            if not moves:
-                self._kernels[stop.wavelength] = kernel
-        return kernel
 
     def field(self, wavefront: Wavefront, values: Values, onto: Sequence[PupilGrid]) -> Tensor:
         """Field on the detector's samples from that behind the entrance pupil.
@@ -155,11 +162,11 @@ class LatticeRoute:
         for plane, window in zip(self.planes[: self._place], onto, strict=False):
             wavefront = plane.apply(wavefront, values, window)
         lattice = self.lattice(wavefront.wavelength)
-        stop = self._stop(onto, wavefront.wavelength, values)
+        stop, kernel = self._behind(onto, wavefront.wavelength, values)
         passed = wavefront.grid.crop(wavefront.field, stop.grid) * stop.field
         direct = self.detector.field(replace(stop, field=passed), {})
         light = lattice.focus(wavefront) * lattice.blocked
-        return direct - lattice.convolve(light, self._kernel(stop, values))
+        return direct - lattice.convolve(light, kernel)
 
     def star(
         self,
@@ -216,7 +223,7 @@ class LatticeRoute:
             if self._stream is None:
                 self._stream = PupilStream(entrance.amplitude, entrance.grid)
             lattice = self.lattice(wavelength)
-            stop = self._stop(onto, wavelength, values)
+            stop, kernel = self._behind(onto, wavelength, values)
             cells = lattice.x.positions, lattice.y.positions
             branches = [
                 Branch(grid, factor, *axes, wavelength, self.detector.dtype, lattice.shear)
@@ -229,7 +236,7 @@ class LatticeRoute:
                 self._stream,
                 branches,
                 lattice,
-                self._kernel(stop, values),
+                kernel,
                 self.detector.per_sample,
             )
         return self._stars[wavelength]
