@@ -103,10 +103,12 @@ class WavefrontResponse:
         Other parameters whose derivatives are kept as well.
     npix : int
         Pupil samples of the coarse copy that does the propagations.
+    wavelengths : int
+        Largest number of wavelengths at which derivatives are computed.
     memory_limit : float
         Bytes that may be kept.
     progress : bool
-        Show a bar.
+        Show a progress bar.
 
     Raises
     ------
@@ -123,27 +125,28 @@ class WavefrontResponse:
         *,
         names: tuple[str, ...] = (),
         npix: int = 128,
+        wavelengths: int = 4,
         memory_limit: float = 4e9,
         progress: bool = False,
     ) -> None:
         self.model, self.names = model, names
-        coarse = coarse_copy(model, npix)
+        self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
+        coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
         self.coarse = coarse
         ny, nx = (n * model.detector.oversample for n in model.detector.shape)
-        wavelengths = model.bandpass.wavelengths
-        size = 8.0 * len(basis) * ny * nx * len(wavelengths)
+        size = 8.0 * len(basis) * ny * nx * len(bandpass.wavelengths)
         if size > memory_limit:
             raise IncompatibleSetupError(
                 f"the response of {len(basis)} modes on {ny} x {nx} samples at "
-                f"{len(wavelengths)} wavelengths takes {size / 1e9:.1f} GB, more than the limit "
-                f"of {memory_limit / 1e9:.1f} GB. Fit a smaller field, fewer wavelengths or "
-                "fewer modes, or raise the limit"
+                f"{len(bandpass.wavelengths)} wavelengths takes {size / 1e9:.1f} GB, more than "
+                f"the limit of {memory_limit / 1e9:.1f} GB. Fit a smaller field, fewer wavelengths "
+                "or fewer modes, or raise the limit"
             )
         self.size = size
         """Bytes that are kept."""
         self.fields = [
             torch.empty(len(basis), ny, nx, dtype=torch.complex64, device=model.device)
-            for _ in wavelengths
+            for _ in bandpass.wavelengths
         ]
         full = PupilGrid.full(coarse.npix, coarse.diameter)
         window = coarse.entrance.grid
@@ -151,7 +154,7 @@ class WavefrontResponse:
         batch = max(1, int(_BATCH_BYTES / (complex_bytes * math.prod(window.shape)) / 2))
         with torch.no_grad():
             small = downsample(opd, coarse.npix)
-            pupils = [coarse.pupil_field(small, wavelength, values) for wavelength in wavelengths]
+            pupils = [coarse.pupil_field(small, w, values) for w in bandpass.wavelengths]
             for start in tqdm(
                 range(0, len(basis), batch), desc="response", unit="batch", disable=not progress
             ):
@@ -199,7 +202,7 @@ class WavefrontResponse:
         total = torch.zeros(shape, device=self.model.device)
         conjugates = [
             (2 * weight) * field.to(torch.complex64).conj()
-            for field, weight in zip(fields, self.model.bandpass.weights, strict=True)
+            for field, weight in zip(self._kept(fields), self.coarse.bandpass.weights, strict=True)
         ]
         # In pieces that stay in the processor's cache: the whole product is never held.
         for start in range(0, max(modes, amplitude_modes), _PIECE):
@@ -213,7 +216,11 @@ class WavefrontResponse:
 
     def parameters(self, fields: Sequence[Tensor], values: dict[str, Tensor]) -> Tensor:
         """Derivative of the image with respect to the other parameters, (components, ny, nx)."""
-        return image_derivatives(self.model, fields, values, self.names, self._slopes)
+        return image_derivatives(self.coarse, self._kept(fields), values, self.names, self._slopes)
+
+    def _kept(self, fields: Sequence[Tensor]) -> list[Tensor]:
+        """The star's fields at the wavelengths of the response."""
+        return [fields[k] for k in self._kept_wavelengths]
 
 
 _OPENINGS = 20.0
@@ -230,13 +237,18 @@ class Responses:
     basis : Basis
     npix : int
         Pupil samples of the coarse copy that does the propagations.
+    wavelengths : int
+        Largest number of wavelengths at which derivatives are computed.
     relinearise : float
         Relative change of the field (radians, for a phase), rms over the pupil, beyond which the
         response is computed anew. A response from 0.2 away (a star 15 mas off) halves the error
         that a fit states for the star's position and moves it by four of those errors.
+    keep : int
+        Number of responses that are kept: one for each frame, as their stars differ in position.
     memory_limit : float
-        Bytes that may be kept.
+        Bytes that one response may take.
     progress : bool
+        Show progress bars.
     """
 
     def __init__(
@@ -245,13 +257,45 @@ class Responses:
         basis: Basis,
         *,
         npix: int = 128,
+        wavelengths: int = 4,
         relinearise: float = 0.05,
+        keep: int = 1,
         memory_limit: float = 4e9,
         progress: bool = False,
     ) -> None:
-        self.model, self.basis, self.npix = model, basis, npix
+        self.keep = keep
+        self.model, self.basis, self.npix, self.wavelengths = model, basis, npix, wavelengths
         self.relinearise, self.memory_limit, self.progress = relinearise, memory_limit, progress
         self._kept: list[tuple[Tensor, dict[str, Tensor], WavefrontResponse]] = []
+        self._slopes: tuple[Tensor, dict[str, Tensor], dict[str, list[Tensor]]] | None = None
+        self._coarse = coarse_copy(model, npix)
+
+    def parameters(
+        self,
+        opd: Tensor,
+        values: dict[str, Tensor],
+        names: tuple[str, ...],
+        fields: Sequence[Tensor],
+    ) -> Tensor:
+        """Derivative of the image with respect to named parameters, (components, ny, nx).
+
+        Parameters
+        ----------
+        opd : Tensor, (npix, npix)
+            On the model's grid, m.
+        values : dict of Tensor
+        names : tuple of str
+        fields : sequence of Tensor
+            The star's field at each wavelength. Derivatives of the field are used again where it
+            differs little.
+        """
+        inside = opd[self.model.entrance.lit]
+        kept = self._slopes
+        if kept is None or self._change(inside - kept[0], values, kept[1]) > self.relinearise:
+            coarse = downsample(opd, self._coarse.npix)
+            slopes = field_derivatives(self._coarse, coarse, values, names)
+            kept = self._slopes = (inside, dict(values), slopes)
+        return image_derivatives(self._coarse, fields, values, names, kept[2])
 
     def near(
         self, opd: Tensor, values: dict[str, Tensor], names: tuple[str, ...] = ()
@@ -261,10 +305,8 @@ class Responses:
         for there, then, response in reversed(self._kept):
             if self._change(inside - there, values, then) <= self.relinearise:
                 return response
-        # Room first, for the new one may take as much memory as the old.
-        size = max((response.size for _, _, response in self._kept), default=0.0)
-        while self._kept and (len(self._kept) + 1) * size > self.memory_limit:
-            del self._kept[0]
+        # Room first, for the new one takes as much memory as the old.
+        del self._kept[: max(0, len(self._kept) + 1 - self.keep)]
         response = WavefrontResponse(
             self.model,
             self.basis,
@@ -272,6 +314,7 @@ class Responses:
             values,
             names=names,
             npix=self.npix,
+            wavelengths=self.wavelengths,
             memory_limit=self.memory_limit,
             progress=self.progress,
         )

@@ -40,6 +40,42 @@ class Bandpass:
         total = sum(self.weights)
         object.__setattr__(self, "weights", tuple(w / total for w in self.weights))
 
+    def thinned(self, count: int) -> tuple[tuple[int, ...], Bandpass]:
+        """Keep some of the wavelengths, evenly spread, with the weights of those left out.
+
+        The weight of a wavelength that is left out goes to its two neighbours as in linear
+        interpolation, so that integrals of functions that are linear between them stay the same.
+
+        Parameters
+        ----------
+        count : int
+            As many as there are, or more, keep all.
+
+        Returns
+        -------
+        indices : tuple of int
+            Of the wavelengths that are kept.
+        bandpass : Bandpass
+        """
+        total = len(self.wavelengths)
+        if count >= total:
+            return tuple(range(total)), self
+        order = np.argsort(self.wavelengths)
+        if count == 1:
+            middle = int(np.abs(np.array(self.wavelengths) - self.mean_wavelength).argmin())
+            return (middle,), Bandpass((self.wavelengths[middle],), (1.0,))
+        kept = np.sort(order[np.round(np.linspace(0, total - 1, count)).astype(int)])
+        nodes = np.array(self.wavelengths)[kept]
+        ascending = np.argsort(nodes)
+        shares = np.stack(
+            [
+                np.interp(self.wavelengths, nodes[ascending], np.eye(count)[k][ascending])
+                for k in range(count)
+            ]
+        )
+        weights = shares @ np.array(self.weights)
+        return tuple(kept.tolist()), Bandpass(tuple(nodes.tolist()), tuple(weights.tolist()))
+
     @property
     def mean_wavelength(self) -> float:
         """Photon-weighted mean wavelength, m."""

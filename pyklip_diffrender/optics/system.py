@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
@@ -116,6 +117,11 @@ class OpticalSystem:
         return "planes" if self._lattice is None else "lattice"
 
     @property
+    def maker(self) -> Callable[..., OpticalSystem] | None:
+        """The function that makes this system from its recipe; None if there is none."""
+        return self._remake
+
+    @property
     def npix(self) -> int:
         """Samples across the pupil array."""
         return self.entrance.full.npix
@@ -155,6 +161,12 @@ class OpticalSystem:
                 "second one with the settings you want"
             )
         return self._remake(**{**self.recipe, **changes})
+
+    def at_wavelengths(self, bandpass: Bandpass) -> Self:
+        """The same system for other wavelengths, sharing what has been computed for them."""
+        other = copy.copy(self)
+        other.bandpass = bandpass
+        return other
 
     def opd(self, opd: Value | None) -> Tensor:
         """Check an OPD and bring it to the system's device: (..., npix, npix) in m.

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pyklip_diffrender.refinement.fitting import refine
+from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.planned import refine_again
-from pyklip_diffrender.refinement.result import FrameFit, Refinement, Status
+from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
+from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.refinement.systematics import Systematics
 
 __all__ = [

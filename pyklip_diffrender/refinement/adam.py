@@ -10,9 +10,11 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.problem import Problem
-from pyklip_diffrender.refinement.result import FrameFit, Refinement, Status
+from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam
+from pyklip_diffrender.refinement.status import Status
 
 __all__ = ["adam"]
 

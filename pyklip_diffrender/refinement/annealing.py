@@ -18,11 +18,13 @@ from tqdm import tqdm
 
 from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.refinement.companions import standing_out
+from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.gauss_newton import Solver, count_modes_below
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.problem import Problem
-from pyklip_diffrender.refinement.result import FrameFit, Refinement, Status
+from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton
+from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.wavefront.bases import Basis
 

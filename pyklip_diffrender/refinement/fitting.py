@@ -67,7 +67,7 @@ def refine(
         "auto" first finds out, with `pyklip_diffrender.plan`, what can be made cheaper without a
         visible error; a plan that was made before is used as it is; "off" fits with the model as
         given. Either way the result is on the model as given. A basis of the settings' own, or
-        none, switches "auto" off.
+        none, and a free pupil amplitude (as in the preset for real frames) switch "auto" off.
     seed : int
         Of the wavefronts that a plan draws; the fit itself is deterministic.
     progress : bool
@@ -144,8 +144,10 @@ def _plan(
         return plan
     if plan not in ("auto", "off"):
         raise IncompatibleSetupError(f"plan: got {plan!r}, expected 'auto', 'off' or a Plan")
-    # A basis of their own, or none, says how fine a fit is meant to be.
-    if plan == "off" or settings.basis is not None or not settings.wavefront:
+    # A basis of their own, or none, says how fine a fit is meant to be; the preset for real frames,
+    # with the pupil's amplitude free, is as coarse as it can be already.
+    decided = settings.basis is not None or not settings.wavefront
+    if plan == "off" or decided or settings.prior.amplitude_scale > 0:
         return None
     return make_plan(problems, settings, seed)
 

@@ -121,7 +121,7 @@ class Forward:
         return {**values, "star_offset": star + offset.to(star.device)}
 
     def jacobian(self, point: Point, modes: int) -> Tensor:
-        """Derivative of `total`, (unknowns, ny, nx), float64.
+        """Derivative of `total`, (unknowns, ny, nx), float32, on the CPU.
 
         Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront.
         """
@@ -132,17 +132,17 @@ class Forward:
         if modes:
             count = unknowns.where("modes").start + modes
         # One array, filled in place: it is the largest of the fit.
-        rows = torch.empty(count, *point.image.shape, dtype=torch.float64, device=opd.device)
+        rows = torch.empty(count, *point.image.shape, dtype=torch.float32)
         response = self._response_at(point) if modes else None
         if unknowns.optical:
             slopes = (
                 response.parameters(point.fields, values)
                 if response is not None
-                else parameter_jacobian(self.coarse, opd, values, unknowns.optical, point.fields)
+                else self.responses.parameters(point.opd, values, unknowns.optical, point.fields)
             )
-            rows[: len(slopes)] = flux * gain * slopes
+            rows[: len(slopes)] = (flux * gain * slopes).cpu()
         if "flux" in unknowns.linear:
-            rows[unknowns.where("flux")] = gain * point.image
+            rows[unknowns.where("flux")] = (gain * point.image).float().cpu()
         if "background" in unknowns.linear:
             rows[unknowns.where("background")] = 1.0
         companions = unknowns.where("companions")
@@ -152,16 +152,16 @@ class Forward:
             there = self._towards(values, unknowns.turn @ source[1:])
             first = companions.start + 3 * k
             with torch.no_grad():
-                rows[first] = flux * self.coarse(opd, **there)
+                rows[first] = (flux * self.coarse(opd, **there)).cpu()
             moved = parameter_jacobian(self.coarse, opd, there, ("star_offset",)).double()
-            turned = torch.tensordot(unknowns.turn.T.to(moved.device), moved, dims=1)
+            turned = torch.tensordot(unknowns.turn.T, moved.cpu(), dims=1)
             rows[first + 1 : first + 3] = flux * source[0] * turned
         if response is not None:
             amplitude = unknowns.where("amplitude")
             slopes = response.image(point.fields, values, unknowns.amplitude_modes, modes)
-            rows[amplitude] = slopes[modes:]
-            rows[amplitude.stop :] = slopes[:modes]
-            rows[amplitude.start :] *= flux * gain
+            slopes *= flux * gain.float()
+            rows[amplitude] = slopes[modes:].cpu()
+            rows[amplitude.stop :] = slopes[:modes].cpu()
         return rows
 
     def _response_at(self, point: Point) -> WavefrontResponse:

@@ -80,7 +80,9 @@ class Solver:
             problems[0].model,
             basis,
             npix=settings.response_npix,
+            wavelengths=settings.response_wavelengths,
             relinearise=settings.relinearise,
+            keep=len(problems),
             progress=progress,
         )
         self.objective = Objective(
@@ -163,7 +165,9 @@ class Solver:
         layout, objective = state.joint, self.objective
         equations = self._equations = linearise(objective, state, kappa, modes)
         sigmas = [objective.sigma(k, point, kappa) for k, point in enumerate(state.points)]
-        update = self._solve(layout, equations, fit_scales=self.settings.prior.fit_scales)
+        fits_scales = self.settings.prior.fit_scales
+        damping = 0.0 if fits_scales else self.damping
+        update = self._solve(layout, equations, fit_scales=fits_scales, damping=damping)
         self.scales = update.scales
         expected = self._predicted_gain(layout, equations, update.step)
         if expected < self.settings.tolerance * objective.pixels:
@@ -171,7 +175,8 @@ class Solver:
             return state, expected / objective.pixels
         before = self._cost(state, sigmas)
         for _ in range(_TRIES):
-            if self.damping:
+            if self.damping != damping:
+                damping = self.damping
                 update = self._solve(layout, equations, damping=self.damping)
                 expected = self._predicted_gain(layout, equations, update.step)
             vector = state.vector.clone()
@@ -237,7 +242,7 @@ class Solver:
         own = torch.ones(len(curvature), dtype=torch.float64)
         own[: len(fixed)] = curvature.diagonal()[: len(fixed)].clamp(min=1e-300) ** -0.5
         update = solve_with_evidence(
-            curvature * own[:, None] * own,
+            (curvature * own[:, None]).mul_(own),
             equations.gradient * own,
             self.shape[:modes],
             self.group[:modes],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from scipy.linalg.blas import dsyrk
 from torch import Tensor
@@ -39,10 +40,30 @@ class NormalEquations:
     frames: tuple[LinearFrame, ...]
 
 
-def _self_product(rows: Tensor) -> Tensor:
-    """``rows @ rows.T`` at half the cost: only one triangle is computed, then mirrored."""
-    upper = torch.from_numpy(dsyrk(1.0, rows.numpy().T, trans=1))
-    return upper + upper.triu(1).T
+_PIXELS = 1024
+"""Pixels whose whitened Jacobian is held in double precision at a time."""
+
+
+def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+    """G G^T and G r of the whitened Jacobian G = jacobian * weight.
+
+    Parameters
+    ----------
+    jacobian : Tensor, (rows, pixels), float32
+    weight, residual : Tensor, (pixels,), float64
+        The residual is whitened.
+    """
+    count = len(jacobian)
+    gradient = torch.zeros(count, dtype=torch.float64)
+    # Only one triangle is computed, in place; LAPACK wants columns contiguous.
+    triangle = np.zeros((count, count), order="F")
+    for start in range(0, jacobian.shape[1], _PIXELS):
+        piece = slice(start, start + _PIXELS)
+        white = jacobian[:, piece].double().mul_(weight[piece])
+        gradient += white @ residual[piece]
+        triangle = dsyrk(1.0, white.numpy().T, beta=1.0, c=triangle, trans=1, overwrite_c=1)
+    upper = torch.from_numpy(triangle)
+    return upper + upper.triu(1).T, gradient
 
 
 def linearise(objective: Objective, state: State, kappa: float, modes: int) -> NormalEquations:
@@ -71,11 +92,10 @@ def linearise(objective: Objective, state: State, kappa: float, modes: int) -> N
         rows = joint.rows(k)[: len(rendered)]
         drift = joint.drift_rows(k) if modes else torch.zeros(0, dtype=torch.int64)
         left = torch.where(weight > 0, residual / weight.clamp(min=1e-300), 0.0).cpu()
-        slopes = rendered.float().cpu()
-        frames.append(LinearFrame(left, weight.cpu(), slopes, rows, drift, first))
-        whitened = rendered.mul_(weight).flatten(1).cpu()
-        pulled = whitened @ residual.flatten().cpu()
-        product = _self_product(whitened)
+        frames.append(LinearFrame(left, weight.cpu(), rendered, rows, drift, first))
+        product, pulled = _accumulate(
+            rendered.flatten(1), weight.flatten().cpu(), residual.flatten().cpu()
+        )
         if len(state.points) == 1:
             curvature, gradient = product, pulled
             continue

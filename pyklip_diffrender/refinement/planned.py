@@ -23,8 +23,9 @@ from pyklip_diffrender.refinement.continuation import (
     fit_with_growing_basis,
     warm_start,
 )
+from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.problem import Problem
-from pyklip_diffrender.refinement.result import FrameFit, Refinement
+from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton
 
 __all__ = ["fit_problems", "make_plan", "refine_again", "require_plan_for"]
@@ -49,9 +50,6 @@ def make_plan(problems: Sequence[Problem], settings: GaussNewton, seed: int) -> 
     fixed = settings.basis is not None or settings.drift is not None
     if fixed or not settings.wavefront or not settings.cycles:
         keep["cycles"] = float(cycles[0])
-    if settings.prior.amplitude_scale > 0:
-        # The amplitude that the fit finds is a map on the model's own grid.
-        keep["npix"] = science.model.npix
     if len(problems) > 1:
         # A correction belongs to one position of the star.
         keep["multifidelity"] = False

@@ -1,171 +1,64 @@
-"""The result of a refinement: `Refinement`, and `FrameFit` for each of its frames."""
+"""The result of a refinement."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from astropy.io import fits
 from astropy.table import QTable
+from astropy.time import Time
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.files import open_fits, write_fits
+from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.planning import Plan
+from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton
+from pyklip_diffrender.refinement.status import Status
+from pyklip_diffrender.refinement.storage import (
+    linear_hdus,
+    linear_of,
+    model_facts,
+    model_of,
+    text_hdu,
+    text_of,
+)
 from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.objects import Planet
-from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.opd import OPDMap
 
-__all__ = ["FrameFit", "Refinement", "Status"]
+__all__ = ["Refinement"]
 
 Image = NDArray[np.float64]
 
-
-class Status(Enum):
-    """How a refinement ended; the values are the messages."""
-
-    CONVERGED = "converged, and the model explains the data within their noise"
-    MODEL_MISMATCH = (
-        "converged, but the model does not explain the data: errors include a model error"
-    )
-    PRIOR_MISMATCH = (
-        "converged, but the wavefront is improbable under a prior that was held fixed, so that "
-        "errors are too small; let the prior's scales be fitted (fit_scales=True), or widen them"
-    )
-    ITERATION_LIMIT = "stopped at the limit of iterations before it converged"
-    COMPLETED = "all iterations of a fixed recipe were done"
-    DIVERGED = "failed: the fitted star has no light, or the loss is not a number"
-
-    @property
-    def message(self) -> str:
-        """The same as the value."""
-        return self.value
-
-    @property
-    def usable(self) -> bool:
-        """Whether the result may be subtracted."""
-        return self is not Status.DIVERGED
-
-    @property
-    def calibrated(self) -> bool:
-        """Whether the stated errors can be relied on as they are."""
-        return self not in (Status.MODEL_MISMATCH, Status.PRIOR_MISMATCH, Status.DIVERGED)
-
-
-@dataclass(frozen=True, eq=False)
-class FrameFit:
-    """The star in one frame of a refinement.
-
-    Attributes
-    ----------
-    model : OpticalSystem
-    observation : Observation
-        As it was given; several frames of one observation are averaged for the fit.
-    start : dict
-        Starting values of parameters, by name.
-    opd : ndarray, (npix, npix)
-        Best estimate of the wavefront, m, entrance-pupil orientation. Complex if the pupil's
-        amplitude was free: the imaginary part is then an absorption.
-    star : ndarray, (ny, nx)
-        The star and the background, in the unit of the observation.
-    companion_image : ndarray, (ny, nx)
-        Light of the companions that had parameters of their own; not part of `star`.
-    values, errors : dict of str to ndarray
-        Every parameter but the wavefront and its standard deviation (NaN where it was not
-        fitted), in the units of the parameter table.
-    gain : ndarray, (ny, nx)
-        Known pattern of the model's error by which the star is multiplied; 1 without systematics.
-    coefficients : ndarray or None
-        Coefficients of the wavefront modes, nm.
-    """
-
-    model: OpticalSystem
-    observation: Observation
-    start: dict[str, Any]
-    opd: NDArray[Any]
-    star: Image
-    companion_image: Image
-    values: dict[str, Image]
-    errors: dict[str, Image]
-    gain: Image
-    coefficients: NDArray[np.float64] | None = None
-
-    def __repr__(self) -> str:
-        return f"<FrameFit: {self.observation.name}, flux {self.flux:.4g}>"
-
-    @property
-    def flux(self) -> float:
-        """Light of the star that the pupil collects, in the unit of the observation."""
-        return float(self.values["flux"][0])
-
-    @property
-    def residual(self) -> Image:
-        """Data minus star, (frames, ny, nx); NaN where the data are masked.
-
-        Some of the light of sources that were not part of the fit has been taken for the star's
-        and is lost here; `Detection.subtracted` keeps it.
-        """
-        data = self.observation.data - self.star
-        return np.where(self.observation.valid, data, np.nan)
-
-    @property
-    def optical_values(self) -> dict[str, Tensor]:
-        """Values of the model's own parameters, as the model takes them."""
-        return {
-            name: torch.from_numpy(value)
-            for name, value in self.values.items()
-            if name in self.model.parameters
-        }
-
-    def render(
-        self,
-        fov_pixels: int | tuple[int, int] | None = None,
-        center: tuple[float, float] | None = None,
-        *,
-        background: bool = True,
-    ) -> Image:
-        """Render the star on another array of pixels of the same scale.
-
-        Parameters
-        ----------
-        fov_pixels : int or (ny, nx), optional
-            Default as fitted.
-        center : (x, y), optional
-            Pixel of the new array on which the observation's `center` falls. Default the middle
-            of the array.
-        background : bool
-            Add the fitted background.
-
-        Returns
-        -------
-        ndarray, (ny, nx)
-            In the unit of the observation, without the pattern of the model's error.
-        """
-        model = self.model
-        if fov_pixels is not None and fov_pixels != self.model.detector.shape:
-            model = model.with_fidelity(fov_pixels=fov_pixels, fov_arcsec=None)
-        values = self.optical_values
-        if center is not None:
-            ny, nx = model.detector.shape
-            old = self.observation.center[0] - (np.array(self.observation.shape[::-1]) - 1) / 2
-            moved = np.array(center) - (np.array([nx, ny]) - 1) / 2 - old
-            shift = torch.from_numpy(moved * np.array(model.detector.pixelscale))
-            values["detector_shift"] = shift + values.get("detector_shift", torch.zeros(2))
-        with torch.no_grad():
-            image = model(torch.from_numpy(self.opd), **values).double().cpu().numpy()
-        level = float(self.values["background"][0]) if background else 0.0
-        return np.asarray(self.flux * image + level)
+_ARRAYS = ("companions", "companion_errors")
+_PLAIN = (
+    "settings",
+    "basis",
+    "chi2_per_pixel",
+    "model_error",
+    *_ARRAYS,
+    "scales",
+    "effective_parameters",
+    "log_evidence",
+    "history",
+    "seconds",
+    "seed",
+)
+"""Attributes of a refinement that are written as text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,6 +194,111 @@ class Refinement:
         for name in ("value", "error"):
             table[name].info.format = ".5g"
         return table
+
+    def write(self, path: str | os.PathLike[str], *, linear: bool = True) -> Path:
+        """Write the refinement to a FITS file from which `read` makes it again.
+
+        Extensions are PARAMETERS (a table), and for each frame DATA, ERROR, VALID, STAR,
+        COMPANIONS, GAIN, OPD and COEFFICIENTS, numbered by EXTVER. The file is written
+        atomically; an existing one is replaced.
+
+        Parameters
+        ----------
+        path : path
+        linear : bool
+            Include the linear model, which `detect` needs and which takes most of the space.
+
+        Returns
+        -------
+        Path
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For settings with a basis that is not the package's own.
+        """
+        primary = fits.PrimaryHDU()
+        for key, value in self.summary().items():
+            primary.header[f"HIERARCH {key.upper()}"] = (
+                value if not isinstance(value, float) or math.isfinite(value) else str(value)
+            )
+        hdus = fits.HDUList([primary, fits.BinTableHDU(self.parameters, name="PARAMETERS")])
+        parts = [frame.to_hdus(k) for k, frame in enumerate(self.frames)]
+        for _, extensions in parts:
+            hdus.extend(extensions)
+        hdus.append(fits.ImageHDU(self.initial.data, name="INITIAL_OPD"))
+        hdus["INITIAL_OPD"].header["BUNIT"] = "m"
+        if self.systematics is not None:
+            hdus.extend(self.systematics.to_hdus())
+        if linear and self.linear is not None:
+            hdus.extend(linear_hdus(self.linear))
+        date = self.initial.date
+        facts = {
+            "model": model_facts(self.model),
+            "frames": [about for about, _ in parts],
+            "initial": [self.initial.name, self.initial.sha256, date and date.isot],
+            "status": self.status.name,
+            **{name: getattr(self, name) for name in _PLAIN},
+        }
+        hdus.append(text_hdu("FACTS", facts))
+        write_fits(hdus, path)
+        return Path(path)
+
+    @classmethod
+    def read(
+        cls, path: str | os.PathLike[str], *, model: OpticalSystem | None = None
+    ) -> Refinement:
+        """Read what `write` wrote.
+
+        Parameters
+        ----------
+        path : path
+        model : OpticalSystem, optional
+            The model of the fit; needed if it was not made by `nircam_coronagraph`.
+
+        Raises
+        ------
+        CorruptFileError
+            If the file is missing, truncated, or was not written by `write`.
+        IncompatibleSetupError
+            If the model is needed and was not given.
+        """
+        name = Path(path).name
+        with open_fits(path) as hdus:
+            if "FACTS" not in hdus:
+                raise CorruptFileError(
+                    f"{name}: no FACTS extension, only {[h.name for h in hdus]}; expected a file "
+                    "written by Refinement.write"
+                )
+            try:
+                facts = text_of(hdus, "FACTS")
+                system = model_of(facts["model"], name) if model is None else model
+                frames = tuple(
+                    FrameFit.from_hdus(hdus, about, system, k)
+                    for k, about in enumerate(facts["frames"])
+                )
+                label, sha256, date = facts["initial"]
+                plain: dict[str, Any] = {key: facts[key] for key in _PLAIN}
+                plain |= {key: np.reshape(facts[key], (-1, 3)).astype(float) for key in _ARRAYS}
+                return cls(
+                    frames=frames,
+                    initial=OPDMap(
+                        native_float64(hdus["INITIAL_OPD"].data),
+                        None if date is None else Time(date),
+                        label,
+                        sha256,
+                    ),
+                    status=Status[facts["status"]],
+                    linear=linear_of(hdus, len(frames), name) if "UNKNOWNS" in hdus else None,
+                    systematics=Systematics.from_hdus(hdus) if "PATTERN" in hdus else None,
+                    **plain,
+                )
+            except (KeyError, TypeError, ValueError) as error:
+                if isinstance(error, DiffrenderError):
+                    raise
+                raise CorruptFileError(
+                    f"{name}: not a complete refinement ({error}). Write the fit again"
+                ) from error
 
     def summary(self) -> Mapping[str, Any]:
         """Return the facts that belong in a header or a log, without arrays."""

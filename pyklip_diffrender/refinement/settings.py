@@ -52,6 +52,8 @@ class GaussNewton:
         How far such companions must stand out, in units of the matched filter's scatter.
     response_npix : int
         Pupil samples of the coarse copy of the model that computes derivatives.
+    response_wavelengths : int
+        Largest number of wavelengths at which it does so.
     max_iterations : int
     tolerance : float
         The fit has converged when a step lowers the penalised chi-squared per pixel by less.
@@ -89,6 +91,7 @@ class GaussNewton:
     max_companions: int = 0
     companion_threshold: float = 4.0
     response_npix: int = 128
+    response_wavelengths: int = 4
     max_iterations: int = 40
     tolerance: float = 1e-3
     min_model_error: float = 0.0
@@ -110,7 +113,14 @@ class GaussNewton:
             raise IncompatibleSetupError("cycles: got none, expected at least one, such as 24")
         if any(each <= 0 for each in self.cycles):
             raise IncompatibleSetupError(f"cycles: got {self.cycles}, expected positive numbers")
-        for name in ("max_iterations", "tolerance", "robust", "relinearise", "response_npix"):
+        for name in (
+            "max_iterations",
+            "tolerance",
+            "robust",
+            "relinearise",
+            "response_npix",
+            "response_wavelengths",
+        ):
             if not getattr(self, name) > 0:
                 raise IncompatibleSetupError(
                     f"{name}: got {getattr(self, name)}, expected a positive number"

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import os
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy.io import fits
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, ShapeError
+from pyklip_diffrender.io.files import open_fits, write_fits
+from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["Systematics"]
+
+_PROVENANCE = ("stars", "frames", "dates")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +68,61 @@ class Systematics:
     def __repr__(self) -> str:
         ny, nx = self.pattern.shape
         return f"<Systematics {self.name!r}: {self.filter}, {nx} x {ny} pixels>"
+
+    def to_hdus(self) -> list[Any]:
+        """Return the FITS extensions PATTERN and PATTERN_ERROR."""
+        hdus = [
+            fits.ImageHDU(self.pattern, name="PATTERN"),
+            fits.ImageHDU(self.error, name="PATTERN_ERROR"),
+        ]
+        header = hdus[0].header
+        header["LABEL"] = self.name
+        header["STARX"], header["STARY"] = self.center
+        header["UNKNOWN"] = (self.unknown, "deviation where nothing was measured")
+        header["FILTER"], header["CORONMSK"] = self.filter or "", self.image_mask or ""
+        for key, value in self.provenance.items():
+            header[f"HIERARCH {key.upper()}"] = json.dumps(value)
+        return hdus
+
+    @classmethod
+    def from_hdus(cls, hdus: fits.HDUList) -> Systematics:
+        """Make the systematics from what `to_hdus` returned."""
+        header = hdus["PATTERN"].header
+        return cls(
+            pattern=native_float64(hdus["PATTERN"].data),
+            error=native_float64(hdus["PATTERN_ERROR"].data),
+            center=(float(header["STARX"]), float(header["STARY"])),
+            unknown=float(header["UNKNOWN"]),
+            filter=header["FILTER"] or None,
+            image_mask=header["CORONMSK"] or None,
+            name=header["LABEL"],
+            provenance={
+                key: json.loads(header[key.upper()]) for key in _PROVENANCE if key.upper() in header
+            },
+        )
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write to a FITS file, atomically; an existing one is replaced."""
+        write_fits(fits.HDUList([fits.PrimaryHDU(), *self.to_hdus()]), path)
+        return Path(path)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Systematics:
+        """Read what `write` wrote.
+
+        Raises
+        ------
+        CorruptFileError
+            If the file is missing, truncated, or holds something else.
+        """
+        with open_fits(path) as hdus:
+            try:
+                return cls.from_hdus(hdus)
+            except (KeyError, ValueError) as error:
+                raise CorruptFileError(
+                    f"{Path(path).name}: not a complete systematics file ({error}); expected one "
+                    "written by Systematics.write"
+                ) from error
 
     def at(self, observation: Observation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pattern and its error on the pixels of an observation.

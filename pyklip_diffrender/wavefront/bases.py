@@ -129,6 +129,7 @@ class FourierModes:
     groups = ("texture",)
 
     def __init__(self, max_cycles: float = 24.0, min_cycles: float = 0.5) -> None:
+        self.max_cycles, self.min_cycles = float(max_cycles), float(min_cycles)
         reach = math.floor(max_cycles)
         pairs = [
             (fx, fy)

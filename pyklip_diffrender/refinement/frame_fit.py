@@ -1,0 +1,175 @@
+"""The star in one frame of a refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from astropy.io import fits
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.refinement.storage import image, observation_hdus, observation_of
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["FrameFit"]
+
+Image = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFit:
+    """The star in one frame of a refinement.
+
+    Attributes
+    ----------
+    model : OpticalSystem
+    observation : Observation
+        As it was given; several frames of one observation are averaged for the fit.
+    start : dict
+        Starting values of parameters, by name.
+    opd : ndarray, (npix, npix)
+        Best estimate of the wavefront, m, entrance-pupil orientation. Complex if the pupil's
+        amplitude was free: the imaginary part is then an absorption.
+    star : ndarray, (ny, nx)
+        The star and the background, in the unit of the observation.
+    companion_image : ndarray, (ny, nx)
+        Light of the companions that had parameters of their own; not part of `star`.
+    values, errors : dict of str to ndarray
+        Every parameter but the wavefront and its standard deviation (NaN where it was not
+        fitted), in the units of the parameter table.
+    gain : ndarray, (ny, nx)
+        Known pattern of the model's error by which the star is multiplied; 1 without systematics.
+    coefficients : ndarray or None
+        Coefficients of the wavefront modes, nm.
+    """
+
+    model: OpticalSystem
+    observation: Observation
+    start: dict[str, Any]
+    opd: NDArray[Any]
+    star: Image
+    companion_image: Image
+    values: dict[str, Image]
+    errors: dict[str, Image]
+    gain: Image
+    coefficients: NDArray[np.float64] | None = None
+
+    def __repr__(self) -> str:
+        return f"<FrameFit: {self.observation.name}, flux {self.flux:.4g}>"
+
+    @property
+    def flux(self) -> float:
+        """Light of the star that the pupil collects, in the unit of the observation."""
+        return float(self.values["flux"][0])
+
+    @property
+    def residual(self) -> Image:
+        """Data minus star, (frames, ny, nx); NaN where the data are masked.
+
+        Some of the light of sources that were not part of the fit has been taken for the star's
+        and is lost here; `Detection.subtracted` keeps it.
+        """
+        data = self.observation.data - self.star
+        return np.where(self.observation.valid, data, np.nan)
+
+    @property
+    def optical_values(self) -> dict[str, Tensor]:
+        """Values of the model's own parameters, as the model takes them."""
+        return {
+            name: torch.from_numpy(value)
+            for name, value in self.values.items()
+            if name in self.model.parameters
+        }
+
+    def render(
+        self,
+        fov_pixels: int | tuple[int, int] | None = None,
+        center: tuple[float, float] | None = None,
+        *,
+        background: bool = True,
+    ) -> Image:
+        """Render the star on another array of pixels of the same scale.
+
+        Parameters
+        ----------
+        fov_pixels : int or (ny, nx), optional
+            Default as fitted.
+        center : (x, y), optional
+            Pixel of the new array on which the observation's `center` falls. Default the middle
+            of the array.
+        background : bool
+            Add the fitted background.
+
+        Returns
+        -------
+        ndarray, (ny, nx)
+            In the unit of the observation, without the pattern of the model's error.
+        """
+        model = self.model
+        if fov_pixels is not None and fov_pixels != self.model.detector.shape:
+            model = model.with_fidelity(fov_pixels=fov_pixels, fov_arcsec=None)
+        values = self.optical_values
+        if center is not None:
+            ny, nx = model.detector.shape
+            old = self.observation.center[0] - (np.array(self.observation.shape[::-1]) - 1) / 2
+            moved = np.array(center) - (np.array([nx, ny]) - 1) / 2 - old
+            shift = torch.from_numpy(moved * np.array(model.detector.pixelscale))
+            values["detector_shift"] = shift + values.get("detector_shift", torch.zeros(2))
+        with torch.no_grad():
+            image = model(torch.from_numpy(self.opd), **values).double().cpu().numpy()
+        level = float(self.values["background"][0]) if background else 0.0
+        return np.asarray(self.flux * image + level)
+
+    def to_hdus(self, k: int) -> tuple[dict[str, Any], list[Any]]:
+        """Facts and FITS extensions of the frame, with EXTVER k + 1."""
+        observation, hdus = observation_hdus(self.observation, k)
+        unit = observation["unit"]
+        arrays = {
+            "STAR": (self.star, unit),
+            "COMPANIONS": (self.companion_image, unit),
+            "GAIN": (self.gain, ""),
+            "OPD": (self.opd.real, "m"),
+            "ABSORPTION": (self.opd.imag if np.iscomplexobj(self.opd) else None, "m"),
+            "COEFFICIENTS": (self.coefficients, "nm"),
+        }
+        for name, (array, array_unit) in arrays.items():
+            if array is not None:
+                hdus.append(fits.ImageHDU(array, name=name, ver=k + 1))
+                hdus[-1].header["BUNIT"] = array_unit
+        facts = {
+            "observation": observation,
+            "start": self.start,
+            "values": self.values,
+            "errors": self.errors,
+        }
+        return facts, hdus
+
+    @classmethod
+    def from_hdus(
+        cls, hdus: fits.HDUList, facts: dict[str, Any], model: OpticalSystem, k: int
+    ) -> FrameFit:
+        """Make the frame from what `to_hdus` returned."""
+        opd: NDArray[Any] = image(hdus, "OPD", k)
+        if ("ABSORPTION", k + 1) in hdus:
+            opd = opd + 1j * image(hdus, "ABSORPTION", k)
+        values, errors = (
+            {name: np.atleast_1d(value).astype(float) for name, value in facts[key].items()}
+            for key in ("values", "errors")
+        )
+        known = ("COEFFICIENTS", k + 1) in hdus
+        return cls(
+            model=model,
+            observation=observation_of(hdus, facts["observation"], k),
+            start=facts["start"],
+            opd=opd,
+            star=image(hdus, "STAR", k),
+            companion_image=image(hdus, "COMPANIONS", k),
+            values=values,
+            errors=errors,
+            gain=image(hdus, "GAIN", k),
+            coefficients=image(hdus, "COEFFICIENTS", k) if known else None,
+        )

@@ -1,0 +1,38 @@
+"""How a refinement ended."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+__all__ = ["Status"]
+
+
+class Status(Enum):
+    """How a refinement ended; the values are the messages."""
+
+    CONVERGED = "converged, and the model explains the data within their noise"
+    MODEL_MISMATCH = (
+        "converged, but the model does not explain the data: errors include a model error"
+    )
+    PRIOR_MISMATCH = (
+        "converged, but the wavefront is improbable under a prior that was held fixed, so that "
+        "errors are too small; let the prior's scales be fitted (fit_scales=True), or widen them"
+    )
+    ITERATION_LIMIT = "stopped at the limit of iterations before it converged"
+    COMPLETED = "all iterations of a fixed recipe were done"
+    DIVERGED = "failed: the fitted star has no light, or the loss is not a number"
+
+    @property
+    def message(self) -> str:
+        """The same as the value."""
+        return self.value
+
+    @property
+    def usable(self) -> bool:
+        """Whether the result may be subtracted."""
+        return self is not Status.DIVERGED
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the stated errors can be relied on as they are."""
+        return self not in (Status.MODEL_MISMATCH, Status.PRIOR_MISMATCH, Status.DIVERGED)
