@@ -78,10 +78,10 @@ def _less_star(frame: FrameFit) -> Image:
 
 @dataclass(frozen=True)
 class Detection:
-    """Where there may be planets, how bright they are, and how bright they would have to be.
+    """Point sources in refined frames: maps, candidates, and the contrast curve.
 
-    Everything is for point sources with wavefront, alignment, flux and background of the star
-    integrated out. Images have the first frame's pixels; positions are x, y from the star.
+    Everything is for point sources with the wavefront, alignment, flux and background of the star
+    marginalised. Images have the first frame's pixels; positions are x, y from the star.
 
     Attributes
     ----------
@@ -99,8 +99,8 @@ class Detection:
     residual_snr : ndarray, (ny, nx)
         The same once the candidates are taken out of the data.
     scatter : float
-        Factor by which all errors were made larger, so that S/N away from sources scatters by 1;
-        exactly 1 where the fit explains its data.
+        Factor by which all errors were multiplied, so that S/N away from sources has a standard
+        deviation of 1; exactly 1 where the fit explains its data.
     candidates : Candidates
     threshold : float
         S/N above which something is a candidate.
@@ -129,50 +129,69 @@ class Detection:
             f"errors scaled by {self.scatter:.3g}>"
         )
 
-    @property
-    def table(self) -> QTable:
-        """The candidates, brightest in S/N first.
+    def __str__(self) -> str:
+        """The candidates in words, at most 80 columns wide."""
+        lines = [
+            f"{row['separation'].value:7.3f} +- {row['separation_error'].value:.3f} arcsec  "
+            f"{row['position_angle'].value:6.2f} +- {row['position_angle_error'].value:.2f} deg  "
+            f"{row['contrast']:.2e} +- {row['contrast_error']:.1e}  {row['snr']:5.1f}"
+            for row in self.table
+        ]
+        title = "    separation             position angle     contrast               S/N"
+        none = [f"no candidate above S/N {self.threshold:g}"]
+        return "\n".join([title, *lines] if lines else none)
 
-        x, y, separation and position angle (counter-clockwise from +y of the image), contrast,
-        their errors, and S/N. The error of the contrast contains those of the star's flux and of
-        the source's own image (see `scale.scale_errors`); S/N, which asks whether there is a
-        source at all, does not.
+    @property
+    def north(self) -> float:
+        """Position angle of the first frame's +y axis, degrees east of north; 0 if not known."""
+        return self.fits[0].frames[0].observation.position_angle
+
+    @cached_property
+    def table(self) -> QTable:
+        """The candidates, highest S/N first.
+
+        Columns are separation; position angle east of north (counter-clockwise from +y of the
+        first frame if its orientation is not known); offsets in right ascension and declination;
+        contrast; magnitude difference; S/N; and x, y from the star on the first frame. Errors are
+        standard deviations, with all parameters of the star marginalised. The error of the
+        contrast includes those of the star's flux and of the source's own image (see
+        `scale.scale_errors`); the S/N, which asks whether there is a source at all, does not.
         """
-        found = self.candidates
-        x, y = found.offsets.T.numpy()
-        contrast = found.contrasts.numpy()
-        errors = self.scatter * found.errors.numpy().reshape(-1, 3)
-        count = len(found)
-        places = (
-            found.covariance.numpy().reshape(3, count, 3, count)
-            if count
-            else np.zeros((3, 0, 3, 0))
-        )
+        candidates, scatter, count = self.candidates, self.scatter, len(self.candidates)
+        x, y = candidates.offsets.T.numpy()
+        contrast = candidates.contrasts.numpy()
+        errors = scatter * candidates.errors.numpy().reshape(-1, 3)
+        covariance = candidates.covariance.numpy().reshape(3, count, 3, count)
+        places = scatter**2 * np.einsum("akbk->kab", covariance)[:, 1:, 1:]
         separation = np.hypot(x, y)
-        radial, angular = np.empty(count), np.empty(count)
-        for k in range(count):
-            own = places[1:, k, 1:, k]
-            along = np.array([x[k], y[k]]) / separation[k]
-            across = np.array([-along[1], along[0]])
-            radial[k] = self.scatter * np.sqrt(along @ own @ along)
-            angular[k] = self.scatter * np.sqrt(across @ own @ across) / separation[k]
-        table = QTable(
-            {
-                "x": x * u.arcsec,
-                "y": y * u.arcsec,
-                "x_error": errors[:, 1] * u.arcsec,
-                "y_error": errors[:, 2] * u.arcsec,
-                "separation": separation * u.arcsec,
-                "separation_error": radial * u.arcsec,
-                "position_angle": np.rad2deg(np.arctan2(-x, y)) % 360 * u.deg,
-                "position_angle_error": np.rad2deg(angular) * u.deg,
-                "contrast": contrast,
-                "contrast_error": np.hypot(errors[:, 0], contrast * self._scale_errors),
-                "snr": contrast / errors[:, 0] if count else np.zeros(0),
-            }
+        along = np.stack([x, y], axis=1) / separation[:, None]
+        across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        radial, tangential = (
+            np.sqrt(np.einsum("ka,kab,kb->k", unit, places, unit)) for unit in (along, across)
         )
-        order = np.argsort(-table["snr"])
-        table = table[order]
+        angle = np.deg2rad(self.north) + np.arctan2(-x, y)
+        contrast_error = np.hypot(errors[:, 0], contrast * self._scale_errors)
+        columns = {
+            "separation": (separation * u.arcsec, ".4f"),
+            "separation_error": (radial * u.arcsec, ".4f"),
+            "position_angle": (np.rad2deg(angle) % 360 * u.deg, ".2f"),
+            "position_angle_error": (np.rad2deg(tangential / separation) * u.deg, ".2f"),
+            "contrast": (contrast, ".3e"),
+            "contrast_error": (contrast_error, ".1e"),
+            "delta_mag": (-2.5 * np.log10(contrast) * u.mag, ".3f"),
+            "delta_mag_error": (2.5 / np.log(10) * contrast_error / contrast * u.mag, ".3f"),
+            "snr": (contrast / errors[:, 0], ".1f"),
+            "delta_ra": (separation * np.sin(angle) * u.arcsec, ".4f"),
+            "delta_dec": (separation * np.cos(angle) * u.arcsec, ".4f"),
+            "x": (x * u.arcsec, ".4f"),
+            "y": (y * u.arcsec, ".4f"),
+            "x_error": (errors[:, 1] * u.arcsec, ".4f"),
+            "y_error": (errors[:, 2] * u.arcsec, ".4f"),
+        }
+        table = QTable({name: values for name, (values, _) in columns.items()})
+        for name, (_, form) in columns.items():
+            table[name].info.format = form
+        table = table[np.argsort(-table["snr"])]
         table.meta = self._provenance()
         return table
 
@@ -276,7 +295,11 @@ class Detection:
             **{key: value for key, value in self.fits[0].summary().items()},
             "scatter": self.scatter,
             "threshold": self.threshold,
-            "orientation": "position angles counter-clockwise from +y of the first frame",
+            "orientation": (
+                "position angles counter-clockwise from +y of the first frame"
+                if self.fits[0].frames[0].observation.position_angles is None
+                else "position angles east of north"
+            ),
         }
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:

@@ -165,6 +165,8 @@ def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start
 
 def _with_position(model: OpticalSystem, observation: Observation, start: Start) -> dict[str, Any]:
     """Starting values, with the star's position on the detector if the observation has one."""
+    if observation.star_offset is not None and "star_offset" in model.parameters:
+        start = {"star_offset": observation.star_offset, **start}
     ny, nx = observation.shape
     away = observation.center[0] - np.array([(nx - 1) / 2, (ny - 1) / 2])
     if "detector_shift" in start or np.abs(away).max() <= 1e-9:

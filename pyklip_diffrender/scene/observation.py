@@ -69,6 +69,8 @@ class Observation:
     date : Time or None
     position_angles : ndarray, (frames,)
         Degrees.
+    star_offset : tuple of float or None
+        x, y of the star relative to the occulter as the file says, arcsec; a fit starts there.
     reference : bool
         Another star, whose frames show the wavefront but none of the target's companions.
     name : str
@@ -87,6 +89,7 @@ class Observation:
     position_angles: NDArray[np.float64] | None = None
     name: str = "observation"
     reference: bool = False
+    star_offset: tuple[float, float] | None = None
     header: fits.Header = field(default_factory=fits.Header)
 
     @classmethod
@@ -182,7 +185,8 @@ class Observation:
         """Read a JWST stage-2 coronagraphic file (calints).
 
         Uses SCI, ERR and DQ, BUNIT, FILTER, DATE-BEG, the aperture's pixel area, and the star's
-        position from STARCENX/Y, else CRPIX1/2 (1-indexed).
+        position from STARCENX/Y, else CRPIX1/2 (1-indexed). Of spaceKLIP's aligned files also
+        MASKOFFS, the position of the mask from the star.
 
         Raises
         ------
@@ -225,7 +229,13 @@ class Observation:
                     stacklevel=2,
                 )
                 quality = np.zeros(data.shape, dtype=np.uint32)
-        return cls.from_jwst(data, error, quality, header, name=path.name)
+            mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
+        observation = cls.from_jwst(data, error, quality, header, name=path.name)
+        if mask is None:
+            return observation
+        # spaceKLIP says where the mask is from the star, in pixels, for every integration.
+        away = -native_float64(mask).reshape(-1, 2).mean(axis=0) * observation.pixelscale
+        return replace(observation, star_offset=(float(away[0]), float(away[1])))
 
     @classmethod
     def from_jwst(
@@ -280,6 +290,11 @@ class Observation:
     def shape(self) -> tuple[int, int]:
         """Rows and columns of a frame."""
         return self.data.shape[1], self.data.shape[2]
+
+    @property
+    def target(self) -> str:
+        """Name of the star: TARGPROP of the header, else the name of the observation."""
+        return str(self.header.get("TARGPROP", self.name)).strip()
 
     @property
     def is_nircam(self) -> bool:

@@ -1,0 +1,204 @@
+"""Sequences: the rolls of a target and the reference stars that go with them."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from astropy import units as u
+from astropy.table import QTable
+
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["ObservingSequence"]
+
+_SUFFIXES = (".fits", ".fits.gz")
+
+
+@dataclass(frozen=True)
+class ObservingSequence:
+    """Observations of one target through one filter, with its reference stars.
+
+    Attributes
+    ----------
+    target : str
+        Name of the target.
+    science : tuple of Observation
+        One for each roll or pointing of the target, in order of time.
+    references : tuple of Observation
+        Frames of other stars through the same coronagraph, in order of time.
+    excluded : tuple of (str, str)
+        Names of the files that were left out, and why.
+    """
+
+    target: str
+    science: tuple[Observation, ...]
+    references: tuple[Observation, ...] = ()
+    excluded: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.science:
+            raise NoValidPixelsError(f"{self.target}: the sequence has no frames of the target")
+
+    def __repr__(self) -> str:
+        return (
+            f"<ObservingSequence: {self.target} in {self.filter}, {len(self.science)} of the "
+            f"target, {len(self.references)} of reference stars>"
+        )
+
+    @property
+    def filter(self) -> str | None:
+        """Filter of the target's frames."""
+        return self.science[0].filter
+
+    @classmethod
+    def from_files(
+        cls,
+        files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+        *,
+        target: str | None = None,
+        filter: str | None = None,
+    ) -> ObservingSequence:
+        """Sort JWST coronagraphic files into target and reference stars by their headers.
+
+        Parameters
+        ----------
+        files : path or sequence of path
+            Stage-2 files (calints), spaceKLIP's aligned files, or a folder with either.
+        target : str, optional
+            Name of the target (TARGPROP). Default the star that is not marked as a reference
+            (IS_PSF), if there is just one.
+        filter : str, optional
+            Filter to use. Default the one of all files, if there is just one.
+
+        Returns
+        -------
+        ObservingSequence
+            Files that cannot be used are listed in `excluded` with the reason.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If target or filter cannot be decided, with the choices.
+        NoValidPixelsError
+            If no frame of the target is left.
+        """
+        paths = _paths(files)
+        observations: list[Observation] = []
+        excluded: list[tuple[str, str]] = []
+        for path in paths:
+            try:
+                observations.append(Observation.from_fits(path))
+            except DiffrenderError as error:
+                excluded.append((path.name, str(error)))
+        if not observations:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in excluded)
+            raise NoValidPixelsError(f"none of {len(paths)} files can be used: {reasons}")
+        filter = _the_only("filter", filter, [each.filter for each in observations])
+        through = [each for each in observations if _same(each.filter, filter)]
+        excluded += [
+            (each.name, f"taken through {each.filter}, not {filter}")
+            for each in observations
+            if not _same(each.filter, filter)
+        ]
+        if target is None:
+            unmarked = [each.target for each in through if not each.header.get("IS_PSF")]
+            target = _the_only("target", None, unmarked or [each.target for each in through])
+        names = sorted({each.target for each in through})
+        if not any(_same(target, name) for name in names):
+            raise IncompatibleSetupError(f"target: got {target!r}, the files show {names}")
+        science = [each for each in through if _same(each.target, target)]
+        setup = _setup(science[0])
+        references = []
+        for each in through:
+            if _same(each.target, target):
+                continue
+            if _setup(each) == setup:
+                references.append(replace(each, reference=True))
+            else:
+                excluded.append((each.name, f"set-up {_setup(each)} differs from {setup}"))
+        return cls(
+            science[0].target,
+            tuple(sorted(science, key=_time)),
+            tuple(sorted(references, key=_time)),
+            tuple(excluded),
+        )
+
+    @property
+    def table(self) -> QTable:
+        """One row for each observation: what it is used for, star, date, roll and exposure."""
+        rows = [("target", each) for each in self.science]
+        rows += [("reference", each) for each in self.references]
+        table = QTable(
+            {
+                "use": [use for use, _ in rows],
+                "star": [each.target for _, each in rows],
+                "date": ["" if e.date is None else e.date.isot[:16] for _, e in rows],
+                "position_angle": [each.position_angle for _, each in rows] * u.deg,
+                "integrations": [len(each) for _, each in rows],
+                "file": [each.name for _, each in rows],
+            }
+        )
+        table["position_angle"].info.format = ".2f"
+        return table
+
+    def cutout(self, size: int) -> ObservingSequence:
+        """Cut the `size` x `size` pixels about the star out of every frame."""
+        return replace(
+            self,
+            science=tuple(each.cutout(size) for each in self.science),
+            references=tuple(each.cutout(size) for each in self.references),
+        )
+
+
+def _paths(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
+    several = [files] if isinstance(files, str | os.PathLike) else list(files)
+    paths: list[Path] = []
+    for each in map(Path, several):
+        if each.is_dir():
+            inside = sorted(p for p in each.iterdir() if p.name.endswith(_SUFFIXES))
+            if not inside:
+                raise NoValidPixelsError(f"{each}: the folder has no FITS files")
+            paths += inside
+        else:
+            paths.append(each)
+    if not paths:
+        raise NoValidPixelsError("files: got none, expected at least one")
+    return paths
+
+
+def _the_only(what: str, wanted: str | None, values: Sequence[str | None]) -> str:
+    """The value that was asked for, or the only one there is."""
+    known = Counter(str(value) for value in values)
+    if wanted is not None:
+        if not any(_same(wanted, value) for value in known):
+            raise IncompatibleSetupError(f"{what}: got {wanted!r}, the files have {sorted(known)}")
+        return wanted
+    if len(known) > 1:
+        raise IncompatibleSetupError(
+            f"{what}: the files have {', '.join(f'{n} ({c})' for n, c in known.items())}; say "
+            f"which one to use with {what}=..."
+        )
+    return next(iter(known))
+
+
+def _same(one: str | None, other: str | None) -> bool:
+    """Whether two names are the same but for case and separators."""
+    return _plain(one) == _plain(other)
+
+
+def _plain(name: str | None) -> str:
+    return "".join(c for c in str(name).upper() if c.isalnum())
+
+
+def _setup(observation: Observation) -> tuple[str, ...]:
+    keys = ("CORONMSK", "PUPIL", "SUBARRAY", "DETECTOR")
+    return tuple(str(observation.header.get(key, "")) for key in keys)
+
+
+def _time(observation: Observation) -> float:
+    return 0.0 if observation.date is None else float(observation.date.mjd)
