@@ -24,25 +24,41 @@ if TYPE_CHECKING:
         register,
         unregister,
     )
-    from pyklip_diffrender.refinement import Refinement, Status, refine
+    from pyklip_diffrender.reduction import Reduction, reduce
+    from pyklip_diffrender.refinement import (
+        Adam,
+        GaussNewton,
+        Refinement,
+        Status,
+        Systematics,
+        learn_systematics,
+        refine,
+    )
     from pyklip_diffrender.scene.objects import Planet, Scene, Star
     from pyklip_diffrender.scene.observation import Observation
+    from pyklip_diffrender.scene.real_frames import model_for
+    from pyklip_diffrender.scene.sequence import Sequence
     from pyklip_diffrender.scene.simulation import simulate
     from pyklip_diffrender.wavefront.opd import drift, random_opd, read_opd
     from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
 
 __all__ = [
+    "Adam",
     "Detection",
     "DiffrenderSettings",
+    "GaussNewton",
     "LinearModel",
     "Observation",
     "OpticalSystem",
     "Plan",
     "Planet",
+    "Reduction",
     "Refinement",
     "Scene",
+    "Sequence",
     "Star",
     "Status",
+    "Systematics",
     "WavefrontPrior",
     "__version__",
     "backend",
@@ -52,12 +68,15 @@ __all__ = [
     "from_poppy",
     "from_webbpsf",
     "learn_prior",
+    "learn_systematics",
     "measure",
+    "model_for",
     "nircam_coronagraph",
     "observation_from_dataset",
     "plan",
     "random_opd",
     "read_opd",
+    "reduce",
     "refine",
     "register",
     "simulate",
@@ -65,6 +84,14 @@ __all__ = [
 ]
 
 _MODULE_OF = {
+    "Reduction": "reduction",
+    "reduce": "reduction",
+    "Adam": "refinement",
+    "GaussNewton": "refinement",
+    "Sequence": "scene.sequence",
+    "Systematics": "refinement",
+    "learn_systematics": "refinement",
+    "model_for": "scene.real_frames",
     "Detection": "detection",
     "DiffrenderSettings": "pyklip_backend",
     "LinearModel": "linear.model",

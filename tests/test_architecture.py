@@ -29,6 +29,7 @@ PACKAGES = (
     "planning",
     "refinement",
     "detection",
+    "reduction",
     "pyklip_backend",
     "demo",
     "plotting",

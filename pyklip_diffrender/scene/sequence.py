@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections import Counter, abc
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,13 +14,13 @@ from astropy.table import QTable
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["ObservingSequence"]
+__all__ = ["Sequence"]
 
 _SUFFIXES = (".fits", ".fits.gz")
 
 
 @dataclass(frozen=True)
-class ObservingSequence:
+class Sequence:
     """Observations of one target through one filter, with its reference stars.
 
     Attributes
@@ -46,7 +46,7 @@ class ObservingSequence:
 
     def __repr__(self) -> str:
         return (
-            f"<ObservingSequence: {self.target} in {self.filter}, {len(self.science)} of the "
+            f"<Sequence: {self.target} in {self.filter}, {len(self.science)} of the "
             f"target, {len(self.references)} of reference stars>"
         )
 
@@ -62,7 +62,7 @@ class ObservingSequence:
         *,
         target: str | None = None,
         filter: str | None = None,
-    ) -> ObservingSequence:
+    ) -> Sequence:
         """Sort JWST coronagraphic files into target and reference stars by their headers.
 
         Parameters
@@ -77,7 +77,7 @@ class ObservingSequence:
 
         Returns
         -------
-        ObservingSequence
+        Sequence
             Files that cannot be used are listed in `excluded` with the reason.
 
         Raises
@@ -146,7 +146,7 @@ class ObservingSequence:
         table["position_angle"].info.format = ".2f"
         return table
 
-    def cutout(self, size: int) -> ObservingSequence:
+    def cutout(self, size: int) -> Sequence:
         """Cut the `size` x `size` pixels about the star out of every frame."""
         return replace(
             self,
@@ -171,7 +171,7 @@ def _paths(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> 
     return paths
 
 
-def _the_only(what: str, wanted: str | None, values: Sequence[str | None]) -> str:
+def _the_only(what: str, wanted: str | None, values: abc.Sequence[str | None]) -> str:
     """The value that was asked for, or the only one there is."""
     known = Counter(str(value) for value in values)
     if wanted is not None:

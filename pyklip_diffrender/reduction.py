@@ -1,0 +1,151 @@
+"""From a sequence of frames to planets: reference stars, systematics, joint fit, detection."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pyklip_diffrender.detection import Detection, detect
+from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.refinement import (
+    GaussNewton,
+    Refinement,
+    Systematics,
+    learn_systematics,
+    refine,
+)
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.wavefront.opd import as_opd_map
+
+__all__ = ["Reduction", "reduce"]
+
+_log = logging.getLogger(__name__)
+
+_KNOWN_MODEL_ERROR = 0.002
+"""Smallest model error, as a fraction of the star, where the pattern of the model's error is known
+from other stars: the pattern's own error is counted apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """Result of `reduce`.
+
+    Attributes
+    ----------
+    sequence : Sequence
+        What was reduced, cut to the fitted pixels.
+    fit : Refinement
+        All frames of the target, fitted together.
+    detection : Detection
+    references : tuple of Refinement
+        One for each reference star.
+    systematics : Systematics or None
+        The pattern of the model's error that was used.
+    failed : tuple of (str, str)
+        Reference stars that could not be fitted, and why.
+    """
+
+    sequence: Sequence
+    fit: Refinement
+    detection: Detection
+    references: tuple[Refinement, ...] = ()
+    systematics: Systematics | None = None
+    failed: tuple[tuple[str, str], ...] = ()
+
+    def __repr__(self) -> str:
+        return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"
+
+    def __str__(self) -> str:
+        return f"{self.sequence!r}\n{self.fit.status.message}\n{self.detection}"
+
+    def write(self, folder: str | os.PathLike[str]) -> list[Path]:
+        """Write maps, tables, the fit and the systematics; returns the paths."""
+        folder = Path(folder)
+        written = self.detection.write(folder)
+        written.append(self.fit.write(folder / "fit.fits"))
+        if self.systematics is not None:
+            written.append(self.systematics.write(folder / "systematics.fits"))
+        return written
+
+
+def reduce(
+    sequence: Sequence | str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    opd: Any,
+    *,
+    target: str | None = None,
+    filter: str | None = None,
+    size: int = 80,
+    systematics: Systematics | None = None,
+    settings: GaussNewton | None = None,
+    threshold: float = 5.0,
+    progress: bool = False,
+) -> Reduction:
+    """Search a sequence of real frames for planets.
+
+    Every reference star is fitted first. What their fits have in common is the pattern of the
+    model's error, with which all frames of the target are then fitted together and searched.
+
+    Parameters
+    ----------
+    sequence : Sequence, or files as for `Sequence.from_files`
+    opd : path, OPDMap, Quantity or array
+        The wavefront to start from, as for `refine`.
+    target, filter : str, optional
+        See `Sequence.from_files`.
+    size : int
+        Side in pixels of the square about the star that is fitted.
+    systematics : Systematics, optional
+        Pattern of the model's error; default that of the sequence's own reference stars, if there
+        are at least two frames of them.
+    settings : GaussNewton, optional
+        Of the fits; default those of `refine`.
+    threshold : float
+        S/N of a candidate.
+    progress : bool
+        Show progress bars.
+
+    Returns
+    -------
+    Reduction
+
+    Raises
+    ------
+    DiffrenderError
+        If the target cannot be fitted. A reference star that cannot be is left out.
+    """
+    if not isinstance(sequence, Sequence):
+        sequence = Sequence.from_files(sequence, target=target, filter=filter)
+    wavefront = as_opd_map(opd)
+    model = model_for(sequence.science[0], size)
+    sequence = sequence.cutout(size)
+    common: dict[str, Any] = {"settings": settings, "progress": progress}
+    references: list[Refinement] = []
+    failed: list[tuple[str, str]] = []
+    if systematics is None:
+        for star, frames in _by_star(sequence.references).items():
+            _log.info("reference star %s: %d frames", star, len(frames))
+            try:
+                references.append(refine(model, frames, wavefront, **common))
+            except DiffrenderError as error:
+                _log.warning("reference star %s is left out: %s", star, error)
+                failed.append((star, str(error)))
+        if sum(len(fit.frames) for fit in references if fit.status.usable) > 1:
+            systematics = learn_systematics(references)
+    if systematics is not None and settings is None and sequence.science[0].is_nircam:
+        common["settings"] = GaussNewton.nircam(min_model_error=_KNOWN_MODEL_ERROR)
+    fit = refine(model, sequence.science, wavefront, systematics=systematics, **common)
+    detection = detect(fit, threshold=threshold, progress=progress)
+    return Reduction(sequence, fit, detection, tuple(references), systematics, tuple(failed))
+
+
+def _by_star(observations: Iterable[Observation]) -> dict[str, list[Observation]]:
+    stars: dict[str, list[Observation]] = {}
+    for each in observations:
+        stars.setdefault(each.target, []).append(each)
+    return stars
