@@ -8,15 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.differentiation import (
+    Position,
+    has_memory,
+    is_plain,
+    position_of,
+)
 from pyklip_diffrender.optics.fast.occulter import DEFAULT_SAMPLING, OcculterLattice, finest_spacing
-from pyklip_diffrender.optics.fast.streaming import Branch, PupilStream, has_memory, is_plain
+from pyklip_diffrender.optics.fast.streaming import Branch, PupilStream
 from pyklip_diffrender.optics.fourier import tilt_phases
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import (
@@ -32,6 +38,8 @@ from pyklip_diffrender.optics.planes import (
 from pyklip_diffrender.optics.sampled_planes import Gain, PupilOptic
 
 __all__ = ["LatticeRoute", "is_pointwise"]
+
+T = TypeVar("T")
 
 _POINTWISE = (Gain, InternalAberration, LyotStop, PupilOptic, PupilStop)
 
@@ -62,11 +70,12 @@ class LatticeRoute:
         self.planes, self.detector = tuple(planes), detector
         (self._place,) = (k for k, p in enumerate(planes) if isinstance(p, CompactOcculter))
         behind = planes[self._place + 1 :]
-        self._moving = {name for plane in behind for name in plane.parameters}
+        self._moving = {name for plane in behind for name in plane.parameters} | {"detector_shift"}
         self._lattices: dict[float, OcculterLattice] = {}
-        self._stops: dict[float, Wavefront] = {}
-        self._kernels: dict[float, Tensor] = {}
-        self._stars: dict[float, _StreamedStar] = {}
+        # The latest at each wavelength, with where the planes behind the occulter stood.
+        self._stops: dict[float, tuple[Position, Wavefront]] = {}
+        self._kernels: dict[float, tuple[Position, Tensor]] = {}
+        self._stars: dict[float, tuple[Position, _StreamedStar]] = {}
         self._stream: PupilStream | None = None
 
     @staticmethod
@@ -109,20 +118,23 @@ class LatticeRoute:
 
         A shift of the detector is a tilt there, so that the rest does not see it.
         """
-        moves = not self._moving.isdisjoint(values)
-        stop = None if moves else self._stops.get(wavelength)
-        if stop is None:
-            grid = onto[self._place]
-            ones = torch.ones(
-                grid.shape, dtype=self.detector.dtype.to_complex(), device=self.detector.device
-            )
-            stop = Wavefront(ones, wavelength, grid)
-            for plane, window in zip(
-                self.planes[self._place + 1 :], onto[self._place + 1 :], strict=True
-            ):
-                stop = plane.apply(stop, values, window)
-            if not moves:
-                self._stops[wavelength] = stop
+        return _kept(
+            self._stops,
+            wavelength,
+            position_of(values, self._moving),
+            lambda: self._make_stop(onto, wavelength, values),
+        )
+
+    def _make_stop(self, onto: Sequence[PupilGrid], wavelength: float, values: Values) -> Wavefront:
+        grid = onto[self._place]
+        ones = torch.ones(
+            grid.shape, dtype=self.detector.dtype.to_complex(), device=self.detector.device
+        )
+        stop = Wavefront(ones, wavelength, grid)
+        for plane, window in zip(
+            self.planes[self._place + 1 :], onto[self._place + 1 :], strict=True
+        ):
+            stop = plane.apply(stop, values, window)
         if "detector_shift" not in values:
             return stop
         x, y = values["detector_shift"].unbind(-1)
@@ -134,13 +146,12 @@ class LatticeRoute:
         return replace(stop, field=stop.field * factors[0][None, :] * factors[1][:, None])
 
     def _kernel(self, stop: Wavefront, values: Values) -> Tensor:
-        moves = not {*self._moving, "detector_shift"}.isdisjoint(values)
-        kernel = None if moves else self._kernels.get(stop.wavelength)
-        if kernel is None:
-            kernel = self.lattice(stop.wavelength).kernel(stop, self.detector.axes({}))
-            if not moves:
-                self._kernels[stop.wavelength] = kernel
-        return kernel
+        return _kept(
+            self._kernels,
+            stop.wavelength,
+            position_of(values, self._moving),
+            lambda: self.lattice(stop.wavelength).kernel(stop, self.detector.axes({})),
+        )
 
     def field(self, wavefront: Wavefront, values: Values, onto: Sequence[PupilGrid]) -> Tensor:
         """Field on the detector's samples from that behind the entrance pupil.
@@ -175,7 +186,7 @@ class LatticeRoute:
         -------
         Tensor or None
             It can be differentiated in reverse mode with respect to the OPD and to the star's
-            offset. None where other derivatives, several stars or moving planes are asked for.
+            offset. None where other derivatives or several stars are asked for.
         """
         offset = values.get("star_offset")
         fixed = [value for name, value in values.items() if name != "star_offset"]
@@ -185,7 +196,6 @@ class LatticeRoute:
             or opd.device.type != "cpu"
             or opd.ndim > 2
             or (offset is not None and offset.ndim > 1)
-            or not {*self._moving, "detector_shift"}.isdisjoint(values)
             or not all(is_plain(t) for t in fixed)
             or not all(has_memory(t) for t in (opd, *values.values()))
         ):
@@ -212,27 +222,53 @@ class LatticeRoute:
         values: Values,
         onto: Sequence[PupilGrid],
     ) -> _StreamedStar:
-        if wavelength not in self._stars:
-            if self._stream is None:
-                self._stream = PupilStream(entrance.amplitude, entrance.grid)
-            lattice = self.lattice(wavelength)
-            stop = self._stop(onto, wavelength, values)
-            cells = lattice.x.positions, lattice.y.positions
-            branches = [
-                Branch(grid, factor, *axes, wavelength, self.detector.dtype, lattice.shear)
-                for grid, factor, axes in (
-                    (entrance.grid, None, cells),
-                    (stop.grid, stop.field, self.detector.axes(values)),
-                )
-            ]
-            self._stars[wavelength] = _StreamedStar(
-                self._stream,
-                branches,
-                lattice,
-                self._kernel(stop, values),
-                self.detector.per_sample,
+        return _kept(
+            self._stars,
+            wavelength,
+            position_of(values, self._moving),
+            lambda: self._make_streamed(entrance, wavelength, values, onto),
+        )
+
+    def _make_streamed(
+        self,
+        entrance: EntrancePupil,
+        wavelength: float,
+        values: Values,
+        onto: Sequence[PupilGrid],
+    ) -> _StreamedStar:
+        if self._stream is None:
+            self._stream = PupilStream(entrance.amplitude, entrance.grid)
+        lattice = self.lattice(wavelength)
+        stop = self._stop(onto, wavelength, values)
+        cells = lattice.x.positions, lattice.y.positions
+        branches = [
+            Branch(grid, factor, *axes, wavelength, self.detector.dtype, lattice.shear)
+            for grid, factor, axes in (
+                (entrance.grid, None, cells),
+                (stop.grid, stop.field, self.detector.axes({})),
             )
-        return self._stars[wavelength]
+        ]
+        return _StreamedStar(
+            self._stream, branches, lattice, self._kernel(stop, values), self.detector.per_sample
+        )
+
+
+def _kept(
+    store: dict[float, tuple[Position, T]],
+    wavelength: float,
+    position: Position | None,
+    make: Callable[[], T],
+) -> T:
+    """What was made last for a wavelength, if it was made at this position, else a new one.
+
+    Nothing is kept of what is being differentiated (position None).
+    """
+    if position is None:
+        return make()
+    kept = store.get(wavelength)
+    if kept is None or kept[0] != position:
+        kept = store[wavelength] = (position, make())
+    return kept[1]
 
 
 @dataclass(frozen=True)
