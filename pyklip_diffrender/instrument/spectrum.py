@@ -14,12 +14,12 @@ from pyklip_diffrender.io.files import embedded_table
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.optics.bandpass import Bandpass
 
-__all__ = ["blackbody", "filter_bandpass", "filter_names", "filter_throughput"]
+__all__ = ["blackbody", "filter_bandpass", "filter_throughput"]
 
 
 @lru_cache(maxsize=1)
 def _throughputs() -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    table = embedded_table("nircam_lw_filters")
+    table = embedded_table("nircam_filters")
     curves = {}
     for name in dict.fromkeys(str(value) for value in table["filter"]):
         rows = table[table["filter"] == name]
@@ -30,24 +30,20 @@ def _throughputs() -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
     return curves
 
 
-def filter_names() -> tuple[str, ...]:
-    """The filters that can be used with MASK335R and have an embedded throughput."""
-    return tuple(_throughputs())
-
-
 def filter_throughput(name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Wavelengths (m) and photon conversion efficiency of a filter.
+    """Wavelengths (m) and relative response (peak 1) of a filter, to be interpolated linearly.
 
     Raises
     ------
     IncompatibleSetupError
-        If the filter is not a long-wave filter that goes with MASK335R.
+        If the filter has no embedded throughput.
     """
     try:
         return _throughputs()[name.upper()]
     except KeyError:
         raise IncompatibleSetupError(
-            f"filter {name!r} is not one that MASK335R takes; those are {', '.join(filter_names())}"
+            f"filter: got {name!r}, expected one that goes with a round mask: "
+            f"{', '.join(_throughputs())}"
         ) from None
 
 
@@ -96,8 +92,10 @@ def filter_bandpass(
     if nlambda < 1:
         raise ValueError(f"nlambda: got {nlambda}, expected at least 1")
     wavelength, throughput = filter_throughput(name)
-    used = np.flatnonzero(throughput > 0.01 * throughput.max())
-    fine = np.linspace(wavelength[used[0]], wavelength[used[-1]], 200 * nlambda + 1)
+    # The table has few points: where it passes 1 % may be anywhere between two of them.
+    dense = np.linspace(wavelength[0], wavelength[-1], 20_001)
+    used = dense[np.interp(dense, wavelength, throughput) > 0.01 * throughput.max()]
+    fine = np.linspace(used[0], used[-1], 200 * nlambda + 1)
     middle = (fine[1:] + fine[:-1]) / 2
     if isinstance(source, tuple):
         grid, flux = native_float64(source[0]), native_float64(source[1])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
@@ -114,19 +114,15 @@ class PixelCrosstalk:
         values = native_float64(kernel)
         if values.ndim != 2 or values.shape[0] % 2 == 0 or values.shape[1] % 2 == 0:
             raise ShapeError(f"kernel: got shape {values.shape}, expected two odd lengths")
-        self.kernel: NDArray[np.float64] = values / values.sum()
+        self.kernel = torch.from_numpy(values / values.sum())
 
     def __call__(self, image: Tensor) -> Tensor:
         """Convolve (..., rows, columns)."""
-        half_y, half_x = (n // 2 for n in self.kernel.shape)
-        padded = torch.nn.functional.pad(image, (half_x, half_x, half_y, half_y))
-        rows, columns = image.shape[-2:]
-        total = torch.zeros_like(image)
-        for i, line in enumerate(self.kernel[::-1]):
-            for j, weight in enumerate(line[::-1]):
-                if weight != 0:
-                    total = total + float(weight) * padded[..., i : i + rows, j : j + columns]
-        return total
+        # What torch calls a convolution is a correlation: with the kernel turned, it is one.
+        turned = self.kernel.flip(0, 1).to(image)[None, None]
+        padding = (self.kernel.shape[0] // 2, self.kernel.shape[1] // 2)
+        images = image.reshape(-1, 1, *image.shape[-2:])
+        return torch.nn.functional.conv2d(images, turned, padding=padding).reshape(image.shape)
 
 
 @dataclass

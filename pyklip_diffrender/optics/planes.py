@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.differentiation import Position, position_of
 from pyklip_diffrender.optics.fourier import MatrixFourier, centred, tilt_phases
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, transform_polygons
 from pyklip_diffrender.optics.zernike import zernike_basis
@@ -190,28 +191,32 @@ class LyotStop:
         self.openings = openings
         self.diameter = diameter
         self.dtype, self.device = dtype, device
-        self._full = PupilGrid.full(npix, diameter)
-        coverage = polygon_coverage(openings, self._full)
-        # Symmetric about the axis, for then transforms are half as large.
-        self._tight = centred(self._full.around(coverage))
+        full = PupilGrid.full(npix, diameter)
+        # Symmetric about the axis, for then transforms are half as large. Windows are just these
+        # two, for whatever else is kept is kept for each.
+        self._tight = centred(full.around(polygon_coverage(openings, full)))
         self._wide = self._tight.widened(self.margin * diameter)
-        self._fixed = self._full.crop(coverage, self._tight).to(device, dtype)
-
-    def _moves(self, values: Values) -> bool:
-        return any(name in values for name in self.parameters)
+        self._kept: dict[PupilGrid, tuple[Position, Tensor]] = {}
 
     def window(self, values: Values) -> PupilGrid:
-        return self._wide if self._moves(values) else self._tight
+        return self._tight if set(self.parameters).isdisjoint(values) else self._wide
 
     def amplitude(self, values: Values) -> Tensor:
         """Transmission on the window, (rows, columns)."""
-        if not self._moves(values):
-            return self._fixed
+        position, grid = position_of(values, self.parameters), self.window(values)
+        if position is None:
+            return self._coverage(values, grid)
+        kept = self._kept.get(grid)
+        if kept is None or kept[0] != position:
+            kept = self._kept[grid] = (position, self._coverage(values, grid))
+        return kept[1]
+
+    def _coverage(self, values: Values, grid: PupilGrid) -> Tensor:
         zero = torch.zeros(2, dtype=torch.float64)
         shift = values.get("lyot_shift", zero).cpu() * self.diameter
         rotation = torch.deg2rad(values.get("lyot_rotation", zero[:1]).cpu()).reshape(())
         moved = transform_polygons(self.openings, shift, rotation)
-        return polygon_coverage(moved, self._wide).to(self.device, self.dtype)
+        return polygon_coverage(moved, grid).to(self.device, self.dtype)
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         grid = self.window(values)

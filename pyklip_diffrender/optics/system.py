@@ -62,11 +62,22 @@ class OpticalSystem:
         How light gets to the detector: by convolution on cells that fit the detector (`cells`),
         which is for one round occulter between pupils, or plane by plane, which is for all.
         "auto" takes the first where it can be had and the detector is not very fine.
+    defaults : mapping of str to value, optional
+        Values at which named parameters stand where a call does not give them, in the units of
+        the parameter table: how the instrument is aligned, or what an earlier fit has found. Not
+        ``star_offset``, which belongs to a source and not to the instrument.
+
+    Attributes
+    ----------
+    defaults : dict of str to Tensor
 
     Raises
     ------
     IncompatibleSetupError
-        For the route "lattice" through planes that it does not take.
+        For the route "lattice" through planes that it does not take, and for a default
+        ``star_offset``.
+    TypeError, ShapeError, UnitError
+        For defaults that `values` refuses.
     """
 
     def __init__(
@@ -78,6 +89,7 @@ class OpticalSystem:
         recipe: dict[str, Any] | None = None,
         remake: Callable[..., OpticalSystem] | None = None,
         route: str = "auto",
+        defaults: Mapping[str, Value] | None = None,
     ) -> None:
         self.entrance = entrance
         self.planes = tuple(planes)
@@ -99,6 +111,13 @@ class OpticalSystem:
                 "route 'lattice': the planes are not one round occulter between factors in "
                 "pupils; use 'auto' or 'planes'"
             )
+        if defaults and "star_offset" in defaults:
+            raise IncompatibleSetupError(
+                "defaults: star_offset belongs to a source; give it in the call, or move the "
+                "optical axis with detector_shift"
+            )
+        self.defaults: dict[str, Tensor] = {}
+        self.defaults = self.values(defaults or {})
 
     def __repr__(self) -> str:
         names = ", ".join(
@@ -211,7 +230,8 @@ class OpticalSystem:
     def values(self, given: Mapping[str, Value | None]) -> dict[str, Tensor]:
         """Check named parameter values and make them float64 tensors, (components,) each.
 
-        Quantities are converted to the unit of the parameter table.
+        Quantities are converted to the unit of the parameter table. Parameters that are not
+        given, or are None, stand at the system's `defaults`, where it has them.
 
         Raises
         ------
@@ -222,7 +242,7 @@ class OpticalSystem:
         UnitError
             For a Quantity of another kind.
         """
-        checked = {}
+        checked = dict(self.defaults)
         for name, value in given.items():
             if value is None:
                 continue

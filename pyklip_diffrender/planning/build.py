@@ -62,6 +62,7 @@ class CheapSystem(OpticalSystem):
             recipe=made.recipe,
             remake=partial(_remade, made, band, tuple(without)) if made.recipe else None,
             route=made.route,
+            defaults=made.defaults,
         )
         self._corrections: dict[float, Tensor] = {}
 

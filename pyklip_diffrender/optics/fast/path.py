@@ -8,15 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.differentiation import (
+    Position,
+    has_memory,
+    is_plain,
+    position_of,
+)
 from pyklip_diffrender.optics.fast.occulter import DEFAULT_SAMPLING, OcculterLattice, finest_spacing
-from pyklip_diffrender.optics.fast.streaming import Branch, PupilStream, has_memory, is_plain
+from pyklip_diffrender.optics.fast.streaming import Branch, PupilStream
 from pyklip_diffrender.optics.fourier import tilt_phases
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import (
@@ -32,6 +38,8 @@ from pyklip_diffrender.optics.planes import (
 from pyklip_diffrender.optics.sampled_planes import Gain, PupilOptic
 
 __all__ = ["LatticeRoute", "is_pointwise"]
+
+T = TypeVar("T")
 
 _POINTWISE = (Gain, InternalAberration, LyotStop, PupilOptic, PupilStop)
 
@@ -62,10 +70,12 @@ class LatticeRoute:
         self.planes, self.detector = tuple(planes), detector
         (self._place,) = (k for k, p in enumerate(planes) if isinstance(p, CompactOcculter))
         behind = planes[self._place + 1 :]
-        self._moving = {name for plane in behind for name in plane.parameters}
+        self._moving = {name for plane in behind for name in plane.parameters} | {"detector_shift"}
         self._lattices: dict[float, OcculterLattice] = {}
-        self._kept: dict[float, tuple[Any, Wavefront, Tensor]] = {}
-        self._stars: dict[float, _StreamedStar] = {}
+        # The latest at each wavelength, with where the planes behind the occulter stood.
+        self._stops: dict[float, tuple[Position, Wavefront]] = {}
+        self._kernels: dict[float, tuple[Position, Tensor]] = {}
+        self._stars: dict[float, tuple[Position, _StreamedStar]] = {}
         self._stream: PupilStream | None = None
 
     @staticmethod
@@ -103,33 +113,19 @@ class LatticeRoute:
             )
         return self._lattices[wavelength]
 
-    def _behind(
-        self, onto: Sequence[PupilGrid], wavelength: float, values: Values
-    ) -> tuple[Wavefront, Tensor]:
-        """The planes behind the occulter as one stop, and the kernel that goes with it.
-
-        Both are kept for the values that they were last computed with: the response to thousands
-        of modes asks for them again and again.
-        """
-        moving = {n: v for n, v in values.items() if n in self._moving or n == "detector_shift"}
-        key = None
-        if all(is_plain(value) for value in moving.values()):
-            own = tuple((name, tuple(value.flatten().tolist())) for name, value in moving.items())
-            key = (onto[self._place], own)
-            kept = self._kept.get(wavelength)
-            if kept is not None and kept[0] == key:
-                return kept[1], kept[2]
-        stop = self._stop(onto, wavelength, values)
-        kernel = self.lattice(wavelength).kernel(stop, self.detector.axes({}))
-        if key is not None:
-            self._kept[wavelength] = (key, stop, kernel)
-        return stop, kernel
-
     def _stop(self, onto: Sequence[PupilGrid], wavelength: float, values: Values) -> Wavefront:
         """What the planes behind the occulter make of a field of ones.
 
         A shift of the detector is a tilt there, so that the rest does not see it.
         """
+        return _kept(
+            self._stops,
+            wavelength,
+            position_of(values, self._moving),
+            lambda: self._make_stop(onto, wavelength, values),
+        )
+
+    def _make_stop(self, onto: Sequence[PupilGrid], wavelength: float, values: Values) -> Wavefront:
         grid = onto[self._place]
         ones = torch.ones(
             grid.shape, dtype=self.detector.dtype.to_complex(), device=self.detector.device
@@ -149,6 +145,14 @@ class LatticeRoute:
         ]
         return replace(stop, field=stop.field * factors[0][None, :] * factors[1][:, None])
 
+    def _kernel(self, stop: Wavefront, values: Values) -> Tensor:
+        return _kept(
+            self._kernels,
+            stop.wavelength,
+            position_of(values, self._moving),
+            lambda: self.lattice(stop.wavelength).kernel(stop, self.detector.axes({})),
+        )
+
     def field(self, wavefront: Wavefront, values: Values, onto: Sequence[PupilGrid]) -> Tensor:
         """Field on the detector's samples from that behind the entrance pupil.
 
@@ -162,11 +166,11 @@ class LatticeRoute:
         for plane, window in zip(self.planes[: self._place], onto, strict=False):
             wavefront = plane.apply(wavefront, values, window)
         lattice = self.lattice(wavefront.wavelength)
-        stop, kernel = self._behind(onto, wavefront.wavelength, values)
+        stop = self._stop(onto, wavefront.wavelength, values)
         passed = wavefront.grid.crop(wavefront.field, stop.grid) * stop.field
         direct = self.detector.field(replace(stop, field=passed), {})
         light = lattice.focus(wavefront) * lattice.blocked
-        return direct - lattice.convolve(light, kernel)
+        return direct - lattice.convolve(light, self._kernel(stop, values))
 
     def star(
         self,
@@ -182,7 +186,7 @@ class LatticeRoute:
         -------
         Tensor or None
             It can be differentiated in reverse mode with respect to the OPD and to the star's
-            offset. None where other derivatives, several stars or moving planes are asked for.
+            offset. None where other derivatives or several stars are asked for.
         """
         offset = values.get("star_offset")
         fixed = [value for name, value in values.items() if name != "star_offset"]
@@ -192,7 +196,6 @@ class LatticeRoute:
             or opd.device.type != "cpu"
             or opd.ndim > 2
             or (offset is not None and offset.ndim > 1)
-            or not {*self._moving, "detector_shift"}.isdisjoint(values)
             or not all(is_plain(t) for t in fixed)
             or not all(has_memory(t) for t in (opd, *values.values()))
         ):
@@ -219,27 +222,53 @@ class LatticeRoute:
         values: Values,
         onto: Sequence[PupilGrid],
     ) -> _StreamedStar:
-        if wavelength not in self._stars:
-            if self._stream is None:
-                self._stream = PupilStream(entrance.amplitude, entrance.grid)
-            lattice = self.lattice(wavelength)
-            stop, kernel = self._behind(onto, wavelength, values)
-            cells = lattice.x.positions, lattice.y.positions
-            branches = [
-                Branch(grid, factor, *axes, wavelength, self.detector.dtype, lattice.shear)
-                for grid, factor, axes in (
-                    (entrance.grid, None, cells),
-                    (stop.grid, stop.field, self.detector.axes(values)),
-                )
-            ]
-            self._stars[wavelength] = _StreamedStar(
-                self._stream,
-                branches,
-                lattice,
-                kernel,
-                self.detector.per_sample,
+        return _kept(
+            self._stars,
+            wavelength,
+            position_of(values, self._moving),
+            lambda: self._make_streamed(entrance, wavelength, values, onto),
+        )
+
+    def _make_streamed(
+        self,
+        entrance: EntrancePupil,
+        wavelength: float,
+        values: Values,
+        onto: Sequence[PupilGrid],
+    ) -> _StreamedStar:
+        if self._stream is None:
+            self._stream = PupilStream(entrance.amplitude, entrance.grid)
+        lattice = self.lattice(wavelength)
+        stop = self._stop(onto, wavelength, values)
+        cells = lattice.x.positions, lattice.y.positions
+        branches = [
+            Branch(grid, factor, *axes, wavelength, self.detector.dtype, lattice.shear)
+            for grid, factor, axes in (
+                (entrance.grid, None, cells),
+                (stop.grid, stop.field, self.detector.axes({})),
             )
-        return self._stars[wavelength]
+        ]
+        return _StreamedStar(
+            self._stream, branches, lattice, self._kernel(stop, values), self.detector.per_sample
+        )
+
+
+def _kept(
+    store: dict[float, tuple[Position, T]],
+    wavelength: float,
+    position: Position | None,
+    make: Callable[[], T],
+) -> T:
+    """What was made last for a wavelength, if it was made at this position, else a new one.
+
+    Nothing is kept of what is being differentiated (position None).
+    """
+    if position is None:
+        return make()
+    kept = store.get(wavelength)
+    if kept is None or kept[0] != position:
+        kept = store[wavelength] = (position, make())
+    return kept[1]
 
 
 @dataclass(frozen=True)

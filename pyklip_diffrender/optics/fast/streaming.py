@@ -15,32 +15,14 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.autograd.forward_ad import unpack_dual
 
 from pyklip_diffrender.optics.fourier import RowTransform, centred, kernel, symmetric, tilt_phases
 from pyklip_diffrender.optics.grid import PupilGrid
 
-__all__ = ["Branch", "PupilStream", "has_memory", "is_plain"]
+__all__ = ["Branch", "PupilStream"]
 
 _ROWS = 128
 """Rows of a block, for each thread: about 2 MB an array for 1024 samples across the pupil."""
-
-
-def has_memory(tensor: Tensor) -> bool:
-    """Whether a tensor is itself, and takes part in no transform of `torch.func`.
-
-    Those of reverse mode by `backward` or `torch.autograd.grad` do, whether they need it or not.
-    """
-    try:
-        tensor.data_ptr()
-    except RuntimeError:
-        return False  # It stands for others, and has no memory of its own.
-    return unpack_dual(tensor).tangent is None
-
-
-def is_plain(tensor: Tensor) -> bool:
-    """Whether a tensor takes part in no differentiation at all."""
-    return has_memory(tensor) and not (tensor.requires_grad and torch.is_grad_enabled())
 
 
 def _sides(array: Tensor) -> Tensor:
