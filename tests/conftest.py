@@ -27,6 +27,8 @@ import torch
 from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parents[1]
+# For the scripts in tests/benchmarks; last, so that an installed package comes before its source.
+sys.path.append(str(ROOT))
 
 # A deadline measures how busy the machine is; derandomised, a failure is there again tomorrow.
 settings.register_profile("quick", deadline=None, derandomize=True, max_examples=8)
