@@ -1,4 +1,8 @@
-"""Fixtures for all tests, and an environment in which two runs give the same numbers."""
+"""The two tiers of tests, fixtures for all, and an environment in which runs repeat.
+
+Plain ``pytest`` leaves out what is marked ``slow`` and tries few examples in each property test;
+``pytest --full`` runs everything.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +27,37 @@ import torch
 from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parents[1]
+# For the scripts in tests/benchmarks; last, so that an installed package comes before its source.
+sys.path.append(str(ROOT))
 
 # A deadline measures how busy the machine is; derandomised, a failure is there again tomorrow.
-settings.register_profile("diffrender", deadline=None, derandomize=True)
-settings.load_profile("diffrender")
+settings.register_profile("quick", deadline=None, derandomize=True, max_examples=8)
+settings.register_profile("full", settings.get_profile("quick"), max_examples=60)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--full",
+        action="store_true",
+        help="run the slow tests too (hard cases, studies), and more examples of property tests",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # Before the test modules are imported, whose settings start from the profile.
+    settings.load_profile("full" if config.getoption("--full") else "quick")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    for item in items:
+        if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
+            item.add_marker("fuzz")
+    if config.getoption("--full"):
+        return
+    slow = [item for item in items if item.get_closest_marker("slow")]
+    if slow:
+        config.hook.pytest_deselected(items=slow)
+        items[:] = [item for item in items if not item.get_closest_marker("slow")]
 
 
 @pytest.fixture(scope="session", autouse=True)

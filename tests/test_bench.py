@@ -1,9 +1,14 @@
-"""The benchmark: what it measures, what it says where it cannot, and the page made of it."""
+"""The speed benchmark: its answers are right, its bookkeeping too, and the page made of it.
+
+Nothing here asserts how long anything takes: machines are busy.
+"""
 
 from __future__ import annotations
 
 import math
-import time
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +17,21 @@ import pytest
 import torch
 from astropy.table import Table
 
-from pyklip_diffrender.bridges.plain import plain_stpsf
-from pyklip_diffrender.cli import main
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.plotting import draw_bench
-from tests.benchmarks.speed import Setting, rivals, run_bench, write_page, write_table
+from tests.benchmarks.speed import Setting, rivals, run_bench, timing, write_page, write_table
 from tests.benchmarks.speed import images as bench_images
+from tests.benchmarks.speed.__main__ import main
 from tests.benchmarks.speed.case import Case
+from tests.benchmarks.speed.figure import draw
 from tests.benchmarks.speed.images import forward
 from tests.benchmarks.speed.memory import memory_of, peak_memory
 from tests.benchmarks.speed.page import page, targets
+from tests.benchmarks.speed.plain import plain_stpsf
 from tests.benchmarks.speed.rivals import load, paper_recipe
 from tests.benchmarks.speed.rows import ROWS, chosen_rows
 from tests.benchmarks.speed.timing import exponent, interleaved
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +132,12 @@ def test_the_other_rows_run(here: Setting) -> None:
     assert fine["error"] < rough["error"] < 0.1
     one_by_one = line(table, "Jacobian", "mode by mode, forward mode on 128")
     assert one_by_one["times"] == 166
-    assert one_by_one["seconds"] > fine["seconds"]
+    assert one_by_one["error"] == 0
+    differences = line(table, "Jacobian", "finite differences of the paper's renderer")
+    assert differences["times"] == 167
+    # What the occulter leaves of the star is due to some 60 nm of wavefront; the square of a step
+    # of 1 nm is about 1 / (2 x 60) of its product with that, more where the star is faint.
+    assert fine["error"] < differences["error"] < 0.05
 
 
 def test_refinement_and_detection_run(here: Setting) -> None:
@@ -134,7 +146,6 @@ def test_refinement_and_detection_run(here: Setting) -> None:
     assert ours["error"] < line(table, "refinement", "the paper's recipe, 1000 Adam steps")["error"]
     curve = line(table, "contrast curve", "this package, 20 x 6 positions")
     assert curve["error"] < 0.05
-    assert curve["ratio"] > 50
     assert line(table, "S/N map", "this package, 576 positions")["error"] < 1e-3
 
 
@@ -145,20 +156,25 @@ def test_rows_are_chosen_by_how_they_begin() -> None:
         chosen_rows(["backward"])
 
 
-def test_durations_are_the_shortest_and_taken_in_turns() -> None:
-    calls: list[str] = []
+def test_durations_are_the_shortest_and_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that only the works advance."""
+    now, calls = [0.0], []
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
 
-    def work(name: str, seconds: float) -> Any:
+    def work(name: str, *durations: float) -> Any:
         def run() -> None:
             calls.append(name)
-            time.sleep(seconds)
+            now[0] += durations[min(calls.count(name), len(durations)) - 1]
 
         return run
 
-    short, long = interleaved([work("short", 0.001), work("long", 0.06)], 0.1)
-    assert 0.001 <= short < 0.06 <= long
-    assert calls.index("long") < len(calls) - 1 - calls[::-1].index("short")
-    assert calls.count("long") <= 2
+    short, long = interleaved([work("short", 0.003, 0.001, 0.002), work("long", 0.07, 0.06)], 0.14)
+    assert (short, long) == (pytest.approx(0.001), pytest.approx(0.06))
+    # What is short is called five times as soon as that is known. The long one fits in twice.
+    assert calls[:2] == ["short", "long"]
+    assert calls[2:7] == ["short"] * 5
+    assert calls.count("long") == 2
+    assert calls[-5:] == ["short"] * 5
 
 
 def test_exponents() -> None:
@@ -188,11 +204,21 @@ def test_page_and_figure_from_the_table_alone(measured: Table, tmp_path: Path) -
     table = run_bench(
         Setting(quick=True), ["scaling"], budget=0.01, memory=False, command="bench --quick"
     )
-    assert np.isfinite(list(table.meta["exponents"].values())).all()
     assert len(table.meta["exponents"]) == 5
-    assert all(limit.get("limit", 1) > 0 for limit in table.meta["limits"])
+    fields = table[table["row"] == "scaling: forward, field"]
+    assert list(fields["size"]) == [12, 24, 48]
+    power = np.polyfit(np.log(fields["size"]), np.log(fields["seconds"]), 1)[0]
+    assert table.meta["exponents"]["scaling: forward, field"] == round(float(power), 2)
+    *works, rates = table.meta["limits"]
+    for limit in works:
+        single = limit["what"] in ("multi-fidelity forward", "Jacobian")
+        rate = rates["float32" if single else "float64"]
+        assert limit["products_s"] == pytest.approx(1e9 * limit["gflop"] / rate)
+        # The products of a fit's step are counted alone.
+        names = ("products_s", "bytes_s", "cosines_s")[: 1 if "step" in limit["what"] else 3]
+        assert limit["limit"] == pytest.approx(sum(limit[name] for name in names))
     written = write_table(table, tmp_path / "results")
-    assert main(["bench", "--page", str(written), "-o", str(tmp_path)]) == 0
+    assert main(["--page", str(written), "-o", str(tmp_path)]) == 0
     text = (tmp_path / "performance.md").read_text(encoding="utf-8")
     assert "## Scaling" in text
     assert "nothing was measured on a GPU" in text
@@ -202,10 +228,24 @@ def test_page_and_figure_from_the_table_alone(measured: Table, tmp_path: Path) -
     text = path.read_text(encoding="utf-8")
     assert "| this package, 128 | float64, eager |" in text
     assert "not measured: no data directory" in text
-    assert len(draw_bench(measured).axes) == 2
 
 
-def test_what_was_asked_for_is_judged() -> None:
+def test_the_figure_shows_every_measured_case_at_its_place(measured: Table) -> None:
+    figure = draw(measured)
+    for ax, row in zip(figure.axes, ("forward", "forward + backward"), strict=True):
+        shown = sorted(
+            (float(one.get_xdata()[0]), float(one.get_ydata()[0]))
+            for one in ax.lines
+            if one.get_marker() == "o" and len(one.get_xdata())
+        )
+        cases = measured[(measured["row"] == row) & np.isfinite(measured["seconds"])]
+        assert shown == sorted(zip(cases["seconds"], cases["error"], strict=True))
+        assert ax.get_title(loc="left").lower() == row
+        labels = {text.get_text() for text in ax.texts}
+        assert {"this package, 128", "the paper's recipe"} <= labels
+
+
+def test_targets_are_judged_by_ratio_and_error() -> None:
     facts = {"precision": "float64", "sigma": math.nan}
     table = Table(
         [
@@ -223,11 +263,35 @@ def test_what_was_asked_for_is_judged() -> None:
 
 
 def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "--rows", "nothing", "-o", str(tmp_path)]) == 1
+    assert main(["--rows", "nothing", "-o", str(tmp_path)]) == 1
     assert "expected some of 'forward'" in capsys.readouterr().err
     options = ["--quick", "--no-memory", "--rows", "forward + backward", "-o", str(tmp_path)]
-    assert main(["bench", *options]) == 0
+    assert main(options) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"performance.ecsv", "performance.png"}
     table = Table.read(tmp_path / "performance.ecsv", format="ascii.ecsv")
-    assert table.meta["command"] == ("pyklip-diffrender bench --quick --rows 'forward + backward'")
-    assert page(table).startswith("# Performance")
+    command = "python -m tests.benchmarks.speed --quick --rows 'forward + backward'"
+    assert table.meta["command"] == command
+    assert f"by `{command}`" in page(table)
+
+
+def test_a_gpu_that_is_not_there_is_a_usage_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SystemExit) as ended:
+        main(["--device", "cuda"])
+    assert ended.value.code == 2
+    assert "finds no GPU" in capsys.readouterr().err
+
+
+def test_it_runs_as_a_script(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.benchmarks.speed", "--help"],
+        cwd=ROOT,
+        env={k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "--quick" in done.stdout

@@ -5,7 +5,9 @@ from __future__ import annotations
 import gzip
 import hashlib
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -246,14 +248,66 @@ def test_a_written_file_reads_back_and_leaves_nothing_else(tmp_path: Path, suffi
         np.testing.assert_array_equal(hdus[0].data, 2 * data)
 
 
-def test_products_have_the_permissions_that_the_user_asked_for(tmp_path: Path) -> None:
-    path = tmp_path / "product.fits"
-    before = os.umask(0o027)
-    try:
+@pytest.fixture
+def umask() -> Iterator[Callable[[int], int]]:
+    """Sets the process's umask, and puts it back."""
+    before = os.umask(0o022)
+    yield os.umask
+    os.umask(before)
+
+
+def permissions(path: Path) -> int:
+    return path.stat().st_mode & 0o777
+
+
+@pytest.mark.parametrize("suffix", [".fits", ".txt"])
+def test_a_new_product_has_the_permissions_of_any_new_file(
+    tmp_path: Path, umask: Callable[[int], int], suffix: str
+) -> None:
+    """astropy makes its own file in the place of the temporary one, other writers do not."""
+    for mask, expected in ((0o027, 0o640), (0o022, 0o644), (0o077, 0o600)):
+        path = tmp_path / f"{mask:o}{suffix}"
+        umask(mask)
+        if suffix == ".fits":
+            write_fits(fits.HDUList([fits.PrimaryHDU()]), path)
+        else:
+            with replacing(path) as temporary:
+                temporary.write_text("new")
+        assert permissions(path) == expected
+
+
+def test_a_replaced_product_keeps_its_permissions(
+    tmp_path: Path, umask: Callable[[int], int]
+) -> None:
+    path = written(tmp_path / "product.fits")
+    umask(0o022)
+    for mode in (0o660, 0o444, 0o600):
+        path.chmod(mode)
         write_fits(fits.HDUList([fits.PrimaryHDU()]), path)
-    finally:
-        os.umask(before)
-    assert path.stat().st_mode & 0o777 == 0o640
+        assert permissions(path) == mode
+
+
+def test_writing_leaves_the_umask_of_the_process_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is one for all threads: files that another one makes meanwhile would be open to all."""
+    monkeypatch.setattr(os, "umask", lambda mask: pytest.fail(f"umask set to {mask:o}"))
+    write_fits(fits.HDUList([fits.PrimaryHDU()]), tmp_path / "product.fits")
+
+
+def test_two_threads_that_write_one_product_leave_one_of_the_two(tmp_path: Path) -> None:
+    """Each has a temporary file of its own."""
+    path, both = tmp_path / "product.txt", threading.Barrier(2)
+
+    def write(word: str) -> None:
+        with replacing(path) as temporary:
+            both.wait(10)
+            temporary.write_text(1000 * word)
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(write, ["a", "b"]))
+    assert path.read_text() in (1000 * "a", 1000 * "b")
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_failure_while_writing_leaves_the_old_file(tmp_path: Path) -> None:

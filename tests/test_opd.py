@@ -352,6 +352,7 @@ def test_there_is_light_nowhere_but_in_the_pupil() -> None:
     assert not random_opd(1, npix=NPIX).data[jwst_pupil(NPIX).numpy() == 0].any()
 
 
+@pytest.mark.slow
 def test_segments_carry_the_share_of_the_variance_that_was_measured() -> None:
     """24 % of the wavefront, 62 % of its drift.
 

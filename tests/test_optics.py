@@ -261,6 +261,7 @@ def test_gradcheck_of_the_opd() -> None:
 
 
 @pytest.mark.hard
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["opd", *(p.name for p in OPTICAL_PARAMETERS)])
 def test_full_size_directional_derivative(name: str) -> None:
     """At 1024 pixels, 80 x 80: reverse mode against a fourth-order finite difference."""

@@ -59,6 +59,8 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "no occulter": ({"image_mask": None}, {}),
     "no Lyot stop": ({"pupil_mask": None}, {}),
 }
+QUICK = ("on axis", "ND squares, 0.6 arcsec", "jitter and diffusion", "no Lyot stop")
+"""The others need ``--full``."""
 
 
 def nircam(
@@ -80,7 +82,10 @@ def nircam(
     return instrument
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=() if case in QUICK else pytest.mark.slow) for case in CASES],
+)
 def test_images_agree_to_rounding(stpsf_path: Path, case: str) -> None:
     """Much closer than required: both sample the same points."""
     options, changes = CASES[case]

@@ -19,6 +19,9 @@ NPIX = 128
 WAVELENGTH = 4.5e-6
 # Off both axes and off the diagonals, in the order of the specification.
 SEPARATIONS = (0.0, 0.01, 0.05, 0.3, 0.6, 1.5, 2.3)
+QUICK = (0.0, 0.6)
+"""The others need ``--full``."""
+
 ANGLE = 0.7
 
 
@@ -59,7 +62,11 @@ def error(image: Array, truth: Array) -> float:
     return float(np.abs(image - truth).max() / truth.max())
 
 
-@pytest.fixture(scope="module", params=SEPARATIONS, ids=lambda r: f"{r} arcsec")
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(r, marks=() if r in QUICK else pytest.mark.slow) for r in SEPARATIONS],
+    ids=lambda r: f"{r} arcsec",
+)
 def converged(request: pytest.FixtureRequest) -> tuple[float, Array]:
     separation = request.param
     finest, before = theirs(16, separation), theirs(8, separation)

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
@@ -60,7 +60,6 @@ def unit_wavefront(seed: int, npix: int) -> torch.Tensor:
 # -- energy ------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40)
 @given(npix=SAMPLES, ny=SIDES, nx=SIDES, oversample=st.integers(1, 3), offset=OFFSETS, rms=RMS,
        seed=SEEDS, mask=st.sampled_from(["MASK335R", None]))  # fmt: skip
 def test_no_image_holds_more_light_than_the_pupil_collects(
@@ -74,7 +73,6 @@ def test_no_image_holds_more_light_than_the_pupil_collects(
     assert 0 < float(image.sum()) <= 1 + ROUNDING
 
 
-@settings(max_examples=40)
 @given(npix=SAMPLES, offset=OFFSETS, rms=RMS, seed=SEEDS,
        shift=st.tuples(st.floats(-0.04, 0.04), st.floats(-0.04, 0.04)),
        angle=st.floats(-4, 4))  # fmt: skip
@@ -107,7 +105,6 @@ def power(wavefront: Wavefront) -> float:
     return float((wavefront.field.abs() ** 2).sum()) * wavefront.grid.spacing**2
 
 
-@settings(max_examples=40)
 @given(shift=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)), angle=st.floats(-10, 10),
        npix=st.integers(2, 40))  # fmt: skip
 def test_stops_never_amplify_and_keep_their_area(
@@ -130,7 +127,6 @@ def test_stops_never_amplify_and_keep_their_area(
         assert float(cover.sum()) * grid.spacing**2 == pytest.approx(area, rel=1e-9)
 
 
-@settings(max_examples=30)
 @given(ny=st.integers(2, 20), nx=st.integers(2, 20), oversample=st.integers(1, 3),
        sigma=st.floats(0, 0.1), seed=SEEDS)  # fmt: skip
 def test_blur_and_binning_keep_the_light(
@@ -139,16 +135,18 @@ def test_blur_and_binning_keep_the_light(
     detector = system(48, ny, nx, oversample).detector
     generator = torch.Generator().manual_seed(seed)
     samples = torch.rand(oversample * ny, oversample * nx, generator=generator).double()
-    image = detector.image(samples, {"blur": torch.tensor([sigma], dtype=torch.float64)})
+    blur = {"blur": torch.tensor([sigma], dtype=torch.float64)}
+    image = detector.image(samples, blur)
     assert image.shape == (ny, nx)
     assert float(image.sum()) == pytest.approx(float(samples.sum()), rel=1e-10)
-    assert float(image.std()) <= float(detector.image(samples, {}).std()) * (1 + ROUNDING)
+    # No blur adds contrast to what it is applied to. (Binning afterwards may: it aliases.)
+    blurred = system(48, oversample * ny, oversample * nx).detector.image(samples, blur)
+    assert float(blurred.std()) <= float(samples.std()) * (1 + ROUNDING)
 
 
 # -- flux --------------------------------------------------------------------------------------
 
 
-@settings(max_examples=30)
 @given(factor=st.floats(1e-12, 1e12), npix=SAMPLES, offset=OFFSETS, seed=SEEDS)
 def test_images_are_linear_in_the_spectrum(
     factor: float, npix: int, offset: tuple[float, float], seed: int
@@ -162,7 +160,6 @@ def test_images_are_linear_in_the_spectrum(
     )
 
 
-@settings(max_examples=30)
 @given(contrasts=st.tuples(st.floats(1e-10, 1.0), st.floats(1e-10, 1.0)),
        magnitude=st.floats(-2, 15), background=st.floats(0, 1e6))  # fmt: skip
 def test_scenes_are_linear_in_star_planets_and_background(
@@ -190,7 +187,6 @@ def test_scenes_are_linear_in_star_planets_and_background(
 # -- shapes ------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40)
 @given(npix=SAMPLES, ny=SIDES, nx=SIDES, more=st.tuples(st.integers(0, 4), st.integers(0, 4)),
        offset=OFFSETS, seed=SEEDS)  # fmt: skip
 def test_odd_and_even_arrays_see_the_same_image(
@@ -204,7 +200,6 @@ def test_odd_and_even_arrays_see_the_same_image(
     torch.testing.assert_close(large[:ny, :nx], small, rtol=1e-8, atol=1e-14)
 
 
-@settings(max_examples=40)
 @given(npix=SAMPLES, ny=SIDES, nx=SIDES, offset=OFFSETS, seed=SEEDS)
 def test_a_tilted_wavefront_is_a_star_off_the_axis(
     npix: int, ny: int, nx: int, offset: tuple[float, float], seed: int
@@ -218,7 +213,6 @@ def test_a_tilted_wavefront_is_a_star_off_the_axis(
     )
 
 
-@settings(max_examples=60)
 @given(npix=st.integers(3, 9), data=st.data(), nx=SIDES, ny=SIDES, shear=st.floats(-0.1, 0.1),
        centred=st.booleans(), fold=st.booleans())  # fmt: skip
 def test_the_matrix_transform_is_the_plain_sum(
@@ -248,7 +242,6 @@ def test_the_matrix_transform_is_the_plain_sum(
     assert float(plain.abs().max()) > 0
 
 
-@settings(max_examples=30)
 @given(npix=st.integers(2, 40), factor=st.integers(2, 4), slope=st.tuples(
     st.floats(-1e-6, 1e-6), st.floats(-1e-6, 1e-6)))  # fmt: skip
 def test_resampling_by_whole_factors_keeps_means_and_planes(
@@ -261,19 +254,17 @@ def test_resampling_by_whole_factors_keeps_means_and_planes(
     np.testing.assert_allclose(resample(plane(npix * factor), npix), plane(npix), atol=1e-19)
 
 
-@settings(max_examples=12)
-@given(npix=st.integers(1, 40))
+@pytest.mark.parametrize("npix", [2, 7, 16, 31, 39])
 def test_pupils_of_any_size_have_the_same_area(npix: int) -> None:
-    """To the pixels in which a strut crosses the edge of a segment."""
+    """To the pixels in which a strut crosses the edge of a segment: 1.7e-4, the most, at 39."""
     cover = jwst_pupil(npix)
     assert cover.shape == (npix, npix)
     assert 0 <= float(cover.min()) <= float(cover.max()) <= 1
     area = float(cover.sum()) * (JWST_DIAMETER / npix) ** 2
-    reference = float(jwst_pupil(40).sum()) * (JWST_DIAMETER / 40) ** 2
+    reference = float(jwst_pupil(1).sum()) * JWST_DIAMETER**2
     assert area == pytest.approx(reference, rel=2e-4)
 
 
-@settings(max_examples=60)
 @given(ny=st.integers(3, 12), nx=st.integers(3, 12), size=st.integers(1, 3),
        place=st.tuples(st.floats(0, 1), st.floats(0, 1)))  # fmt: skip
 def test_cutouts_of_any_size_hold_the_star_in_their_middle(
@@ -295,7 +286,6 @@ def test_cutouts_of_any_size_hold_the_star_in_their_middle(
     np.testing.assert_array_equal(cut.data[0], data[rows, columns])
 
 
-@settings(max_examples=60)
 @given(separation=st.floats(1e-3, 10), angle=st.floats(-720, 720))
 def test_position_angles_go_round(separation: float, angle: float) -> None:
     x, y = Planet(1.0, separation, angle).offset

@@ -1,31 +1,51 @@
-"""Figures of merit on a subtracted image, as the paper and as statisticians define them."""
+"""Figures of merit on a subtracted image, as the paper and as statisticians define them.
+
+Pixels are taken whole: those whose centres lie inside an aperture, with the edge of a circle
+included. Positions are x, y in pixels, with (0, 0) at the centre of the first pixel.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from photutils.aperture import ApertureStats, CircularAnnulus, CircularAperture
 
 __all__ = ["annulus_snr", "aperture_sum", "psnr", "star_model_error", "throughput"]
 
 Image = NDArray[np.float64]
+Position = tuple[float, float]
 
 
-def _distance(shape: tuple[int, ...], position: tuple[float, float]) -> Image:
-    y, x = np.indices(shape)
-    return np.hypot(x - position[0], y - position[1])
+def _circle(position: Position, radius: float) -> CircularAperture:
+    # photutils leaves out centres that lie exactly on an outer edge.
+    return CircularAperture(position, np.nextafter(radius, np.inf))
 
 
-def aperture_sum(image: Image, position: tuple[float, float], radius: float) -> float:
+def _ring(center: Position, inner: float, outer: float) -> CircularAperture | CircularAnnulus:
+    if inner <= 0:  # photutils has no annulus without a hole.
+        return _circle(center, outer)
+    return CircularAnnulus(center, inner, np.nextafter(outer, np.inf))
+
+
+def _inside(aperture: Any, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Pixels of an image that an aperture takes."""
+    inside = aperture.to_mask(method="center").to_image(shape)
+    return np.zeros(shape, dtype=bool) if inside is None else inside > 0
+
+
+def aperture_sum(image: Image, position: Position, radius: float) -> float:
     """Sum over the pixels whose centres lie within `radius` pixels of `position` (x, y)."""
-    return float(image[_distance(image.shape, position) <= radius].sum())
+    sums, _ = _circle(position, radius).do_photometry(image, method="center")
+    return float(sums[0])
 
 
 def annulus_snr(
     image: Image,
-    position: tuple[float, float],
-    center: tuple[float, float],
+    position: Position,
+    center: Position,
     radius: float = 1.5,
     half_width: float = 1.5,
 ) -> float:
@@ -34,7 +54,7 @@ def annulus_snr(
     Parameters
     ----------
     image : ndarray, (ny, nx)
-        Star-subtracted.
+        Star-subtracted. Pixels that are not finite are left out.
     position : tuple of float
         x, y of the planet, pixels.
     center : tuple of float
@@ -53,37 +73,38 @@ def annulus_snr(
         aperture counts as scatter, so that it saturates near 30, and it knows nothing of lost
         planet light (see `throughput`).
     """
-    near = (_distance(image.shape, position) <= radius) & np.isfinite(image)
+    circle = _circle(position, radius)
     separation = math.dist(position, center)
-    ring = np.abs(_distance(image.shape, center) - separation) <= half_width
-    background = image[ring & ~near & np.isfinite(image)]
-    signal = image[near].mean() - background.mean()
-    return float(signal / background.std() * math.sqrt(near.sum()))
+    ring = _ring(center, separation - half_width, separation + half_width)
+    planet = ApertureStats(image, circle, sum_method="center")
+    around = ApertureStats(image, ring, mask=_inside(circle, image.shape), sum_method="center")
+    signal = planet.mean - around.mean
+    return float(signal / around.std * np.sqrt(planet.center_aper_area.value))
 
 
 def throughput(
     image: Image,
     planet: Image,
     noise: Image,
-    position: tuple[float, float],
+    position: Position,
     radius: float = 3.0,
 ) -> float:
     """Share of a known planet that a subtraction kept: its matched-filter amplitude.
 
     Parameters
     ----------
-    image : ndarray
-        Star-subtracted, with the planet.
-    planet : ndarray
+    image : ndarray, (ny, nx)
+        Star-subtracted, with the planet. Pixels that are not finite are left out.
+    planet : ndarray, (ny, nx)
         What the planet alone would look like.
-    noise : ndarray
+    noise : ndarray, (ny, nx)
         Standard deviation of every pixel.
     position : tuple of float
         x, y of the planet.
     radius : float
         Pixels taken about the planet.
     """
-    near = (_distance(image.shape, position) <= radius) & np.isfinite(image)
+    near = _inside(_circle(position, radius), image.shape) & np.isfinite(image)
     weight = planet[near] / noise[near] ** 2
     return float((weight * image[near]).sum() / (weight * planet[near]).sum())
 
@@ -92,17 +113,16 @@ def star_model_error(
     model: Image,
     truth: Image,
     noise: Image,
-    center: tuple[float, float],
+    center: Position,
     inner: float,
     outer: float,
 ) -> float:
     """Rms of (model - true star) / noise over an annulus between two radii in pixels."""
-    distance = _distance(truth.shape, center)
-    ring = (distance >= inner) & (distance <= outer)
+    ring = _inside(_ring(center, inner, outer), truth.shape)
     return float(np.sqrt(np.mean(((model - truth) / noise)[ring] ** 2)))
 
 
-def psnr(image: Image, reference: Image, position: tuple[float, float], size: int = 11) -> float:
+def psnr(image: Image, reference: Image, position: Position, size: int = 11) -> float:
     """Peak signal-to-noise ratio in dB over `size` x `size` pixels about `position` (x, y)."""
     x, y = (round(c - (size - 1) / 2) for c in position)
     window = (slice(max(y, 0), y + size), slice(max(x, 0), x + size))

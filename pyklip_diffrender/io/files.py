@@ -6,7 +6,8 @@ import gzip
 import hashlib
 import io
 import os
-import tempfile
+import secrets
+import shutil
 import warnings
 import zlib
 from collections.abc import Iterator
@@ -106,21 +107,21 @@ def _require_sound(hdu: Any, number: int, path: Path) -> None:
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path that takes the place of `path` only when the block succeeds.
 
-    The suffix is kept, so that writers which look at it (``.fits.gz``, ``.png``) do as usual.
+    The temporary file lies in the same folder, so that the replacement is one step, and keeps
+    the suffix, so that writers which look at it (``.fits.gz``, ``.png``) do as usual. The product
+    has the permissions of the file that it replaces, or those of any new file.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(
-        dir=path.parent, prefix=f".{path.name}.", suffix="".join(path.suffixes)
-    )
-    os.close(handle)
-    temporary = Path(name)
-    # mkstemp makes files that only their owner can read; products are for everyone.
-    umask = os.umask(0)
-    os.umask(umask)
-    temporary.chmod(0o666 & ~umask)
+    suffix = "".join(path.suffixes)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{suffix}")
+    # Not `tempfile`, whose files only their owner can read: the mode of a plain new file follows
+    # from the umask, which cannot be read without changing it for all threads.
+    temporary.touch(exist_ok=False)
     try:
         yield temporary
+        if path.exists():
+            shutil.copymode(path, temporary)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

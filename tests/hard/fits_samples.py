@@ -4,28 +4,26 @@ from __future__ import annotations
 
 import gzip
 import io
-import tempfile
 import warnings
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import torch
 from astropy.io import fits
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError
-from pyklip_diffrender.linear.model import LinearFrame, LinearModel
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, read_opd
 
 __all__ = ["READERS", "calints", "content", "opd_map", "outcome", "same", "sane", "wavefront"]
 
-Result = OPDMap | Observation | LinearModel
+Result = OPDMap | Observation
 
 READERS: dict[str, Callable[[Path], Result]] = {
-    "opd": read_opd, "calints": Observation.from_fits, "linear": LinearModel.load,
-}  # fmt: skip
+    "opd": read_opd,
+    "calints": Observation.from_fits,
+}
 
 
 @lru_cache(maxsize=1)
@@ -63,34 +61,7 @@ def calints(**planes: np.ndarray) -> fits.HDUList:
     return hdus
 
 
-def linear() -> fits.HDUList:
-    """Two frames of 3 x 4 pixels: a flux each, two modes, by one of which they may differ."""
-
-    def random(*shape: int, seed: int) -> torch.Tensor:
-        generator = torch.Generator().manual_seed(seed)
-        return torch.randn(*shape, dtype=torch.float64, generator=generator)
-
-    frames = tuple(
-        LinearFrame(
-            random(3, 4, seed=k), random(3, 4, seed=10 + k).abs(), random(3, 3, 4, seed=k).float(),
-            torch.tensor(rows), torch.tensor(drift, dtype=torch.int64), 1,
-        )
-        for k, rows, drift in ((1, [0, 2, 3], []), (2, [1, 2, 3], [4]))
-    )  # fmt: skip
-    deviation = torch.tensor([np.inf, np.inf, 1.0, 2.0, 0.5], dtype=torch.float64)
-    names = ("flux[0]", "flux[1]", "modes[0]", "modes[1]", "drift[0]")
-    square = random(5, 5, seed=5)
-    model = LinearModel(
-        names, frames, random(5, seed=6), 0 * deviation.clamp(max=1), deviation, square @ square.T
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        model.save(Path(folder) / "linear.fits")
-        return fits.open(io.BytesIO((Path(folder) / "linear.fits").read_bytes()))
-
-
-_MAKERS: dict[str, Callable[[], fits.HDUList]] = {
-    "opd": opd_map, "calints": calints, "linear": linear
-}  # fmt: skip
+_MAKERS: dict[str, Callable[[], fits.HDUList]] = {"opd": opd_map, "calints": calints}
 
 
 @lru_cache(maxsize=16)
@@ -122,22 +93,13 @@ def outcome(kind: str, path: Path, damaged: bytes) -> tuple[Result | None, bool]
 def _arrays(result: Result) -> list[np.ndarray]:
     if isinstance(result, OPDMap):
         return [result.data]
-    if isinstance(result, LinearModel):
-        parts = ("residual", "weight", "jacobian", "rows", "drift")
-        ours = [getattr(frame, part) for frame in result.frames for part in parts]
-        ours += [result.vector, result.mean, 1 / result.deviation, result.curvature]
-        return [array.numpy() for array in ours] + [np.array([f.modes for f in result.frames])]
     return [result.data, result.error, result.valid, result.center, np.array(result.pixelscale)]
-
-
-def _words(result: Result) -> object:
-    return result.names if isinstance(result, LinearModel) else result.date
 
 
 def same(result: Result, truth: Result) -> bool:
     """Whether two results are the same in all numbers."""
     pairs = zip(_arrays(result), _arrays(truth), strict=True)
-    return all(np.array_equal(a, b) for a, b in pairs) and _words(result) == _words(truth)
+    return all(np.array_equal(a, b) for a, b in pairs) and result.date == truth.date
 
 
 def sane(result: Result) -> bool:
@@ -145,12 +107,6 @@ def sane(result: Result) -> bool:
     finite = all(np.isfinite(a).all() for a in _arrays(result))
     if isinstance(result, OPDMap):
         return finite and result.data.ndim == 2 and result.data.dtype == np.dtype("=f8")
-    if isinstance(result, LinearModel):
-        size = len(result.names)
-        good = {len(result.vector), len(result.mean), len(result.deviation)} == {size}
-        # Takes rows and places apart as everything behind does.
-        shapes = {f.onto_unknowns(f.jacobian.flatten(1), size).shape for f in result.frames}
-        return finite and good and shapes == {(size, 12)}
     shapes = {result.data.shape, result.error.shape, result.valid.shape}
     good = len(shapes) == 1 and result.data.ndim == 3 and bool((result.error > 0).all())
     return finite and good and min(result.pixelscale) > 0

@@ -84,7 +84,7 @@ def test_a_file_cut_anywhere(kind: str, packed: bool, path: Path, truth: dict[st
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=150, phases=AS_THEY_COME)
+@settings(phases=AS_THEY_COME)
 @given(data=st.data())
 def test_bytes_changed_anywhere_end_in_an_error_or_a_usable_result(
     kind: str, path: Path, data: st.DataObject
@@ -95,7 +95,7 @@ def test_bytes_changed_anywhere_end_in_an_error_or_a_usable_result(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=200, phases=AS_THEY_COME)
+@settings(phases=AS_THEY_COME)
 @given(data=st.data())
 def test_bytes_changed_in_a_gzipped_file_are_always_noticed(
     kind: str, path: Path, truth: dict[str, object], data: st.DataObject
@@ -106,7 +106,7 @@ def test_bytes_changed_in_a_gzipped_file_are_always_noticed(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=100, phases=AS_THEY_COME)
+@settings(phases=AS_THEY_COME)
 @given(data=st.data())
 def test_bytes_changed_in_a_file_with_checksums_are_always_noticed(
     kind: str, path: Path, truth: dict[str, object], data: st.DataObject
@@ -205,11 +205,6 @@ def test_a_damaged_card_is_an_error_of_this_package(
         ("calints", b"EXTNAME = 'SCI     '", b"EXTNAME = 'SKY     '"),
         ("calints", b"GCOUNT  =                    1", b"GCOUNT  =                    7"),
         ("calints", b"SIMPLE  =                    T", b"SIMPLE  =                    F"),
-        ("linear", b"FIRSTMOD=                    1", b"FIRSTMOD=                    4"),
-        ("linear", b"FIRSTMOD=                    1", b"FIRSTMOD=                  'A'"),
-        ("linear", b"TFORM2  = 'D       '", b"TFORM2  = 'A       '"),
-        ("linear", b"TTYPE3  = 'MEAN    '", b"TTYPE3  = 'MEAM    '"),
-        ("linear", b"EXTNAME = 'WEIGHT  '", b"EXTNAME = 'HEIGHT  '"),
     ],
 )
 def test_a_damaged_structure_is_an_error_of_this_package(
@@ -226,7 +221,6 @@ def test_a_damaged_structure_is_an_error_of_this_package(
 SHAPES = st.lists(st.integers(1, 5), min_size=1, max_size=4).map(tuple)
 
 
-@settings(max_examples=100)
 @given(shapes=st.tuples(SHAPES, SHAPES, SHAPES), equal=st.tuples(st.booleans(), st.booleans()))
 def test_calints_of_any_shapes(
     shapes: tuple[tuple[int, ...], ...], equal: tuple[bool, bool], path: Path
@@ -252,7 +246,6 @@ def test_calints_of_any_shapes(
         assert result.valid.all()
 
 
-@settings(max_examples=60)
 @given(shape=SHAPES)
 def test_maps_of_any_shape(shape: tuple[int, ...], path: Path) -> None:
     data = 1e-7 * np.random.default_rng(3).normal(size=shape)
@@ -264,7 +257,6 @@ def test_maps_of_any_shape(shape: tuple[int, ...], path: Path) -> None:
 
 
 @given(names=st.permutations(["SCI", "ERR", "DQ", "AREA"]), keep=st.integers(0, 4))
-@settings(max_examples=60)
 def test_extensions_in_any_order_or_missing(
     names: list[str], keep: int, path: Path, truth: dict[str, object]
 ) -> None:

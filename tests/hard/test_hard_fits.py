@@ -47,6 +47,9 @@ SPOILT = {
 ELSEWHERE = ("the start upside down", "the start transposed")
 """In test_refinement.py, on a larger case."""
 
+QUICK = ("nothing hard", "50 % missing", "saturated core, flagged", "bright planet, 1e-3")
+"""One of each kind: the others need ``--full``."""
+
 
 @lru_cache(maxsize=32)
 def result(row: FitRow, dtype: torch.dtype) -> tuple[Refinement, float]:
@@ -55,7 +58,12 @@ def result(row: FitRow, dtype: torch.dtype) -> tuple[Refinement, float]:
 
 
 @pytest.mark.parametrize(
-    "row", [row for row in FITS if row.case not in ELSEWHERE], ids=lambda row: row.case
+    "row",
+    [
+        pytest.param(row, id=row.case, marks=() if row.case in QUICK else pytest.mark.slow)
+        for row in FITS
+        if row.case not in ELSEWHERE
+    ],
 )
 def test_a_fit_ends_as_the_table_says(row: FitRow) -> None:
     fit, error = result(row, torch.float64)
@@ -69,6 +77,7 @@ def test_a_fit_ends_as_the_table_says(row: FitRow) -> None:
         assert contrast == pytest.approx(1e-3, abs=4 * fit.companion_errors[0, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     ["nothing hard", "50 % missing", "saturated core, flagged", "the same with companions=1"],
@@ -104,6 +113,7 @@ def test_a_spoilt_star_is_no_success(spoil: object) -> None:
 # -- what no image shows ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_piston_of_all_segments_does_not_drift_and_is_reported_as_unknown() -> None:
     found = piston_of_segments()
     assert found.fit.status is Status.CONVERGED

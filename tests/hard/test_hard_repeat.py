@@ -56,6 +56,7 @@ def test_eight_threads_give_the_same_bits_every_time(dtype: torch.dtype) -> None
     assert images[0].tobytes() == images[1].tobytes() == images[2].tobytes()
 
 
+@pytest.mark.slow
 def test_a_fit_with_eight_threads_is_the_serial_fit() -> None:
     """Bits differ, sums are taken in another order; a thousandth of the noise is allowed."""
     before = torch.get_num_threads()

@@ -22,13 +22,14 @@ import torch
 from astropy.table import Table
 
 from pyklip_diffrender.io.files import replacing
+from tests.benchmarks.provenance import processor
 from tests.benchmarks.speed.case import Case, Found
 from tests.benchmarks.speed.memory import peak_memory
 from tests.benchmarks.speed.page import write_page
 from tests.benchmarks.speed.rows import ROWS, Row, chosen_rows
 from tests.benchmarks.speed.scaling import SCALING, limits
 from tests.benchmarks.speed.setting import Setting
-from tests.benchmarks.speed.timing import exponent, interleaved, processor
+from tests.benchmarks.speed.timing import exponent, interleaved
 
 __all__ = ["ROWS", "Setting", "run_bench", "write_page", "write_table"]
 

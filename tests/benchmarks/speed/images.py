@@ -105,7 +105,7 @@ def forward(here: Setting) -> list[Case]:
                 )
             )
     if torch.device(here.device).type != "cuda":
-        cases.append(missing(FORWARD, "this package as a CUDA graph", "no GPU was asked for"))
+        cases.append(missing(FORWARD, "this package as a CUDA graph", "--device names no GPU"))
     cases.append(Case(FORWARD, "the paper's recipe", lambda: _paper(here), here.judge, memory=True))
     for name, rival in (("prysm", prysm_image), ("hcipy", hcipy_image)):
         try:
@@ -155,7 +155,7 @@ def _scaled(image: Any, here: Setting) -> Any:
 
 
 def _poppy(here: Setting) -> Callable[[], Any]:
-    from pyklip_diffrender.bridges.plain import plain_poppy
+    from tests.benchmarks.speed.plain import plain_poppy
 
     arrays = here.arrays
     return plain_poppy(
@@ -179,7 +179,7 @@ def _stpsf_cases(here: Setting) -> list[Case]:
         return [missing(FORWARD, name, "no data directory (--stpsf-path or STPSF_PATH)")]
     os.environ["STPSF_PATH"] = str(here.data)
     from pyklip_diffrender.bridges import from_webbpsf
-    from pyklip_diffrender.bridges.plain import plain_stpsf
+    from tests.benchmarks.speed.plain import plain_stpsf
 
     try:
         instrument = plain_stpsf(here.data, 256 if here.quick else here.npix)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
+from pyklip_diffrender.linear.forward_mode import jacfwd
 from pyklip_diffrender.linear.response import NANOMETRE, WavefrontResponse
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -142,7 +143,9 @@ def _mode(model: OpticalSystem, basis: Basis, k: int) -> Tensor:
 def _along(model: OpticalSystem, opd: Tensor, basis: Basis, k: int) -> Tensor:
     """Derivative of the image along one mode, per nm."""
     mode = NANOMETRE * _mode(model, basis, k).to(opd.device)
-    return torch.func.jvp(lambda o: model(o), (opd,), (mode,))[1]
+    step = torch.zeros((), dtype=opd.dtype, device=opd.device)
+    derivative: Tensor = jacfwd(lambda size: model(opd + size * mode))(step)
+    return derivative
 
 
 # -- refinement ------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ _TARGETS: tuple[tuple[str, str, str, str, float, float, str], ...] = (
     ("contrast curve", "this package, 20 x 6 positions", "float64",
      "120 injections, each refined again", 50, 0.05, "error"),
 )  # fmt: skip
-"""What was asked for. An error of NaN: at most that of the other."""
+"""Goals of speed at a given error. An error of NaN: at most that of the other."""
 
 
 def _number(value: float, digits: int = 3) -> str:
@@ -64,7 +64,7 @@ def _find(table: Table, row: str, column: str, precision: str | None = None) -> 
 
 
 def targets(table: Table) -> list[tuple[str, str, str, str, str, str]]:
-    """What was asked for, what was found, and whether that is enough."""
+    """Each goal, what was measured, and whether it is met."""
     rows = []
     for row, ours, precision, theirs, factor, worst, kind in _TARGETS:
         mine, other = _find(table, row, ours, precision), _find(table, row, theirs)
@@ -110,8 +110,8 @@ def page(table: Table, figure: str = "results/performance.png", notes: str = "")
     lines = [
         "# Performance",
         "",
-        "Written by `pyklip-diffrender bench --page` from the table `results/performance.ecsv`; "
-        "do not edit.",
+        "Written by `python -m tests.benchmarks.speed --page` from the table "
+        "`results/performance.ecsv`; do not edit.",
         "",
         f"- Measured {meta['date']} by `{meta['command']}` in {meta['seconds']} s.",
         f"- {meta['machine']}, {meta['threads']} threads; device {meta['device']}"
@@ -129,7 +129,7 @@ def page(table: Table, figure: str = "results/performance.png", notes: str = "")
         "",
         f"![Error against time]({figure})",
         "",
-        "## What was asked for",
+        "## Targets",
         "",
         *_table(("", "times faster", "found", "error", "at most", "met"), targets(table)),
         *([notes.strip(), ""] if notes else []),

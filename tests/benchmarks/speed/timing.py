@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import math
-import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +18,6 @@ __all__ = [
     "exponent",
     "give_back",
     "interleaved",
-    "processor",
     "resident",
     "seconds",
     "start_peak",
@@ -113,13 +111,3 @@ def start_peak(device: str = "cpu") -> None:
         torch.cuda.reset_peak_memory_stats(device)
     elif _FORGET.exists():
         _FORGET.write_text("5", encoding="ascii")
-
-
-def processor() -> str:
-    """What the machine calls its processor."""
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
