@@ -70,23 +70,12 @@ def linearise(misfit: Misfit, state: State, kappa: float, modes: int) -> Lineari
         first = point.unknowns.where("modes").start
         rows = joint.rows(k)[: len(rendered)]
         drift = joint.drift_rows(k) if modes else torch.zeros(0, dtype=torch.int64)
-        seen = forward.problem.informative
-        if seen is not None:
-            # Consistently: here the wavefront does nothing, in the fit and for what uses it.
-            wavefront = point.unknowns.where("amplitude").start
-            rendered[wavefront:, ~seen.to(rendered.device)] = 0.0
         left = torch.where(weight > 0, residual / weight.clamp(min=1e-300), 0.0).cpu()
         slopes = rendered.float().cpu()
         frames.append(LinearFrame(left, weight.cpu(), slopes, rows, drift, first))
         whitened = rendered.mul_(weight).flatten(1).cpu()
         pulled = whitened @ residual.flatten().cpu()
-        if seen is None:
-            product = _self_product(whitened)
-        else:
-            inside = seen.flatten().cpu()
-            product = _self_product(whitened[:, inside].contiguous())
-            others = whitened[:wavefront, ~inside].contiguous()
-            product[:wavefront, :wavefront] += others @ others.T
+        product = _self_product(whitened)
         if len(state.points) == 1:
             curvature, gradient = product, pulled
             continue

@@ -16,7 +16,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.response import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.planning import Error, Plan, plan
+from pyklip_diffrender.planning import ModelError, Plan, plan
 from pyklip_diffrender.refinement.growth import gauss_newton
 from pyklip_diffrender.refinement.options import GaussNewtonOptions
 from pyklip_diffrender.refinement.problem import Problem
@@ -122,20 +122,15 @@ def refine_by_plan(
     progress : bool
     """
     began = time.perf_counter()
-    informative = None
-    if not planned.informative.all():
-        informative = torch.from_numpy(planned.informative)
-    cheap = [
-        Problem(planned.model, p.observation, p.initial, p.start, informative, p) for p in problems
-    ]
-    chosen = replace(options, response_npix=planned.refine_options["response_npix"])
+    cheap = [Problem(planned.model, p.observation, p.initial, p.start, p) for p in problems]
+    chosen = options
     if options.basis is None:
-        chosen = replace(chosen, cycles=planned.refine_options["cycles"])
+        chosen = replace(options, cycles=planned.refine_options["cycles"])
     fits = gauss_newton(cheap, chosen, seed=seed, progress=progress)
     if not fits[0].status.usable:
         return [replace(fit, plan=planned) for fit in fits]
     found = [_as_given(fit, p, planned) for fit, p in zip(fits, problems, strict=True)]
-    error = Error.largest(each for _, each in found)
+    error = ModelError.largest(each for _, each in found)
     if planned.allows(error):
         done = replace(planned, final_error=error)
         seconds = time.perf_counter() - began
@@ -153,7 +148,7 @@ def refine_by_plan(
     return [replace(fit, plan=done, seconds=seconds) for fit in exact]
 
 
-def _as_given(fit: Refinement, problem: Problem, planned: Plan) -> tuple[Refinement, Error]:
+def _as_given(fit: Refinement, problem: Problem, planned: Plan) -> tuple[Refinement, ModelError]:
     """A cheap fit on the grid of the given model, its star rendered with that, and the change."""
     model = problem.model
     opd = fit.opd
@@ -174,7 +169,7 @@ def _as_given(fit: Refinement, problem: Problem, planned: Plan) -> tuple[Refinem
     )
     star = flux * image.double() + level
     away = ((star - before) / problem.sigma)[problem.valid].abs()
-    error = Error(float(away.square().mean().sqrt()), float(away.max()))
+    error = ModelError(float(away.square().mean().sqrt()), float(away.max()))
     values = {**fit.values, "flux": np.array([flux]), "background": np.array([level])}
     finished = replace(fit, model=model, opd=opd, star_image=star.cpu().numpy(), values=values)
     return finished, error

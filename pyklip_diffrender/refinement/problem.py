@@ -38,8 +38,6 @@ class Problem:
     start : dict
         Starting values of optical parameters (numbers in the units of the parameter table, or
         Quantities), and of "flux" and "background" where known.
-    informative : Tensor of bool, (ny, nx), optional
-        Pixels that say something about the wavefront; default all.
     given : Problem, optional
         The same with the model as it was given, where a plan has put a cheaper one in its place.
     """
@@ -48,7 +46,6 @@ class Problem:
     observation: Observation
     initial: OPDMap
     start: dict[str, Any] = field(default_factory=dict)
-    informative: Tensor | None = None
     given: Problem | None = None
 
     def __post_init__(self) -> None:
