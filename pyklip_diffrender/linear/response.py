@@ -58,7 +58,7 @@ def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
     field = max(n * s for n, s in zip(detector.shape[::-1], detector.pixelscale, strict=True))
     while npix < samples_for_field(field, min(model.bandpass.wavelengths), model.diameter):
         npix *= 2
-    if not model.recipe or model.npix <= npix or model.npix % npix:
+    if "npix" not in model.adjustable or model.npix <= npix or model.npix % npix:
         return model.npix
     return npix
 
@@ -66,8 +66,8 @@ def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
 def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     """A cheaper copy of a model for derivatives: coarse cells, single precision.
 
-    A model without a recipe, or one that is already as coarse, serves itself. A wide field takes
-    more samples, by powers of two, so that the image does not repeat inside it.
+    A model whose pupil grid is fixed, or one that is already as coarse, serves itself. A wide
+    field takes more samples, by powers of two, so that the image does not repeat inside it.
     """
     npix = coarse_npix(model, npix)
     if npix == model.npix:
@@ -76,12 +76,18 @@ def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
 
 
 def downsample(opd: Tensor, npix: int) -> Tensor:
-    """Mean of the OPD over the pixels of a coarser grid, (npix, npix)."""
-    if opd.shape[-1] == npix:
+    """Mean of the OPD over the pixels of a coarser grid, (..., npix, npix).
+
+    `npix` must divide the grid of the OPD.
+    """
+    factor = opd.shape[-1] // npix
+    if factor == 1:
         return opd
-    if opd.is_complex():
-        return torch.complex(downsample(opd.real, npix), downsample(opd.imag, npix))
-    return torch.nn.functional.avg_pool2d(opd[None, None], opd.shape[-1] // npix)[0, 0]
+    # Rows first, each as a whole, then columns by a product: a third of the time of a pooling
+    # over squares.
+    rows = opd.unflatten(-2, (npix, factor)).sum(dim=-2)
+    mean = torch.full((factor, 1), 1 / factor**2, dtype=opd.dtype, device=opd.device)
+    return (rows.unflatten(-1, (npix, factor)) @ mean).squeeze(-1)
 
 
 class WavefrontResponse:

@@ -41,7 +41,10 @@ class Detector:
     shear: float = 0.0
     name: str = "detector"
     parameters: tuple[str, ...] = ("detector_shift", "blur")
-    _transforms: dict[tuple[float, PupilGrid], MatrixFourier] = field(default_factory=dict)
+    # Not for `dataclasses.replace` to hand on: a changed detector has other transforms.
+    _transforms: dict[tuple[float, PupilGrid], MatrixFourier] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def axes(self, values: Values) -> tuple[Tensor, Tensor]:
         """Sample positions x, y on the image relative to the optical axis, radians."""

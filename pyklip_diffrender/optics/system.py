@@ -166,6 +166,11 @@ class OpticalSystem:
         between = [name for plane in self.planes for name in plane.parameters]
         return (*self.entrance.parameters, *between, *self.detector.parameters)
 
+    @property
+    def adjustable(self) -> frozenset[str]:
+        """Names that `with_fidelity` takes, such as "npix" or "dtype"; none without a recipe."""
+        return frozenset(() if self._remake is None else self.recipe)
+
     def with_fidelity(self, **changes: Any) -> Self | OpticalSystem:
         """The same system with other numerical settings, such as ``npix=256``.
 

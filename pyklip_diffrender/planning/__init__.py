@@ -1,9 +1,10 @@
-"""How fine a model has to be for a scene: measured, chosen, verified."""
+"""How fine a model has to be for a scene: measured on it, chosen, and verified."""
 
 from __future__ import annotations
 
-from pyklip_diffrender.planning.choice import Choice, Economy, Error, Option
-from pyklip_diffrender.planning.planning import plan
+from pyklip_diffrender.planning.choice import Choice, Economy, ModelError, Option
+from pyklip_diffrender.planning.planner import plan
 from pyklip_diffrender.planning.result import Plan
+from pyklip_diffrender.planning.systems import coarse_steps
 
-__all__ = ["Choice", "Economy", "Error", "Option", "Plan", "plan"]
+__all__ = ["Choice", "Economy", "ModelError", "Option", "Plan", "coarse_steps", "plan"]

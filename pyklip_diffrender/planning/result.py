@@ -1,61 +1,55 @@
-"""What a plan is."""
+"""`Plan`: the settings that were chosen, why, and what they save."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
+import torch
+from astropy import units as u
 from astropy.table import QTable
-from numpy.typing import NDArray
 
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.planning.choice import Choice, Error
+from pyklip_diffrender.planning.choice import Choice, Economy, ModelError, Option
+from pyklip_diffrender.planning.trial import Trial
 
-__all__ = ["Plan"]
+__all__ = ["Plan", "plan_table"]
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The cheapest settings that model a scene's star to within a share of the noise.
+    """The cheapest settings that model a scene's star to within a fraction of the noise.
 
     Attributes
     ----------
     model : OpticalSystem
         The system to fit with.
     given : OpticalSystem
-        The one that was given, which errors are relative to.
+        The system as given, which errors are relative to.
     choice : Choice
         All settings.
     refine_options : dict
-        What `refine` is told: ``cycles`` and ``response_npix``.
-    informative : ndarray of bool, (ny, nx)
-        Pixels that say something about the wavefront.
+        What `refine` is told: ``cycles``.
     table : QTable
-        One row for each economy: ``what``, ``chosen``, ``finest``, ``why``, ``error`` as the probe
-        measured it, ``worst`` (in the worst pixel), ``verified_error`` of this choice alone at a
-        wavefront the probe has not seen (all in units of the pixel noise), ``seconds`` of a
-        refinement and ``memory`` with this economy alone.
+        One row for each economy: ``what``, ``chosen``, ``finest``, ``why``; its ``error`` alone
+        and in the ``worst`` pixel, units of the noise; ``seconds`` of a refinement with it alone.
     budget : float
         Largest rms error, in units of the noise.
-    error, verified_error : Error
-        Of all together: expected, and measured against the given model.
+    error, verified_error : ModelError
+        Of all settings together: expected, and measured against the model as given.
     seconds, seconds_given : float
         Expected for a refinement on one core, counted from operations: with the plan, and with
         everything as given. Ratios are good, absolute times depend on the machine.
-    memory, memory_given : float
-        Bytes, expected at most.
-    planning_seconds : float
-        What the plan itself took.
     seed : int
         Of the wavefronts that were drawn.
     pinned : tuple of str
-        Settings that were kept by the caller.
+        Settings that the caller kept.
     steps : tuple of str
-        Economies that the verification has made finer again.
-    final_error : Error, optional
-        Of the refined star, against the given model at the wavefront that was found; in the plan
-        that comes with a refinement.
+        Economies that the verification made finer again.
+    final_error : ModelError, optional
+        Of the refined star, against the model as given at the wavefront of the solution; only in
+        the plan of a `Refinement`.
     abandoned : bool
         Whether that was too large, so that the fit went on with the model as given.
     """
@@ -64,23 +58,19 @@ class Plan:
     given: OpticalSystem
     choice: Choice
     refine_options: dict[str, Any]
-    informative: NDArray[np.bool_]
     table: QTable
     budget: float
-    error: Error
-    verified_error: Error
+    error: ModelError
+    verified_error: ModelError
     seconds: float
     seconds_given: float
-    memory: float
-    memory_given: float
-    planning_seconds: float
     seed: int
     pinned: tuple[str, ...] = ()
     steps: tuple[str, ...] = ()
-    final_error: Error | None = None
+    final_error: ModelError | None = None
     abandoned: bool = False
 
-    def allows(self, error: Error) -> bool:
+    def allows(self, error: ModelError) -> bool:
         """Whether an error is inside the budget."""
         return error.inside(self.budget)
 
@@ -91,48 +81,103 @@ class Plan:
         )
 
     def __str__(self) -> str:
-        shown = self.table["what", "chosen", "finest", "error", "verified_error", "seconds", "why"]
-        lines = shown.pformat(
+        lines = self.table.pformat(
             max_lines=-1, max_width=-1, show_unit=True, align=["<", "<", "<", ">", ">", ">", "<"]
         )
-        pixels = self.informative
         lines += [
             "",
             f"error {self.error.rms:.3f} sigma expected, {self.verified_error.rms:.3f} verified "
             f"(worst pixel {self.verified_error.worst:.2f}), budget {self.budget:g}",
-            f"about {self.seconds:.2g} s and {self.memory / 1e6:.0f} MB for a refinement on one "
-            f"core, as given {self.seconds_given:.2g} s and {self.memory_given / 1e6:.0f} MB",
-            f"{int(pixels.sum())} of {pixels.size} pixels say something about the wavefront",
+            f"about {self.seconds:.2g} s for a refinement on one core, "
+            f"as given {self.seconds_given:.2g} s",
         ]
         if self.steps:
             lines.append(f"made finer by the verification: {', '.join(self.steps)}")
         if self.final_error is not None:
             end = "the fit went on as given" if self.abandoned else "inside the budget"
-            lines.append(f"at the wavefront found {self.final_error.rms:.3f} sigma: {end}")
+            lines.append(f"at the solution {self.final_error.rms:.3f} sigma: {end}")
         if self.pinned:
             lines.append(f"kept as asked: {', '.join(self.pinned)}")
         return "\n".join(line.rstrip() for line in lines)
 
     def summary(self) -> dict[str, Any]:
         """The facts that belong in a header or a log: text and numbers by short names."""
-        choice = self.choice
-        return {
-            "plan_npix": choice.npix,
-            "plan_multifidelity": choice.multifidelity,
-            "plan_occulter_sampling": choice.occulter_sampling or "as the route has it",
-            "plan_wavelengths": choice.wavelengths,
-            "plan_dtype": choice.dtype,
-            "plan_without": ", ".join(choice.without) or "nothing",
-            "plan_cycles": choice.cycles,
-            "plan_response_npix": choice.response_npix,
-            "plan_pixels": int(self.informative.sum()),
-            "plan_budget": self.budget,
-            "plan_error": self.error.rms,
-            "plan_verified_error": self.verified_error.rms,
-            "plan_worst_pixel": self.verified_error.worst,
-            "plan_seconds": self.seconds,
-            "plan_seconds_given": self.seconds_given,
-            "plan_seed": self.seed,
-            "plan_final_error": -1.0 if self.final_error is None else self.final_error.rms,
-            "plan_abandoned": self.abandoned,
+        facts: dict[str, Any] = {
+            **vars(self.choice),
+            "occulter_sampling": self.choice.occulter_sampling or "default",
+            "dtype": _type_name(self.choice.dtype),
+            "without": ", ".join(sorted(self.choice.without)) or "nothing",
+            "budget": self.budget,
+            "error": self.error.rms,
+            "verified_error": self.verified_error.rms,
+            "worst_pixel": self.verified_error.worst,
+            "seconds": self.seconds,
+            "seconds_given": self.seconds_given,
+            "seed": self.seed,
+            "final_error": -1.0 if self.final_error is None else self.final_error.rms,
+            "abandoned": self.abandoned,
         }
+        return {f"plan_{name}": value for name, value in facts.items()}
+
+
+def _type_name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+def _label(name: str, choice: Choice) -> str:
+    """What a choice has of an economy, in words."""
+    return {
+        "pupil grid": f"{choice.npix}" + " for differences" * choice.multifidelity,
+        "occulter sampling": f"{choice.occulter_sampling or 'default'}",
+        "wavelengths": f"{choice.wavelengths}",
+        "precision": _type_name(choice.dtype),
+        "optional parts": "without " + ", ".join(sorted(choice.without))
+        if choice.without
+        else "all",
+        "wavefront modes": f"to {choice.cycles:g} cycles",
+    }[name]
+
+
+def _why(trial: Trial, economy: Economy, option: Option) -> str:
+    if economy.note:
+        return economy.note
+    if any(name in trial.pins for name in option.changes):
+        return "kept as asked"
+    place = economy.options.index(option)
+    if place == 0:
+        return "the cheapest is good enough"
+    before = economy.options[place - 1]
+    label, error = _label(economy.name, replace(trial.finest, **before.changes)), before.error
+    if not error.inside(trial.budget):
+        return f"{label}: {error.rms:.2g} sigma (worst pixel {error.worst:.2g})"
+    return f"{label}: {error.rms:.2g} sigma, too much with the others, or no faster"
+
+
+def plan_table(trial: Trial, economies: Sequence[Economy], picked: Sequence[Option]) -> QTable:
+    """The table of a plan; see `Plan`.
+
+    Parameters
+    ----------
+    trial : Trial
+    economies : sequence of Economy
+    picked : sequence of Option
+        Chosen of each economy.
+    """
+    rows = []
+    for economy, option in zip(economies, picked, strict=True):
+        alone = replace(trial.finest, **option.changes)
+        rows.append(
+            {
+                "what": economy.name,
+                "chosen": _label(economy.name, alone),
+                "finest": _label(economy.name, trial.finest),
+                "error": option.error.rms,
+                "worst": option.error.worst,
+                "seconds": trial.seconds(alone) * u.s,
+                "why": _why(trial, economy, option),
+            }
+        )
+    table = QTable(rows=rows)
+    for name in ("error", "worst", "seconds"):
+        table[name].info.format = ".3g"
+    return table

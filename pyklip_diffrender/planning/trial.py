@@ -1,271 +1,232 @@
-"""Renders a scene with the given model and with cheaper ones, and compares."""
+"""Renders the star with the model as given and with cheaper ones, and compares."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.linear.response import NANOMETRE, coarse_npix, downsample
+from pyklip_diffrender.linear.response import (
+    WavefrontResponse,
+    coarse_copy,
+    coarse_npix,
+    downsample,
+    parameter_jacobian,
+)
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.planning.build import CheapSystem, build, optional_parts
-from pyklip_diffrender.planning.choice import Choice, Economy, Error
-from pyklip_diffrender.planning.cost import Workload
-from pyklip_diffrender.planning.modes import Modes
-from pyklip_diffrender.planning.target import Target
+from pyklip_diffrender.planning import cost
+from pyklip_diffrender.planning.choice import Choice, Economy, ModelError
+from pyklip_diffrender.planning.drift import Drift, RidgeResidual
+from pyklip_diffrender.planning.noise_model import NoiseModel, least_squares
+from pyklip_diffrender.planning.systems import (
+    CheapSystem,
+    build,
+    optional_parts,
+    wavelengths_are_fixed,
+)
 from pyklip_diffrender.scene.objects import Scene
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["PROBED", "START", "VERIFIED", "Trial"]
+__all__ = ["PROBED", "START", "Trial"]
 
 START, PROBED, VERIFIED = 0, 1, 2
 """Wavefronts: the starting one, the drifted one of the probes, an independent one to verify."""
 
-_ALIGNED = {"star_offset": 2e-3, "lyot_shift": 1e-3, "lyot_rotation": 0.05}
-"""Parameters whose misfit at the start says nothing about the wavefront, and steps for their
-derivatives: large enough for single precision."""
+_MORE = tuple(range(3, 19))
+"""Further drifts, which tell how far the prior expects the star to move."""
 
-_FEW = 3
-"""Wavelengths at which modes are looked at, at most."""
+_ALIGNMENT = ("star_offset", "lyot_shift", "lyot_rotation")
+"""Parameters whose misfit at the start is not that of the wavefront."""
+
+_LEAST = 0.3
+"""The prior is never narrowed by more than this, however well the star fits the data."""
+
+_SURE = 3.0
+"""Standard deviations of the chi-squared that are added to it."""
+
+_ROUGH_NPIX, _ROUGH_WAVELENGTHS = 256, 3
+"""Pupil samples and wavelengths at which differences that hardly depend on them are measured."""
 
 
+@dataclass
 class Trial:
-    """A scene, the given model of it, and what has been rendered so far.
+    """A scene, the model of it as given, and what has been rendered so far.
 
-    Parameters
-    ----------
-    model : OpticalSystem
-        As given, the finest.
-    subject : Scene or Observation
-    opd : Tensor, (npix, npix)
-        Starting wavefront, m.
-    values : dict of Tensor
-        The model's other parameters.
-    prior : WavefrontPrior
-    cycles : float
-        Highest frequency of the finest set of modes.
-    response_npix : int
-        Pupil samples of the finest derivatives.
-    share : float
-        Of the star, that the model may miss.
-    budget : float
-        Error that is allowed, units of the noise.
-    seed : int
-    pins : mapping
-        Fields of `Choice` that are decided.
+    Parameters are those of `plan`: `opd0` on the model's grid in m, `values` the model's other
+    parameters, `cycles` the highest frequency of the finest modes, `pins` what is to be kept.
 
     Attributes
     ----------
     finest : Choice
         Everything as given.
+    rough : Choice
+        As given but for a coarse pupil and few wavelengths, where these can be had.
     likely : Choice
         With the cheapest good options of the economies that were probed.
+    grids : list of int
+        Samples across coarser pupils that may be used, from coarse to fine.
+    parts : frozenset of str
+        Optional parts of the model.
+    noise : NoiseModel
+    drift : Drift
     """
 
-    def __init__(
-        self,
-        model: OpticalSystem,
-        subject: Scene | Observation,
-        opd: Tensor,
-        values: dict[str, Tensor],
-        *,
-        prior: WavefrontPrior,
-        cycles: float,
-        response_npix: int,
-        share: float,
-        budget: float,
-        seed: int,
-        pins: Mapping[str, Any],
-    ) -> None:
-        self.model, self.opd0, self.values, self.pins = model, opd, values, dict(pins)
-        self.seed, self.budget = seed, budget
+    model: OpticalSystem
+    subject: Scene | Observation
+    opd0: Tensor
+    values: dict[str, Tensor]
+    prior: WavefrontPrior
+    cycles: float
+    response_npix: int
+    model_error: float
+    budget: float
+    seed: int
+    pins: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        model = self.model
         self.parts = optional_parts(model)
-        response_npix = coarse_npix(model, response_npix)
-        self.finest = Choice(
+        self.response_npix = coarse_npix(model, self.response_npix)
+        self.finest = self.likely = Choice(
             npix=model.npix,
             multifidelity=False,
             occulter_sampling=model.recipe.get("occulter_sampling"),
             wavelengths=len(model.bandpass.wavelengths),
-            dtype="float32" if model.dtype == torch.float32 else "float64",
-            without=(),
-            cycles=cycles,
-            response_npix=response_npix,
-            pixels=0.0,
+            dtype=model.dtype,
+            without=frozenset(),
+            cycles=self.cycles,
         )
-        self.likely = self.finest
+        halves = [model.npix >> k for k in range(6, 0, -1) if model.npix % (1 << k) == 0]
+        # The derivatives' grid is fine enough for the field, and that of a fixed model its own.
+        self.grids = [npix for npix in halves if npix >= self.response_npix]
+        waves = self.finest.wavelengths
+        self.rough = replace(
+            self.finest,
+            npix=next((npix for npix in self.grids if npix >= _ROUGH_NPIX), model.npix),
+            wavelengths=waves if wavelengths_are_fixed(model) else min(_ROUGH_WAVELENGTHS, waves),
+        )
         self._systems: dict[Choice, OpticalSystem] = {self.finest.system: model}
-        self._images: dict[tuple[Choice, float, int], Tensor] = {}
-        self._wavefronts: dict[tuple[int, float, int], Tensor] = {}
+        self._images: dict[tuple[Choice, int], Tensor] = {}
         self._fields: dict[int, list[Tensor]] = {}
-        image = model.image_of(self.fields(self.finest), values).double()
-        self._images[self.finest.system, cycles, START] = image
-        if isinstance(subject, Scene):
-            target = Target.of_scene(subject, image)
-        else:
-            target = Target.of_observation(subject, image)
-        self.target = target.allowing(share)
-        self.basis = default_basis(cycles)
-        # What modes do to the star takes fewer wavelengths than the star itself.
-        few = self.finest.changed({"wavelengths": min(_FEW, self.finest.wavelengths)})
-        self.modes = Modes(
-            self.system(few),
-            self.target,
-            self.basis,
-            prior,
-            opd,
-            self._alignment(),
-            self.fields(few),
-            cycles=cycles,
-            npix=response_npix,
-            seed=seed,
-            aligned={name: s for name, s in _ALIGNED.items() if name in model.parameters},
-        )
-        ny, nx = model.detector.shape
-        self.work = Workload(
-            samples=ny * nx * model.detector.oversample**2,
-            pixels=ny * nx,
-            lattice=model.route == "lattice",
-            device=model.device.type,
-            frequencies=self.basis.frequencies,
-        )
+        self._ridge: RidgeResidual | None = None
+        image = model.image_of(self._fine_fields(waves), self.values).double()
+        self._images[self.finest, START] = image
+        self.noise = NoiseModel.of(self.subject, image, self.model_error)
+        self.drift = Drift(self.prior, self.cycles, self.seed)
+        self.drift.deviation *= self._misfit()
 
-    def _alignment(self) -> dict[str, Tensor]:
-        """The values, with those that are differentiated at their defaults where not given."""
-        there = {
-            name: np.full(parameter(name).size, parameter(name).default)
-            for name in _ALIGNED
-            if name in self.model.parameters
-        }
-        return {**self.model.values(there), **self.values}
+    def _misfit(self) -> float:
+        """Rms misfit of the starting star, relative to what the prior expects.
+
+        Once star and Lyot stop are aligned; 1 where there are no data.
+        """
+        noise, valid = self.noise, self.noise.valid
+        if noise.residual is None:
+            return 1.0
+        fine, fields = self._few_wavelengths()
+        coarse = coarse_copy(fine, self.response_npix)
+        names = tuple(name for name in _ALIGNMENT if name in self.model.parameters)
+        defaults = {n: np.full(parameter(n).size, parameter(n).default) for n in names}
+        values = {**self.model.values(defaults), **self.values}
+        small = downsample(self.opd0, coarse.npix)
+        rows = parameter_jacobian(coarse, small, values, names, fields)
+        columns = [noise.in_sigma(row)[valid] for row in (*rows, noise.image)]
+        columns.append(1 / noise.sigma[valid])
+        left = least_squares(columns, (noise.residual / noise.sigma)[valid])[1]
+        # As much as the noise leaves possible: a small misfit may be so by chance.
+        excess = float(left.square().mean()) - 1.0 + _SURE * math.sqrt(2 / len(left))
+        start = self._rendered(self.rough, START)
+        moved = [noise.in_sigma(self._rendered(self.rough, k) - start)[valid] for k in _MORE]
+        expected = float(torch.stack(moved).square().mean())
+        return max(_LEAST, math.sqrt(max(excess, 0.0) / max(expected, 1e-300)))
+
+    def _few_wavelengths(self) -> tuple[OpticalSystem, list[Tensor]]:
+        """The given model and its fields at the start, at few wavelengths."""
+        waves = self.rough.wavelengths
+        return self.system(replace(self.finest, wavelengths=waves)), self._fine_fields(waves)
 
     def learn(self, economy: Economy) -> None:
-        """Take note of what a probe found."""
+        """Take note of what a probe measured."""
         for option in economy.options:
             if option.error.inside(self.budget):
-                self.likely = self.likely.changed(option.changes)
+                self.likely = replace(self.likely, **option.changes)
                 return
 
     def seconds(self, choice: Choice) -> float:
-        """Expected, of a refinement."""
-        kept = len(self.parts) - len(choice.without)
-        return self.work.seconds(
-            choice, informative=float(self.informative(choice).double().mean()), effects=kept
+        """Expected time of a refinement."""
+        return cost.seconds(
+            self.model,
+            choice,
+            modes=self.drift.count(choice.cycles),
+            effects=len(self.parts) - len(choice.without),
+            response_npix=self.response_npix,
         )
 
-    def fields(self, choice: Choice) -> list[Tensor]:
-        """The given model's fields at the start, at the wavelengths of a choice."""
-        waves = choice.wavelengths
-        if waves not in self._fields:
-            fine = self.system(self.finest.changed({"wavelengths": waves}))
+    def _fine_fields(self, wavelengths: int) -> list[Tensor]:
+        """The given model's fields at the start, at so many wavelengths."""
+        if wavelengths not in self._fields:
+            fine = self.system(replace(self.finest, wavelengths=wavelengths))
             with torch.no_grad():
-                self._fields[waves] = fine.fields(self.opd0, **self.values)
-        return self._fields[waves]
+                self._fields[wavelengths] = fine.fields(self.opd0, **self.values)
+        return self._fields[wavelengths]
 
     def system(self, choice: Choice) -> OpticalSystem:
         """The optical system of a choice."""
         key = choice.system
         if key not in self._systems and choice.multifidelity:
-            # E(opd) = E_fine(opd0) + (E_coarse(opd) - E_coarse(opd0)), see `multifidelity`.
-            coarse = self.system(choice.changed({"multifidelity": False}))
+            coarse = self.system(replace(choice, multifidelity=False))
             assert isinstance(coarse, CheapSystem)
-            with torch.no_grad():
-                there = coarse.fields(downsample(self.opd0, coarse.npix), **self.values)
-            fine = self.fields(choice)
-            self._systems[key] = coarse.corrected(
-                [exact - rough for exact, rough in zip(fine, there, strict=True)]
-            )
+            small, fine = downsample(self.opd0, coarse.npix), self._fine_fields(choice.wavelengths)
+            self._systems[key] = coarse.stepping_from(fine, small, self.values)
         elif key not in self._systems:
             self._systems[key] = build(self.model, choice)
         return self._systems[key]
 
-    def wavefront(self, which: int, cycles: float, npix: int) -> Tensor:
-        """One of the wavefronts, with the change up to a frequency only, (npix, npix), m."""
-        key = (which, cycles, npix)
-        if key not in self._wavefronts:
-            opd = downsample(self.opd0, npix)
-            if which != START:
-                # Seeds of different plans must not share their draws.
-                drawn = self.modes.draw(1000 * self.seed + which)
-                drawn = torch.where(self.basis.frequencies <= cycles, drawn, 0.0)
-                grid = PupilGrid.full(npix, self.model.diameter)
-                opd = opd + self.basis.opd(drawn * NANOMETRE, grid).to(opd.device)
-            self._wavefronts[key] = opd
-        return self._wavefronts[key]
+    def _rendered(self, choice: Choice, which: int) -> Tensor:
+        system = self.system(choice)
+        opd = downsample(self.opd0, system.npix)
+        if which != START:
+            grid = PupilGrid.full(system.npix, system.diameter)
+            opd = opd + self.drift.opd(which, choice.cycles, grid).to(opd.device)
+        with torch.no_grad():
+            return system(opd, **self.values).double()
 
     def image(self, choice: Choice, which: int) -> Tensor:
         """The star as a choice renders one of the wavefronts, (ny, nx), at flux 1."""
-        cycles = self.finest.cycles if which == START else choice.cycles
-        key = (choice.system, cycles, which)
+        key = (replace(choice, cycles=self.finest.cycles) if which == START else choice, which)
         if key not in self._images:
-            system = self.system(choice)
-            opd = self.wavefront(which, cycles, system.npix)
-            with torch.no_grad():
-                self._images[key] = system(opd, **self.values).double()
+            self._images[key] = self._rendered(*key)
         return self._images[key]
 
-    def rendering_error(self, choice: Choice, which: int, base: Choice | None = None) -> Error:
-        """How far the star of a choice is from that of the given model, or of another one.
+    def prepare_fit(self, cycles: float) -> None:
+        """Let errors of fewer modes be what a fit of these leaves, up to a spatial frequency."""
+        if self._ridge is None:
+            fine, fields = self._few_wavelengths()
+            basis, npix = default_basis(cycles), self.response_npix
+            response = WavefrontResponse(fine, basis, self.opd0, self.values, npix=npix)
+            slopes = self.noise.in_sigma(response.image(fields, self.values).double())
+            prior = self.drift.deviation[: len(basis)].to(slopes.device)
+            self._ridge = RidgeResidual(slopes * prior[:, None, None])
 
-        Of a choice with fewer modes: after a fit of those, where that was prepared.
-        """
+    def error(self, choice: Choice, which: int, base: Choice | None = None) -> ModelError:
+        """Error of the star of a choice, relative to the given model or to another choice."""
         change = self.image(choice, which) - self.image(base or self.finest, which)
-        left = self.target.unexplained(change)
-        if choice.cycles < self.finest.cycles:
-            left = self.modes.left(left, choice.cycles)
-        return self.target.error(left)
+        left = self.noise.unexplained(change)
+        if choice.cycles < self.finest.cycles and self._ridge:
+            left = self._ridge.left(left, self.drift.count(choice.cycles))
+        return self.noise.error(left)
 
-    def informative(self, choice: Choice) -> Tensor:
-        """Pixels that say something about the wavefront, (ny, nx), bool.
-
-        Those where the star is expected to change least are left out, as many as together stay
-        below ``choice.pixels``.
-        """
-        if choice.pixels <= 0:
-            return torch.ones_like(self.target.valid)
-        power = self.modes.upto(choice.cycles).flatten() ** 2
-        order = torch.argsort(power)
-        summed = torch.cumsum(power[order], dim=0)
-        few = summed <= choice.pixels**2 * int(self.target.valid.sum())
-        kept = torch.ones_like(self.target.valid).flatten()
-        kept[order[few]] = False
-        return kept.reshape(self.target.valid.shape)
-
-    def dropped_error(self, choice: Choice, which: int) -> Error:
-        """How much the star changes in pixels that are taken to say nothing."""
-        if choice.pixels <= 0 or which == START:
-            return Error()
-        change = self.image(self.finest, which) - self.image(self.finest, START)
-        whitened = self.target.in_sigma(change)
-        return self.target.error(torch.where(self.informative(choice), 0.0, whitened))
-
-    def response_error(self, choice: Choice, *, others: bool = False) -> Error:
-        """What coarse derivatives leave, at most.
-
-        Once a fit has converged the star is known to within the noise or to within what the
-        prior allows; a relative error of the derivatives leaves that share of it.
-        """
-        if choice.response_npix >= self.finest.response_npix:
-            return Error()
-        known = self.modes.upto(choice.cycles).clamp(max=1.0)
-        relative = self.modes.response_error(choice.response_npix, others=others)
-        return self.target.error(torch.where(self.target.valid, relative * known, 0.0))
-
-    def verified(self, choice: Choice) -> Error:
+    def verified(self, choice: Choice) -> ModelError:
         """Error of a choice as a whole, at the start and at a wavefront no probe has seen."""
         if choice == self.finest:
-            return Error()
-        rendered = Error.largest(self.rendering_error(choice, which) for which in (START, VERIFIED))
-        return Error.in_quadrature(
-            [
-                rendered,
-                self.dropped_error(choice, VERIFIED),
-                self.response_error(choice, others=True),
-            ]
-        )
+            return ModelError()
+        return ModelError.largest(self.error(choice, which) for which in (START, VERIFIED))

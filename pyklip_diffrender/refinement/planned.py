@@ -17,7 +17,7 @@ from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.linear.response import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.planning import Error, Plan, plan
+from pyklip_diffrender.planning import ModelError, Plan, plan
 from pyklip_diffrender.refinement.continuation import (
     continued,
     fit_with_growing_basis,
@@ -123,7 +123,7 @@ def fit_problems(
     if not fit.status.usable:
         return replace(fit, plan=planned)
     finished = [_on_full_model(fit, k, each, settings.free) for k, each in enumerate(problems)]
-    error = Error.largest(change for _, change in finished)
+    error = ModelError.largest(change for _, change in finished)
     if planned.allows(error):
         return replace(
             fit,
@@ -150,7 +150,7 @@ def fit_problems(
 
 def _on_full_model(
     fit: Refinement, k: int, problem: Problem, free: tuple[str, ...]
-) -> tuple[FrameFit, Error]:
+) -> tuple[FrameFit, ModelError]:
     """One frame of a planned fit on the given model, and by how much its star changes."""
     frame, model = fit.frames[k], problem.model
     opd = frame.opd
@@ -173,7 +173,7 @@ def _on_full_model(
     )
     star = flux * image + level
     away = ((star - before) / problem.sigma)[problem.valid].abs()
-    error = Error(float(away.square().mean().sqrt()), float(away.max()))
+    error = ModelError(float(away.square().mean().sqrt()), float(away.max()))
     fitted = {**frame.values, "flux": np.array([flux]), "background": np.array([level])}
     return replace(frame, model=model, opd=opd, star=star.cpu().numpy(), values=fitted), error
 

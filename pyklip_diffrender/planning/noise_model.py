@@ -1,0 +1,112 @@
+"""The noise of every pixel, which errors of the star model are compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.errors import NoValidPixelsError, ShapeError
+from pyklip_diffrender.planning.choice import ModelError
+from pyklip_diffrender.scene.objects import Scene
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["NoiseModel", "least_squares"]
+
+
+def least_squares(columns: Sequence[Tensor], data: Tensor) -> tuple[list[float], Tensor]:
+    """Coefficients of columns of any scale that fit the data best, and the residual."""
+    design = torch.stack(list(columns), dim=1)
+    length = torch.linalg.vector_norm(design, dim=0).clamp(min=1e-300)
+    design = design / length
+    solution = torch.linalg.lstsq(design, data[:, None]).solution[:, 0]
+    return (solution / length).tolist(), data - design @ solution
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """A star and the noise in which it is seen.
+
+    Attributes
+    ----------
+    image : Tensor, (ny, nx), float64
+        The star at flux 1.
+    flux : float
+        Light that the pupil collects, in the unit of the noise.
+    sigma : Tensor, (ny, nx)
+        Standard deviation of every pixel.
+    valid : Tensor of bool, (ny, nx)
+    residual : Tensor, (ny, nx), or None
+        Data less star and background, where there are data.
+    """
+
+    image: Tensor
+    flux: float
+    sigma: Tensor
+    valid: Tensor
+    residual: Tensor | None = None
+
+    @classmethod
+    def of(cls, subject: Scene | Observation, image: Tensor, share: float = 0.0) -> NoiseModel:
+        """Noise of a star that is to be simulated, or of frames.
+
+        A simulated star has photon noise of star and background, and read noise; frames have
+        errors of their own, and the flux at which the image fits them best.
+
+        Parameters
+        ----------
+        subject : Scene or Observation
+        image : Tensor, (ny, nx)
+            The star at flux 1.
+        share : float
+            Share of the star that the model may miss; adds to the noise in quadrature.
+
+        Raises
+        ------
+        ShapeError, NoValidPixelsError
+        """
+        residual = None
+        if isinstance(subject, Scene):
+            flux = subject.star.photons
+            sigma = torch.sqrt(flux * image + subject.background + subject.read_noise**2)
+            valid = torch.ones_like(image, dtype=torch.bool)
+        else:
+            if subject.shape != tuple(image.shape):
+                raise ShapeError(
+                    f"{subject.name}: got {subject.shape} pixels, expected the model's "
+                    f"{tuple(image.shape)}"
+                )
+            frame = subject.combined()
+            data, sigma, valid = (
+                torch.from_numpy(each[0]).to(image.device)
+                for each in (frame.data, frame.error, frame.valid)
+            )
+            if not bool(valid.any()):
+                raise NoValidPixelsError(f"{subject.name}: all pixels are masked")
+            # Equal weights: those of photon noise would trust only the faint pixels.
+            columns = [image[valid], torch.ones_like(image[valid])]
+            (flux, level), _ = least_squares(columns, data[valid])
+            residual = data - flux * image - level
+            flux = max(flux, 0.0)
+        return cls(image, flux, torch.hypot(sigma, share * flux * image), valid, residual)
+
+    def in_sigma(self, change: Tensor) -> Tensor:
+        """A change of the image at flux 1, (..., ny, nx), in units of the noise; 0 if masked."""
+        return torch.where(self.valid, self.flux * change / self.sigma, 0.0)
+
+    def unexplained(self, change: Tensor) -> Tensor:
+        """As `in_sigma`, less what another flux and background would explain.
+
+        Every fit has these two free; nothing else is taken off.
+        """
+        columns = [self.in_sigma(self.image)[self.valid], 1 / self.sigma[self.valid]]
+        left = torch.zeros_like(self.image)
+        left[self.valid] = least_squares(columns, self.in_sigma(change)[self.valid])[1]
+        return left
+
+    def error(self, whitened: Tensor) -> ModelError:
+        """Size of an image in units of the noise, over the valid pixels."""
+        inside = whitened[self.valid].abs()
+        return ModelError(float(inside.square().mean().sqrt()), float(inside.max()))

@@ -1,0 +1,219 @@
+"""`plan`: measure the economies, pick the cheapest set inside the budget, verify it as a whole."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import torch
+
+from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError, MissingOPDError
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.planning.choice import Choice, Economy, ModelError, Option
+from pyklip_diffrender.planning.probes import PROBES
+from pyklip_diffrender.planning.result import Plan, plan_table
+from pyklip_diffrender.planning.trial import Trial
+from pyklip_diffrender.scene.objects import Scene
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import as_opd_map, resample
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
+
+__all__ = ["plan"]
+
+_log = logging.getLogger(__name__)
+
+_SHARE_OF_BUDGET = 0.9
+"""Part of the budget that the expected errors may fill: they differ between wavefronts."""
+
+
+def plan(
+    model: OpticalSystem,
+    subject: Scene | Observation,
+    opd: Any,
+    *,
+    error_budget: float = 0.1,
+    keep: Mapping[str, Any] | None = None,
+    start: Mapping[str, Any] | None = None,
+    prior: WavefrontPrior | None = None,
+    cycles: Sequence[float] = (24.0, 32.0),
+    response_npix: int = 128,
+    model_error: float = 0.0,
+    seed: int = 0,
+) -> Plan:
+    """Find the cheapest settings that model a star to within a fraction of its noise.
+
+    Every economy is measured on the scene itself: the star is rendered with and without it, at
+    the starting wavefront and after a drift drawn from the prior, and compared in units of the
+    pixel noise. What another flux and background would explain is taken off, because every fit
+    has them free. Errors of several economies add in quadrature. The chosen set is rendered as a
+    whole, at a wavefront that no probe has seen; if its error exceeds the budget, the economy that
+    matters most is made finer and the set is verified again.
+
+    Parameters
+    ----------
+    model : OpticalSystem
+        As fine as wanted: errors are relative to it, and no setting becomes finer than its own.
+        Settings that it cannot change (see `OpticalSystem.adjustable`) stay as they are.
+    subject : Scene or Observation
+        A star that is to be simulated, or frames. For frames, the prior is widened until it
+        explains how far the star is from them.
+    opd : path, OPDMap, Quantity or array
+        Wavefront to start from, as for `refine`.
+    error_budget : float
+        Largest rms error of the star model over the valid pixels, in units of their noise. The
+        worst pixel may be ten times as far off.
+    keep : mapping, optional
+        Settings that are decided: fields of `planning.Choice`, such as ``npix`` and ``cycles``.
+    start : mapping, optional
+        The model's other parameters, as for `refine`.
+    prior : WavefrontPrior, optional
+        How far the wavefront may have moved.
+    cycles : sequence of float
+        Highest spatial frequencies of the modes that a fit may use, see `refine`; the first is
+        that of the finest set here.
+    response_npix : int
+        Pupil samples of the copy that computes derivatives; see `refine`.
+    model_error : float
+        Fraction of the star that the model may miss anyway (``kappa_floor`` of `refine`).
+    seed : int
+        Of the wavefronts that are drawn.
+
+    Returns
+    -------
+    Plan
+        ``print(plan)`` shows what was chosen and why.
+
+    Raises
+    ------
+    MissingOPDError
+        If `opd` is None.
+    IncompatibleSetupError
+        For a setting in `keep` that is unknown or cannot be had, a budget that is not positive,
+        no `cycles`, or a subject of another type.
+    ShapeError, NoValidPixelsError
+        For frames of another shape than the model's, or without valid pixels.
+
+    Warns
+    -----
+    DiffrenderWarning
+        If the settings in `keep` do not fit into the budget.
+    """
+    if opd is None:
+        raise MissingOPDError("plan needs the wavefront that the refinement will start from")
+    if not error_budget > 0:
+        raise IncompatibleSetupError(
+            f"error_budget: got {error_budget}, expected a positive number of sigma, such as 0.1"
+        )
+    if not cycles:
+        raise IncompatibleSetupError("cycles: got none, expected at least one")
+    if not isinstance(subject, Scene | Observation):
+        raise IncompatibleSetupError(
+            f"plan: got a {type(subject).__name__} to plan for, expected a Scene or an Observation"
+        )
+    pins = dict(keep or {})
+    known = [each.name for each in fields(Choice)]
+    if unknown := [name for name in pins if name not in known]:
+        raise IncompatibleSetupError(
+            f"keep: got {unknown}, expected settings that a plan chooses: {', '.join(known)}"
+        )
+    wavefront = np.ascontiguousarray(resample(as_opd_map(opd).data, model.npix))
+    values = {name: value for name, value in (start or {}).items() if name in model.parameters}
+    if isinstance(subject, Scene) and any(subject.star_offset):
+        values.setdefault("star_offset", subject.star_offset)
+    trial = Trial(
+        model,
+        subject,
+        torch.from_numpy(wavefront).to(model.device),
+        model.values(values),
+        prior=prior or WavefrontPrior(),
+        cycles=float(cycles[0]),
+        response_npix=response_npix,
+        model_error=model_error,
+        budget=error_budget,
+        seed=seed,
+        pins=pins,
+    )
+    economies = []
+    for probe in PROBES.values():
+        economies.append(probe(trial))
+        trial.learn(economies[-1])
+    picked = _cheapest(trial, economies)
+    picked, verified, steps = _verified(trial, economies, picked)
+    if not verified.inside(error_budget):
+        warnings.warn(
+            f"plan: what is kept ({', '.join(pins)}) leaves {verified.rms:.2g} sigma (worst pixel "
+            f"{verified.worst:.2g}), more than the budget of {error_budget:g}",
+            DiffrenderWarning,
+            stacklevel=2,
+        )
+    choice = _choice(trial, picked)
+    _log.info("%s: %.3g sigma, verified %.3g", choice, error_budget, verified.rms)
+    return Plan(
+        model=trial.system(choice),
+        given=model,
+        choice=choice,
+        refine_options={"cycles": (choice.cycles, *(c for c in cycles if c > choice.cycles))},
+        table=plan_table(trial, economies, picked),
+        budget=error_budget,
+        error=ModelError.in_quadrature(option.error for option in picked),
+        verified_error=verified,
+        seconds=trial.seconds(choice),
+        seconds_given=trial.seconds(trial.finest),
+        seed=seed,
+        pinned=tuple(pins),
+        steps=tuple(steps),
+    )
+
+
+def _choice(trial: Trial, picked: Iterable[Option]) -> Choice:
+    choice = trial.finest
+    for option in picked:
+        choice = replace(choice, **option.changes)
+    return choice
+
+
+def _cheapest(trial: Trial, economies: Sequence[Economy]) -> list[Option]:
+    """Of all sets whose errors together stay inside the budget, the one that takes least time."""
+    room = _SHARE_OF_BUDGET * trial.budget
+    offered = []
+    for economy in economies:
+        fitting = [each for each in economy.options if each.error.inside(room)]
+        # What is pinned may be outside; then the best of it is taken, and the rest stays fine.
+        offered.append(fitting or [min(economy.options, key=lambda each: each.error.rms)])
+
+    def rank(picked: Iterable[Option]) -> tuple[bool, float, float]:
+        error = ModelError.in_quadrature(option.error for option in picked)
+        inside = error.inside(room)
+        seconds = trial.seconds(_choice(trial, picked)) if inside else 0.0
+        return not inside, seconds, error.rms
+
+    return list(min(product(*offered), key=rank))
+
+
+def _verified(
+    trial: Trial, economies: Sequence[Economy], picked: list[Option]
+) -> tuple[list[Option], ModelError, list[str]]:
+    """Verify as a whole; as long as that is outside the budget, make finer what matters most."""
+    steps: list[str] = []
+    while True:
+        error = trial.verified(_choice(trial, picked))
+        if error.inside(trial.budget):
+            return picked, error, steps
+        tried = []
+        for k, economy in enumerate(economies):
+            after = economy.options[economy.options.index(picked[k]) + 1 :]
+            finer = [each for each in after if each.error.rms <= picked[k].error.rms]
+            if finer:
+                # Whatever the probes say of it: one of them may be wrong.
+                other = [*picked[:k], finer[0], *picked[k + 1 :]]
+                tried.append((trial.verified(_choice(trial, other)).rms, k, other))
+        if not tried:
+            return picked, error, steps
+        _, k, picked = min(tried, key=lambda each: each[:2])
+        steps.append(economies[k].name)
+        _log.info("verification: %.3g sigma; finer: %s", error.rms, economies[k].name)
