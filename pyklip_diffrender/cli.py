@@ -9,61 +9,86 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 
 if TYPE_CHECKING:
-    from pyklip_diffrender.refinement import Refinement
+    from pyklip_diffrender.reduction import Reduction
 
 __all__ = ["main"]
 
 
 def _parser() -> argparse.ArgumentParser:
+    from pyklip_diffrender import __version__
+
     parser = argparse.ArgumentParser(
         prog="pyklip-diffrender",
-        description="Star subtraction for JWST coronagraphy by refining the wavefront.",
+        description="Find planets in JWST coronagraphic images by refining the wavefront.",
     )
-    parser.add_argument("-v", "--verbose", action="store_true", help="say what is being done")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    # Before and after the command alike.
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("-v", "--verbose", action="store_true", help="log every step")
+    common.add_argument("-q", "--quiet", action="store_true", help="show no progress bars")
+    common.add_argument(
+        "--overwrite", action="store_true", help="replace existing products of an earlier run"
+    )
+    frames = argparse.ArgumentParser(add_help=False)
+    frames.add_argument(
+        "--opd", type=Path, required=True, help="wavefront map to start from (FITS)"
+    )
+    frames.add_argument("-o", "--output", type=Path, required=True, help="folder for the products")
+    frames.add_argument("--size", type=int, default=80, help="side of the fitted square, pixels")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     demo = commands.add_parser(
-        "demo", help="a simulated planet, KLIP and wavefront refinement side by side"
+        "demo",
+        parents=[common],
+        help="a simulated planet with KLIP and wavefront refinement side by side",
     )
     demo.add_argument("-o", "--output", type=Path, default=Path("diffrender-demo"))
     demo.add_argument("--contrast", type=float, default=1e-6)
     demo.add_argument("--separation", type=float, default=0.6, help="arcsec")
     demo.add_argument("--hours", type=float, default=40.0, help="age of the wavefront map")
     demo.add_argument("--seed", type=int, default=1)
-    demo.set_defaults(run=_demo)
+    demo.set_defaults(run=_demo, products="demo.fits")
 
-    psf = commands.add_parser("psf", help="write the image of a star behind the coronagraph")
+    reduce = commands.add_parser(
+        "reduce",
+        parents=[common, frames],
+        help="search all rolls of a target, with what its reference stars teach",
+        epilog="example: pyklip-diffrender reduce frames/ --target G-7-34 --filter F444W "
+        "--opd wavefront.fits -o products",
+    )
+    reduce.add_argument("frames", type=Path, nargs="+", help="calints files, or a folder of them")
+    reduce.add_argument("--target", help="name of the target; the other stars are references")
+    reduce.add_argument("--filter", help="which filter, if the files have several")
+    reduce.add_argument("--threshold", type=float, default=5.0, help="S/N of a candidate")
+    reduce.add_argument(
+        "--systematics", type=Path, help="pattern of the model's error, from an earlier reduction"
+    )
+    reduce.add_argument(
+        "--dry-run", action="store_true", help="list what would be reduced, and stop"
+    )
+    reduce.set_defaults(run=_reduce, products="detection.fits")
+
+    detect = commands.add_parser(
+        "detect", parents=[common, frames], help="search a single calints file"
+    )
+    detect.add_argument("frames", type=Path, help="calints file")
+    detect.add_argument("--threshold", type=float, default=5.0, help="S/N of a candidate")
+    detect.set_defaults(run=_detect, products="detection.fits")
+
+    psf = commands.add_parser(
+        "psf", parents=[common], help="write the image of a star behind the coronagraph"
+    )
     psf.add_argument("output", type=Path, help="FITS file to write")
     psf.add_argument("--filter", default="F444W")
     psf.add_argument("--monochromatic", type=float, help="wavelength, m")
-    psf.add_argument("--opd", type=Path, help="OPD map (FITS); default a flat wavefront")
-    psf.add_argument("--fov-pixels", type=int, default=80)
+    psf.add_argument("--opd", type=Path, help="wavefront map (FITS); default a flat wavefront")
+    psf.add_argument("--size", type=int, default=80, help="side of the image, pixels")
     psf.add_argument("--offset", type=float, nargs=2, default=(0.0, 0.0), metavar=("X", "Y"),
                      help="star from the occulter's centre, arcsec")  # fmt: skip
-    psf.set_defaults(run=_psf)
-
-    refine = commands.add_parser("refine", help="refine a wavefront on a calints file")
-    refine.add_argument("frames", type=Path, help="calints FITS")
-    refine.add_argument("opd", type=Path, help="OPD map (FITS)")
-    refine.add_argument("-o", "--output", type=Path, required=True, help="FITS file to write")
-    refine.add_argument("--fov-pixels", type=int, default=80)
-    refine.add_argument("--plan", choices=("auto", "off"), default="auto", help="model fidelity")
-    refine.set_defaults(run=_refine)
-
-    detect = commands.add_parser(
-        "detect", help="look for companions in a calints file, the wavefront integrated out"
-    )
-    detect.add_argument("frames", type=Path, help="calints FITS")
-    detect.add_argument("opd", type=Path, help="OPD map (FITS)")
-    detect.add_argument("-o", "--output", type=Path, required=True, help="folder to write into")
-    detect.add_argument("--fov-pixels", type=int, default=80)
-    detect.add_argument("--plan", choices=("auto", "off"), default="auto", help="model fidelity")
-    detect.add_argument("--threshold", type=float, default=5.0, help="S/N of a candidate")
-    detect.set_defaults(run=_detect)
-
+    psf.set_defaults(run=_psf, products="")
     return parser
 
 
@@ -74,11 +99,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
         level=logging.INFO if options.verbose else logging.WARNING, format="%(message)s"
     )
     try:
+        _require_free(options.output, options.products, options.overwrite)
         options.run(options)
     except DiffrenderError as error:
         print(f"pyklip-diffrender: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("pyklip-diffrender: interrupted; nothing was written", file=sys.stderr)
+        return 130
     return 0
+
+
+def _require_free(output: Path, product: str, overwrite: bool) -> None:
+    """Refuse, before any work, an output that could not be written or would be replaced.
+
+    Raises
+    ------
+    IncompatibleSetupError
+    """
+    if product and output.exists() and not output.is_dir():
+        raise IncompatibleSetupError(f"--output: {output} is a file, expected a folder")
+    taken = output / product if product else output
+    if taken.exists() and not overwrite:
+        raise IncompatibleSetupError(
+            f"--output: {taken} exists; choose another place, or replace it with --overwrite"
+        )
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -90,7 +135,7 @@ def _demo(options: argparse.Namespace) -> None:
         separation=options.separation,
         hours=options.hours,
         seed=options.seed,
-        progress=True,
+        progress=not options.quiet,
     )
     written = write_demo(result, options.output)
     figure = options.output / "demo.png"
@@ -125,7 +170,7 @@ def _psf(options: argparse.Namespace) -> None:
     from pyklip_diffrender.wavefront.opd import read_opd, resample
 
     model = nircam_coronagraph(
-        options.filter, monochromatic=options.monochromatic, fov_pixels=options.fov_pixels
+        options.filter, monochromatic=options.monochromatic, fov_pixels=options.size
     )
     opd = None if options.opd is None else resample(read_opd(options.opd).data, model.npix)
     image = model(opd, tuple(options.offset))
@@ -136,56 +181,57 @@ def _psf(options: argparse.Namespace) -> None:
     print(f"wrote {options.output}")
 
 
-def _fitted(options: argparse.Namespace) -> Refinement:
-    from pyklip_diffrender.refinement import refine
+def _detect(options: argparse.Namespace) -> None:
+    from pyklip_diffrender.reduction import reduce
     from pyklip_diffrender.scene.observation import Observation
-    from pyklip_diffrender.scene.real_frames import model_for
+    from pyklip_diffrender.scene.sequence import Sequence
 
     observation = Observation.from_fits(options.frames)
-    model = model_for(observation, options.fov_pixels)
-    cutout = observation.cutout(options.fov_pixels)
-    fit = refine(model, cutout, options.opd, progress=True, plan=options.plan)
-    if fit.plan is not None:
-        print(f"{fit.plan}\n")
-    return fit
+    _conclude(
+        reduce(
+            Sequence(observation.target, (observation,)),
+            options.opd,
+            size=options.size,
+            threshold=options.threshold,
+            progress=not options.quiet,
+        ),
+        options.output,
+    )
 
 
-def _detect(options: argparse.Namespace) -> None:
-    from pyklip_diffrender.detection import detect
+def _reduce(options: argparse.Namespace) -> None:
+    from pyklip_diffrender.reduction import reduce
+    from pyklip_diffrender.refinement import Systematics
+    from pyklip_diffrender.scene.sequence import Sequence
+
+    frames = options.frames[0] if len(options.frames) == 1 else options.frames
+    sequence = Sequence.from_files(frames, target=options.target, filter=options.filter)
+    print("\n".join(sequence.table.pformat(max_lines=-1, max_width=-1)))
+    for name, reason in sequence.excluded:
+        print(f"left out: {name}: {reason}")
+    if options.dry_run:
+        return
+    known = None if options.systematics is None else Systematics.read(options.systematics)
+    _conclude(
+        reduce(
+            sequence,
+            options.opd,
+            size=options.size,
+            systematics=known,
+            threshold=options.threshold,
+            progress=not options.quiet,
+        ),
+        options.output,
+    )
+
+
+def _conclude(reduction: Reduction, folder: Path) -> None:
+    """Write all products and say what was found."""
     from pyklip_diffrender.plotting import draw_detection, save
 
-    fit = _fitted(options)
-    found = detect(fit, threshold=options.threshold, progress=True)
-    written = found.write(options.output)
-    figure = options.output / "detection.png"
-    save(draw_detection(found), figure)
-    print(found.table["separation", "position_angle", "contrast", "contrast_error", "snr"])
-    print(f"{fit.status.message}; errors scaled by {found.scatter:.3g}")
+    written = reduction.write(folder)
+    figure = folder / "detection.png"
+    save(draw_detection(reduction.detection), figure)
+    print(f"\n{reduction}")
     for path in (*written, figure):
         print(f"wrote {path}")
-
-
-def _refine(options: argparse.Namespace) -> None:
-    import numpy as np
-    from astropy.io import fits
-
-    from pyklip_diffrender.io.files import write_fits
-
-    fit = _fitted(options)
-    (frame,) = fit.frames
-    primary = fits.PrimaryHDU()
-    for key, value in fit.summary().items():
-        primary.header[f"HIERARCH {key}"] = value
-    hdus = fits.HDUList(
-        [
-            primary,
-            fits.ImageHDU(frame.residual.astype(np.float32), name="RESIDUAL"),
-            fits.ImageHDU(frame.star.astype(np.float32), name="STAR"),
-            fits.ImageHDU(fit.wavefront.real.astype(np.float32), name="OPD"),
-        ]
-    )
-    hdus["OPD"].header["BUNIT"] = "m"
-    write_fits(hdus, options.output)
-    print(fit.parameters["name", "value", "error", "unit"])
-    print(fit.status.message)
-    print(f"wrote {options.output}")
