@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -44,6 +44,8 @@ class FrameLayout:
         Degrees by which the sky is turned, counter-clockwise, relative to the first frame.
     shows_companions : bool
         False for a reference star.
+    deviations : mapping of str to float
+        Prior deviations that differ from the parameter table's.
     """
 
     names: tuple[str, ...]
@@ -53,6 +55,7 @@ class FrameLayout:
     companions: list[Planet] = field(default_factory=list)
     roll: float = 0.0
     shows_companions: bool = True
+    deviations: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def optical(self) -> tuple[str, ...]:
@@ -121,7 +124,11 @@ class FrameLayout:
     def prior_deviation(self) -> Tensor:
         """Prior deviations of everything before the amplitude and the modes."""
         named = [
-            torch.full((parameter(name).size,), parameter(name).prior, dtype=torch.float64)
+            torch.full(
+                (parameter(name).size,),
+                self.deviations.get(name, parameter(name).prior),
+                dtype=torch.float64,
+            )
             for name in self.ordered
         ]
         planets = torch.tensor(COMPANION_PRIOR, dtype=torch.float64).repeat(len(self.companions))

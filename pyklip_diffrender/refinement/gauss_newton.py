@@ -134,7 +134,18 @@ class Solver:
         image = forward.at(layout, layout.initial()).image
         # Photon-noise weights before the star is known would trust the faint pixels only.
         flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
-        flux, level = problem.flux_and_background(problem.gain * image, flat, layout.linear)
+        deviations = dict(self.settings.deviations)
+        known = "flux" in deviations
+        if known and "flux" not in problem.start:
+            raise IncompatibleSetupError(
+                "deviations has 'flux', but start does not: how bright is the star? Give "
+                "start={'flux': stellar_flux(...)}"
+            )
+        unknown = tuple(name for name in layout.linear if not (known and name == "flux"))
+        flux, level = problem.flux_and_background(problem.gain * image, flat, unknown)
+        if known:
+            deviations["flux"] *= flux
+        layout.deviations = deviations
         layout.start["flux"] = torch.tensor([flux], dtype=torch.float64)
         layout.start["background"] = torch.tensor([level], dtype=torch.float64)
         return layout

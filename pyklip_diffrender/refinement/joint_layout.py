@@ -133,10 +133,10 @@ class JointLayout:
 
     def prior_deviation(self) -> Tensor:
         """Prior deviations of everything before the amplitude and the modes."""
-        every = self.frames[0].prior_deviation()
         joint = torch.empty(self.where("amplitude").start, dtype=torch.float64)
-        for frame in range(len(self.frames)):
-            joint[self.rows(frame)[: len(every)]] = every
+        for frame, layout in reversed(list(enumerate(self.frames))):
+            own = layout.prior_deviation()
+            joint[self.rows(frame)[: len(own)]] = own
         return joint
 
     def clamped(self, vector: Tensor) -> Tensor:

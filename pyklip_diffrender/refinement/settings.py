@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -35,6 +36,11 @@ class GaussNewton:
         one is fitted; the next one is tried while the data are not explained.
     basis : Basis, optional
         Wavefront modes, in place of the default basis (segment motions and Fourier modes).
+    deviations : mapping of str to float
+        Prior standard deviations of free parameters about their starting values, where they
+        differ from those of the parameter table. That of "flux" is relative, and takes a starting
+        value: ``deviations={"flux": 0.05}`` with ``start={"flux": ...}`` ties the contrast scale to
+        the star's known brightness, see `stellar_flux`.
     prior : WavefrontPrior
         Prior on the wavefront's change from the starting map.
     drift : WavefrontPrior, optional
@@ -84,6 +90,7 @@ class GaussNewton:
     wavefront: bool = True
     cycles: tuple[float, ...] = (24.0, 32.0)
     basis: Basis | None = None
+    deviations: Mapping[str, float] = field(default_factory=dict)
     prior: WavefrontPrior = field(default_factory=WavefrontPrior)
     drift: WavefrontPrior | None = None
     drift_cycles: float = 8.0
@@ -129,6 +136,12 @@ class GaussNewton:
             if getattr(self, name) < 0:
                 raise IncompatibleSetupError(
                     f"{name}: got {getattr(self, name)}, expected 0 or more"
+                )
+        for name, deviation in self.deviations.items():
+            if name not in self.free or not deviation > 0:
+                raise IncompatibleSetupError(
+                    f"deviations: got {deviation} for {name!r}, expected a positive number for one "
+                    f"of the free parameters {self.free}"
                 )
         if not self.free and not self.wavefront:
             raise IncompatibleSetupError("free is empty and wavefront is False: nothing to fit")
