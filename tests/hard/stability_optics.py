@@ -25,7 +25,8 @@ from hard_cases import (
 )
 
 from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
-from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, mask335r_complement
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.scene.objects import Planet, Scene
 from pyklip_diffrender.scene.simulation import expected_photons, planet_photons, star_photons
@@ -81,7 +82,7 @@ def occulter(dtype: torch.dtype) -> float:
         s = [mpmath.mpf(float(r)) * mpmath.mpf(reference.SIGMA) for r in radii]
         exact = [1.0 if x == 0 else float((2 * mpmath.besselj(1, x) / x) ** 2) for x in s]
     x = torch.from_numpy(radii)
-    got = mask335r_complement(x, torch.zeros_like(x)).to(dtype)
+    got = ROUND_MASKS["MASK335R"].complement(x, torch.zeros_like(x)).to(dtype)
     return float(np.abs(array(got) / exact - 1).max())
 
 
