@@ -174,7 +174,7 @@ def nircam_coronagraph(
     """
     recipe: dict[str, Any] = {k: v for k, v in locals().items() if k != "recipe"}
     recipe["defaults"] = dict(defaults or {})  # A copy, for the caller may change theirs.
-    mask = require_mask_and_filter(image_mask, filter.upper())
+    mask = require_mask_and_filter(image_mask, filter)
     if pupil_mask not in ("MASKRND", None):
         raise IncompatibleSetupError(
             f"pupil_mask: got {pupil_mask!r}, expected 'MASKRND' or None. Other stops come through "
