@@ -62,8 +62,8 @@ def _offset(mas: float) -> tuple[float, float]:
 def plain_fft(mas: float, route: str, sampling: float | None, dtype: torch.dtype) -> float:
     """Semi-analytic image against the plain FFT with 4 samples per lambda/D on the occulter."""
     model = small(
-        si_wfe=reference.lopsided_zernikes(), flip_si_wfe=True, dtype=dtype, route=route,
-        occulter_sampling=sampling,
+        si_wfe=reference.tabulated(reference.lopsided_zernikes(), WAVELENGTH), flip_si_wfe=True,
+        dtype=dtype, route=route, occulter_sampling=sampling,
     )  # fmt: skip
     return worst(model(reference.lopsided_opd(NPIX), _offset(mas)), _plain_fft(mas))
 
