@@ -94,6 +94,18 @@ def lopsided_zernikes() -> Array:
     return 12e-9 * np.sin(np.arange(36) ** 1.7 + 0.5) / np.sqrt(1 + np.arange(36) / 4)
 
 
+def tabulated(coefficients: Array, wavelength: float) -> Array:
+    """What the argument `si_wfe` has to be for a model to have these coefficients at a wavelength.
+
+    NIRCam's long-wave focus changes with the wavelength, relative to 3.23 um where its table was
+    made (polynomial of stpsf 2.2.0, highest order first).
+    """
+    focus = np.poly1d([0.175718713, -1.100964635, 0.986462016, 1.641692934]) / -1.09746e7
+    found = coefficients.copy()
+    found[3] += focus(wavelength * 1e6) - focus(3.23)
+    return found
+
+
 def zernike_opd(coefficients: Array, npix: int) -> Array:
     """Sum of Noll Zernikes by poppy on the inscribed circle, m.
 

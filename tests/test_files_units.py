@@ -353,7 +353,7 @@ def test_sha256_is_that_of_the_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["jwst_primary_polygons", "nircam_lw_filters", "nircam_maskrnd_openings", "nircam_si_zernikes"],
+    ["jwst_primary_polygons", "nircam_filters", "nircam_maskrnd_openings", "nircam_si_zernikes"],
 )
 def test_embedded_tables_say_where_they_come_from(name: str) -> None:
     table = embedded_table(name)

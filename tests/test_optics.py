@@ -15,17 +15,17 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.instrument.nircam import (
-    MASK335R_RADIUS,
-    mask335r_complement,
-    nircam_coronagraph,
-)
-from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, filter_names
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
+from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, filter_throughput
 from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.linear.forward_mode import jacfwd
+from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
+from pyklip_diffrender.planning.build import CheapSystem
 from pyklip_diffrender.wavefront.opd import random_opd
 
 WAVELENGTH = 4.5e-6
@@ -142,22 +142,125 @@ def test_debug_names_every_plane_in_order(opd: torch.Tensor) -> None:
     torch.testing.assert_close(intensity, model(opd), rtol=1e-10, atol=1e-20)
 
 
+# -- values where a call gives none ----------------------------------------------------------
+
+STANDING = {"blur": 0.026 * u.arcsec, "lyot_shift": (-0.013, 0.008), "lyot_rotation": 0.6}
+
+
+@pytest.mark.parametrize("changes", [{}, {"image_mask": None}, {"route": "planes"}], ids=str)
+def test_defaults_are_what_a_call_does_not_give(
+    changes: dict[str, object], opd: torch.Tensor
+) -> None:
+    plain, model = small(**changes), small(**changes, defaults=STANDING)
+    expected = plain(opd, **STANDING)
+    assert float((plain(opd) - expected).abs().max()) > 1e-2 * float(expected.max())
+    torch.testing.assert_close(model(opd), expected, rtol=0, atol=0)
+    torch.testing.assert_close(model(opd, blur=None), expected, rtol=0, atol=0)
+    image = model.image_of(model.fields(opd), model.values({}))
+    torch.testing.assert_close(image, expected, rtol=0, atol=0)
+    torch.testing.assert_close(
+        model.debug(opd)["detector"], plain.debug(opd, **STANDING)["detector"]
+    )
+    # What a call gives counts, and leaves the other parameters where they are.
+    other = {**STANDING, "lyot_shift": (0.004, 0.001), "star_offset": (0.02, -0.01)}
+    given = {name: other[name] for name in ("lyot_shift", "star_offset")}
+    torch.testing.assert_close(model(opd, **given), plain(opd, **other), rtol=0, atol=0)
+    zero = {"blur": 0.0, "lyot_shift": (0.0, 0.0), "lyot_rotation": 0.0}
+    torch.testing.assert_close(model(opd, **zero), plain(opd), rtol=1e-9, atol=1e-18)
+
+
+def test_defaults_stay_with_copies_of_another_fidelity(opd: torch.Tensor) -> None:
+    given = dict(FLIGHT_ALIGNMENT)
+    model = small(npix=192, defaults=given)
+    given["lyot_rotation"] = 40.0  # The caller's own; the model has a copy.
+    coarse = model.with_fidelity(npix=96)
+    torch.testing.assert_close(coarse(opd), small()(opd, **FLIGHT_ALIGNMENT), rtol=0, atol=0)
+    assert not model.with_fidelity(defaults=None).defaults
+    cheap = CheapSystem(coarse).with_fidelity(fov_pixels=20)
+    expected = small(fov_pixels=20)(opd, **FLIGHT_ALIGNMENT)
+    torch.testing.assert_close(cheap(opd), expected, rtol=0, atol=0)
+
+
+def test_point_sources_see_the_defaults(opd: torch.Tensor) -> None:
+    model, plain = small(defaults=STANDING), small()
+    images = [
+        PointSources(each, opd, values).images([12, 3], [20, 4])
+        for each, values in ((model, {}), (plain, STANDING))
+    ]
+    assert torch.equal(*images)
+
+
+def test_defaults_are_checked() -> None:
+    with pytest.raises(TypeError, match="'lyot_shfit' is not a parameter"):
+        small(defaults={"lyot_shfit": (0.0, 0.0)})
+    with pytest.raises(TypeError, match="'lyot_shift' is not a parameter"):
+        small(pupil_mask=None, defaults=FLIGHT_ALIGNMENT)
+    with pytest.raises(ShapeError, match="expected 2"):
+        small(defaults={"lyot_shift": 0.01})
+    with pytest.raises(UnitError, match="arcsec"):
+        small(defaults={"blur": 1 * u.m})
+
+
+def test_what_is_kept_for_one_position_is_not_used_for_another(opd: torch.Tensor) -> None:
+    """Nor does it hide a derivative: a parameter may be varied after it has stood still."""
+    model = small()
+    one, other = {"lyot_shift": (0.01, 0.0), "detector_shift": (0.02, 0.01)}, {"lyot_rotation": 1.0}
+    for values in (one, other, {}, one, {**one, **other}):
+        torch.testing.assert_close(model(opd, **values), small()(opd, **values), rtol=0, atol=0)
+    shift = torch.tensor([0.01, 0.0], dtype=torch.float64)
+    model(opd, lyot_shift=shift)
+    shift.requires_grad_()
+    with torch.no_grad():
+        model(opd, lyot_shift=shift)
+    (slope,) = torch.autograd.grad(model(opd, lyot_shift=shift).sum(), shift)
+    step = torch.tensor([1e-6, 0.0], dtype=torch.float64)
+    with torch.no_grad():
+        change = (
+            model(opd, lyot_shift=shift + step).sum() - model(opd, lyot_shift=shift - step).sum()
+        )
+    assert float(slope[0]) == pytest.approx(float(change) / 2e-6, rel=1e-5)
+    forward = jacfwd(lambda s: model(opd, lyot_shift=s).sum())(shift.detach())
+    torch.testing.assert_close(forward, slope, rtol=1e-9, atol=0)
+
+
 # -- the occulter ----------------------------------------------------------------------------
 
 
+# Scale of the profile per arcsec, and radius of half the transmitted light, arcsec: 6 lambda/D at
+# 2.1, 3.35 and 4.3 um (Krist et al. 2009).
+PROFILES = {
+    "MASK210R": ("5.253", 0.400),
+    "MASK335R": ("3.2927866", 0.638),
+    "MASK430R": ("2.58832", 0.812),
+}
+
+
 @pytest.mark.hard
-def test_occulter_complement_keeps_its_digits_near_the_centre() -> None:
+@pytest.mark.parametrize("name", PROFILES)
+def test_occulter_complement_keeps_its_digits_near_the_centre(name: str) -> None:
     mpmath = pytest.importorskip("mpmath")
-    for r in (0.0, 1e-9, 1e-5, 1e-2, 0.3, 1.5, 2.13):
-        s = mpmath.mpf(r) * mpmath.mpf("3.2927866")
+    mask = ROUND_MASKS[name]
+    for r in (0.0, 1e-9, 1e-5, 1e-2, 0.3, 1.0, 0.999 * mask.radius):
+        s = mpmath.mpf(r) * mpmath.mpf(PROFILES[name][0])
         exact = 1 if s == 0 else (2 * mpmath.besselj(1, s) / s) ** 2
-        got = float(mask335r_complement(torch.tensor(r, dtype=torch.float64), torch.tensor(0.0)))
+        got = float(mask.complement(torch.tensor(r, dtype=torch.float64), torch.tensor(0.0)))
         assert got == pytest.approx(float(exact), rel=1e-12, abs=1e-16)
 
 
-def test_occulter_is_exactly_clear_beyond_its_radius() -> None:
-    beyond = torch.tensor([MASK335R_RADIUS * (1 + 1e-12), 3.0, 10.0], dtype=torch.float64)
-    assert not mask335r_complement(beyond, torch.zeros(3)).any()
+@pytest.mark.parametrize("name", PROFILES)
+def test_occulter_is_exactly_clear_beyond_its_radius(name: str) -> None:
+    mask = ROUND_MASKS[name]
+    beyond = torch.tensor([mask.radius * (1 + 1e-12), 4.0, 10.0], dtype=torch.float64)
+    assert not mask.complement(beyond, torch.zeros(3)).any()
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_half_of_the_light_passes_where_the_mask_is_named_for(name: str) -> None:
+    """Krist's half width at half maximum is that of the intensity, and rounded to a percent."""
+    radius = torch.linspace(0, 1.2, 1201, dtype=torch.float64)
+    passed = (1 - ROUND_MASKS[name].complement(radius, torch.zeros(1))) ** 2
+    found = float(radius[(passed < 0.5).sum()])
+    assert found == pytest.approx(PROFILES[name][1], rel=0.015)
 
 
 @pytest.mark.hard
@@ -309,7 +412,7 @@ def test_gradient_at_exact_zeros_of_the_field() -> None:
 # -- wavelengths -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["F444W", "F335M", "F250M"])
+@pytest.mark.parametrize("name", ["F444W", "F335M", "F250M", "F182M", "F212N"])
 def test_bandpass_weights_sum_to_one_and_lie_in_the_filter(name: str) -> None:
     band = filter_bandpass(name, 9)
     assert math.fsum(band.weights) == pytest.approx(1.0, abs=1e-12)
@@ -343,12 +446,28 @@ def test_a_given_spectrum_is_used() -> None:
 
 
 @pytest.mark.hard
-@pytest.mark.parametrize("name", ["F200W", "F444", "nonsense"])
-def test_a_filter_that_the_mask_does_not_take_is_named_with_those_it_takes(name: str) -> None:
-    with pytest.raises(IncompatibleSetupError, match=r"MASK335R.*F444W") as caught:
-        nircam_coronagraph(name)
+@pytest.mark.parametrize(
+    ("name", "mask"),
+    [("F200W", "MASK335R"), ("F444W", "MASK210R"), ("F444", "MASK430R"), ("nonsense", None)],
+)
+def test_a_filter_that_the_mask_does_not_take_is_named_with_those_it_takes(
+    name: str, mask: str | None
+) -> None:
+    legal = r"MASK210R with F182M.*F212N; MASK335R with F250M.*F444W.*; MASK430R with F250M"
+    with pytest.raises(IncompatibleSetupError, match=legal) as caught:
+        nircam_coronagraph(name, image_mask=mask)
     assert repr(name) in str(caught.value)
-    assert "F444W" in filter_names()
+    assert repr(mask) in str(caught.value)
+
+
+@pytest.mark.parametrize("mask", ROUND_MASKS)
+def test_every_filter_of_a_mask_has_a_throughput(mask: str) -> None:
+    for name in ROUND_MASKS[mask].filters:
+        wavelength, throughput = filter_throughput(name)
+        assert (np.diff(wavelength) > 0).all()
+        assert throughput.max() == pytest.approx(1.0, abs=1e-3)
+    with pytest.raises(IncompatibleSetupError, match=r"'F150W'.*F182M.*F480M"):
+        filter_throughput("F150W")
 
 
 @pytest.mark.hard
@@ -357,7 +476,10 @@ def test_a_filter_that_the_mask_does_not_take_is_named_with_those_it_takes(name:
     [
         ({"monochromatic": 4.5}, "metres"),
         ({"monochromatic": 2e-6}, "outside F444W"),
-        ({"image_mask": "MASK210R"}, "MASK335R"),
+        ({"image_mask": "MASKLWB"}, "round masks.*from_webbpsf"),
+        ({"pupil_mask": "MASKLWB"}, "MASKRND.*from_webbpsf"),
+        ({"pupil": "RevW"}, "'design' or 'flight'"),
+        ({"defaults": {"star_offset": (0.1, 0.0)}}, "belongs to a source"),
         ({"fov_pixels": 10, "fov_arcsec": 1.0}, "not both"),
         ({"fov_pixels": 0}, "at least 1"),
         ({"occulter_sampling": 0.5}, "at least 1"),

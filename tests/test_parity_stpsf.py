@@ -1,4 +1,4 @@
-"""The table of parity with stpsf, at 256 samples across the pupil.
+"""The table of parity with stpsf, at 256 samples across the pupil, and on STScI's own files.
 
 `tests/benchmarks/parity.py` measures the same at 1024 and writes docs/parity.md.
 """
@@ -11,8 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from stpsf_data import lyot_stop
 
 from pyklip_diffrender.bridges import from_webbpsf
+from pyklip_diffrender.instrument.jwst import maskrnd_openings
+from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
+from pyklip_diffrender.optics.grid import JWST_DIAMETER
+from pyklip_diffrender.optics.planes import LyotStop
+from pyklip_diffrender.optics.system import OpticalSystem
 
 NPIX = 256
 CALL = {
@@ -69,6 +76,7 @@ def nircam(
     band: str = "F444W",
     image_mask: str | None = "MASK335R",
     pupil_mask: str | None = "MASKRND",
+    pupil: str = "RevW",
     **options: Any,
 ) -> Any:
     """A configured stpsf.NIRCam."""
@@ -77,7 +85,7 @@ def nircam(
     instrument = stpsf.NIRCam()
     instrument.filter = band
     instrument.image_mask, instrument.pupil_mask = image_mask, pupil_mask
-    instrument.pupil = str(folder / f"jwst_pupil_RevW_npix{npix}.fits.gz")
+    instrument.pupil = str(folder / f"jwst_pupil_{pupil}_npix{npix}.fits.gz")
     instrument.options.update(options)
     return instrument
 
@@ -138,3 +146,117 @@ def test_the_table_would_notice(stpsf_path: Path, turn: Callable[[Any], Any]) ->
     truth = instrument.calc_psf(**call)[1].data
     for image in (turn(model()), model(turn(model.entrance.opd))):
         assert np.abs(image.numpy() - truth).max() > 1e-3 * truth.max()
+
+
+# -- the embedded coronagraph --------------------------------------------------------------------
+
+
+def test_the_stop_moves_and_turns_as_in_stpsf(stpsf_path: Path) -> None:
+    """Shifts of whole samples, for poppy cuts the rest off; y and the rotation change sign."""
+    shift, angle = (-5 / NPIX, 3 / NPIX), 1.5
+    options = {"pupil_shift_x": shift[0], "pupil_shift_y": -shift[1], "pupil_rotation": -angle}
+    call = {**CALL, "fft_oversample": 2, "detector_oversample": 1}
+    model = from_webbpsf(nircam(stpsf_path, **BARE), **call)
+    truth = nircam(stpsf_path, **BARE, **options).calc_psf(**call)[1].data
+    # The synthetic stop lacks the first opening.
+    openings = maskrnd_openings()[1:]
+    stop = LyotStop(openings, NPIX, JWST_DIAMETER, torch.float64, torch.device("cpu"))
+    assert np.abs(stop.amplitude({}).numpy().sum() - lyot_stop(NPIX).sum()) < 1e-9
+    planes = [stop if plane.name == "MASKRND" else plane for plane in model.planes]
+    system = OpticalSystem(model.entrance, planes, model.detector, model.bandpass)
+
+    def away(x: float, y: float, turn: float) -> float:
+        image = system(lyot_shift=(x * shift[0], y * shift[1]), lyot_rotation=turn * angle)
+        return float(np.abs(image.numpy() - truth).max() / truth.max())
+
+    # scipy's cubic rotation of 256 samples, against polygons.
+    assert away(1, 1, 1) < 0.01
+    assert min(away(-1, 1, 1), away(1, -1, 1), away(1, 1, -1), away(0, 0, 0)) > 0.1
+
+
+@pytest.fixture
+def official(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """STScI's files, as STPSF_PATH."""
+    folder = shared_data / "stpsf-data"
+    if not folder.is_dir():
+        pytest.skip(f"needs STScI's files for stpsf in {folder}")
+    monkeypatch.setenv("STPSF_PATH", str(folder))
+    return folder
+
+
+FULL = {"fft_oversample": 2, "detector_oversample": 1, "fov_pixels": 80}
+
+
+@pytest.mark.parametrize("case", ["ND squares, 0.6 arcsec", "pupil shift, rotation, offset"])
+def test_converted_models_agree_on_the_official_files(official: Path, case: str) -> None:
+    """To rounding, DET_SAMP and DET_DIST, at 1024 samples."""
+    instrument = nircam(official, 1024, **CASES[case][0])
+    call = {**FULL, "monochromatic": 4.5e-6}
+    truth = instrument.calc_psf(**call)
+    for distorted, name in ((False, "DET_SAMP"), (True, "DET_DIST")):
+        image = from_webbpsf(instrument, add_distortion=distorted, **call)().numpy()
+        assert np.abs(image - truth[name].data).max() <= 1e-11 * truth[name].data.max()
+
+
+# Mask, filter, wavelength, where stpsf has no wedge tilt; stpsf's options, ours, and the limit on
+# the mean difference in units of the mean light there.
+EMBEDDED: dict[str, tuple[str, str, float, float, dict[str, Any], dict[str, Any], float]] = {
+    "MASK335R": ("MASK335R", "F444W", 4.5e-6, 3.35e-6, {}, {}, 5e-3),
+    "MASK430R": ("MASK430R", "F356W", 3.5e-6, 3.35e-6, {}, {}, 5e-3),
+    "MASK210R": ("MASK210R", "F210M", 2.05e-6, 2.10e-6, {}, {}, 5e-3),
+    "flight pupil": (
+        "MASK335R", "F444W", 4.5e-6, 3.35e-6, {"pupil": "flight"}, {"pupil": "flight"}, 5e-3,
+    ),
+    # Published for stpsf's options; poppy cuts the shifts to 13 and 7 samples.
+    "flight alignment": (
+        "MASK335R", "F444W", 4.5e-6, 3.35e-6,
+        {"pupil_shift_x": -0.01347, "pupil_shift_y": -0.00762, "pupil_rotation": -0.567},
+        {"defaults": FLIGHT_ALIGNMENT}, 5e-3,
+    ),
+    # The table's row, against what stpsf interpolates between field points: 5 nm of astigmatism.
+    "embedded aberrations": ("MASK335R", "F444W", 4.5e-6, 3.35e-6, {}, {"si_wfe": True}, 0.01),
+}  # fmt: skip
+# Changes that a test with such limits must notice.
+WRONG: dict[str, dict[str, Any]] = {
+    "aberrations not flipped": {"flip_si_wfe": False},
+    "no wedge tilt": {"chromatic_reference": None},
+    "another mask": {"image_mask": "MASK430R", "pixelscale": 0.062424185},
+    "stop aligned otherwise": {"defaults": {"lyot_shift": (0.0, 0.002)}},
+}
+
+
+def differences(official: Path, case: str, wrong: dict[str, Any]) -> list[float]:
+    """Mean difference between the embedded coronagraph and stpsf, and the mean light, in rings."""
+    mask, band, wavelength, tilt_free, theirs, ours, _ = EMBEDDED[case]
+    x, y = 0.05, -0.03
+    options = {**BARE, "jitter": None, "source_offset_x": x, "source_offset_y": y, **theirs}
+    instrument = nircam(official, 1024, band=band, image_mask=mask, **options)
+    call = {**FULL, "monochromatic": wavelength}
+    truth = instrument.calc_psf(**call, add_distortion=False)[1].data
+    opd = from_webbpsf(instrument, **call).entrance.opd
+    settings = {
+        "image_mask": mask,
+        "si_wfe": instrument._get_aberrations().zernike_coeffs,
+        "chromatic_reference": tilt_free,
+        **ours,
+        **wrong,
+    }
+    model = nircam_coronagraph(band, monochromatic=wavelength, **settings)
+    error = np.abs(model(opd, (x, y)).numpy() - truth)
+    rows, columns = np.mgrid[:80, :80] - 39.5
+    radius = np.hypot(rows, columns)
+    rings = [
+        (low <= radius) & (radius < high) for low, high in ((0, 5), (5, 11), (11, 19), (19, 38))
+    ]
+    return [float(error[ring].mean() / truth[ring].mean()) for ring in rings]
+
+
+@pytest.mark.parametrize("case", EMBEDDED)
+def test_the_embedded_coronagraph_is_that_of_the_official_files(official: Path, case: str) -> None:
+    """What is left: the outlines of pupil (0.2 %) and stop (0.1 %), and poppy's Zernike circle."""
+    assert max(differences(official, case, {})) < EMBEDDED[case][-1]
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_is_wrong_in_the_embedded_coronagraph_is_seen(official: Path, wrong: str) -> None:
+    assert max(differences(official, "MASK335R", WRONG[wrong])) > 0.03

@@ -38,7 +38,7 @@ def ours(
         monochromatic=WAVELENGTH,
         npix=NPIX,
         occulter_sampling=occulter_sampling,
-        si_wfe=reference.lopsided_zernikes(),
+        si_wfe=reference.tabulated(reference.lopsided_zernikes(), WAVELENGTH),
         flip_si_wfe=True,  # The coefficients are given for the entrance pupil.
         dtype=dtype,
         route=route,

@@ -109,7 +109,7 @@ def makers(here: Setting, case: Case, seed: int) -> tuple[Setting, Setting]:
     known = replace(here, model=here.model.with_fidelity(**case.both)) if case.both else here
     settings = {**case.both, **case.truth}
     if case.internal:
-        table = 1e-9 * np.asarray(embedded_table("nircam_si_zernikes")["coefficient"], dtype=float)
+        table = 1e-9 * np.asarray(embedded_table("nircam_si_zernikes")["MASK335R"], dtype=float)
         wrong = np.random.default_rng([seed, 99]).normal(0, NON_COMMON_PATH / 12**0.5, 12)
         table[3:15] += wrong
         settings["si_wfe"] = table

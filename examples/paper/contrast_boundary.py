@@ -33,7 +33,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection.metrics import aperture_sum
 from pyklip_diffrender.detection.relinearise import star_only
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.instrument.nircam import mask335r_complement
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
 from pyklip_diffrender.refinement import Refinement
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -82,7 +82,7 @@ def noise_limit(here: Setting, shot: Frame, separation: float) -> float:
     """The paper's fundamental limit (its appendix A)."""
     ring = np.abs(separations(here) - separation) <= HALF_WIDTH * here.model.detector.pixelscale[0]
     where = torch.tensor(separation, dtype=torch.float64)
-    passed = (1 - float(mask335r_complement(where, torch.zeros_like(where)))) ** 2
+    passed = (1 - float(ROUND_MASKS["MASK335R"].complement(where, torch.zeros_like(where)))) ** 2
     return 5 * float(shot.noise[ring].mean()) / Star().peak_photons / passed
 
 

@@ -1,7 +1,7 @@
 """NIRCam's internal wavefront error behind the Lyot stop, and how it depends on wavelength.
 
-Tables are in the orientation of the exit pupil, whose y is inverted with respect to the entrance
-pupil. What this module returns is in the orientation of the entrance pupil.
+Tables are in the orientation of the exit pupil, y inverted with respect to the entrance pupil. What
+this module returns has the orientation of the entrance pupil.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def require_mask_and_filter(mask: str | None, name: str) -> RoundMask:
         Image mask; None stands for the mask that is usual in the filter's channel (MASK210R or
         MASK335R), whose geometry then applies without the mask.
     name : str
-        Filter, in capitals.
+        Filter, in any case.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def require_mask_and_filter(mask: str | None, name: str) -> RoundMask:
             "masks come through from_webbpsf"
         )
     for candidate in (mask,) if mask else ("MASK210R", "MASK335R"):
-        if name in ROUND_MASKS[candidate].filters:
+        if name.upper() in ROUND_MASKS[candidate].filters:
             return ROUND_MASKS[candidate]
     raise IncompatibleSetupError(
         f"filter: got {name!r} with image mask {mask!r}, which do not go together. Legal "

@@ -50,10 +50,17 @@ SIAF_PIXELSCALE = ROUND_MASKS["MASK335R"].siaf_pixelscale
 SIAF_SHEAR = ROUND_MASKS["MASK335R"].siaf_shear
 """Growth of the ideal y with the ideal x at MASK335R, see `RoundMask`."""
 
-FLIGHT_ALIGNMENT: dict[str, Any] = {
-    "lyot_shift": (-0.01346839, 0.00762122),
-    "lyot_rotation": 0.56725767,
-}
+FLIGHT_ALIGNMENT: dict[str, Any] = {"lyot_shift": (-0.0127, 0.0068), "lyot_rotation": 0.567}
+"""How the stop MASKRND stands in flight in the long-wave channel, for the argument `defaults`.
+
+The shift is a fraction of the pupil's diameter, the rotation in degrees, both as the parameters of
+`OpticalSystem`, in entrance-pupil orientation. K. Lawson's values for frames behind MASK335R, of
+stpsf's options: pupil_shift_x -0.01347, pupil_shift_y -0.00762, pupil_rotation -0.567 deg
+(github.com/kdlawson/Winnie, commit dbc7ca8). stpsf's pupil is upside down there, which changes the
+signs of y and of the rotation, and poppy cuts shifts to whole samples of 1/1024. stpsf 2.2.0 itself
+has the stop aligned. Alignment-only fits of this package to one frame each of three stars gave
+shifts of -0.0109 to -0.0121 and 0.0040 to 0.0054 and rotations of 0.39 to 0.54 deg.
+"""
 
 # Interpixel capacitance and post-pixel coupling of the detector NRCA5, as in stpsf's kernels for
 # the sensor 485: J. Leisenring, ground tests (ISIM CV3).
@@ -167,7 +174,7 @@ def nircam_coronagraph(
     """
     recipe: dict[str, Any] = {k: v for k, v in locals().items() if k != "recipe"}
     recipe["defaults"] = dict(defaults or {})  # A copy, for the caller may change theirs.
-    mask = require_mask_and_filter(image_mask, filter.upper())
+    mask = require_mask_and_filter(image_mask, filter)
     if pupil_mask not in ("MASKRND", None):
         raise IncompatibleSetupError(
             f"pupil_mask: got {pupil_mask!r}, expected 'MASKRND' or None. Other stops come through "

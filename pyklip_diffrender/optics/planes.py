@@ -1,7 +1,27 @@
 """The planes of a coronagraph: pupils, the compact occulter, internal aberrations.
 
-A plane takes a `Wavefront` and gives the next. All but the first are linear in the field. Values
-of free parameters come in by name; a plane uses those that it declares in `parameters`.
+The whole propagation, with xi, eta positions in the pupil (m), x, y angles on the sky (radians),
+F the transform from the pupil to the sky (`optics.fourier`), and all fields in the orientation of
+the entrance pupil:
+
+    E0 = A exp(2 pi i OPD / lambda) exp(-2 pi i (x0 xi - y0 eta) / lambda)     `EntrancePupil`
+    E1 = F^-1[t F[E0]] = E0 - F^-1[(1 - t) F[E0]]                            `CompactOcculter`
+    E2 = L E1                                                                       `LyotStop`
+    E3 = exp(2 pi i W / lambda) E2                                        `InternalAberration`
+    Ed = F[E3],   I = sum over lambda of w |Ed|^2                  `Detector`, `OpticalSystem`
+
+A is the amplitude of the telescope's pupil, (x0, y0) the star, t the real amplitude transmission of
+the mask, L the stop, W the aberration behind it, w the weight of a wavelength. The mask changes
+light only within its disc, where 1 - t is not zero: F[E0] is needed there alone, and a matrix
+product gives it (R. Soummer et al., Opt. Express 15, 15935, 2007). Everything behind E0 is linear,
+with L, W and t the same on the way back: the adjoint of E0 -> Ed is
+g -> (1 - F^-1 (1 - t) F) L exp(-2 pi i W / lambda) F^-1 g.
+
+With S = L exp(2 pi i W / lambda), the last four lines are one, Ed = F[S E0] - F[S] * (1 - t) F[E0],
+where * is a convolution of small arrays: `optics.fast` computes that.
+
+A plane takes a `Wavefront` and gives the next. Values of free parameters come in by name; a plane
+uses those that it declares in `parameters`.
 """
 
 from __future__ import annotations
@@ -290,8 +310,8 @@ class InternalAberration:
 class CompactOcculter:
     """A focal-plane mask whose complement 1 - t is zero outside a disc.
 
-    The field behind it, back in the pupil, is E - F^-1[(1 - t) F[E]]: only the disc is ever
-    sampled (Soummer et al. 2007), in cells of ``1 / sampling`` of lambda/D.
+    The field behind it, back in the pupil, is E - F^-1[(1 - t) F[E]]. Only the disc is ever
+    sampled, in cells of ``1 / sampling`` of lambda/D.
 
     Parameters
     ----------
@@ -356,10 +376,10 @@ class CompactOcculter:
         return self._transform(wavefront.wavelength, wavefront.grid).forward(wavefront.field)
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
+        """E - F^-1[(1 - t) F[E]] on the window `onto`."""
         axis, complement = self.cells(wavefront.wavelength)
-        blocked = self.focal_field(wavefront) * complement
-        removed = self._transform(wavefront.wavelength, onto).inverse(
-            blocked, float(axis[1] - axis[0]) ** 2
-        )
+        cell = float(axis[1] - axis[0]) ** 2
+        blocked = complement * self.focal_field(wavefront)
+        removed = self._transform(wavefront.wavelength, onto).inverse(blocked, cell)
         field = wavefront.grid.crop(wavefront.field, onto) - removed
         return replace(wavefront, field=field, grid=onto)

@@ -64,7 +64,7 @@ def main() -> None:
             monochromatic=WAVELENGTH,
             npix=npix,
             occulter_sampling=sampling,
-            si_wfe=zernikes,
+            si_wfe=reference.tabulated(zernikes, WAVELENGTH),
             flip_si_wfe=True,
             dtype=dtype,
             route=route,

@@ -37,7 +37,7 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "no amplitude modes": ({}, {"prior": replace(NIRCAM_FIT["prior"], amplitude_scale=0.0)}),
     "internal Zernikes not free": ({}, {"free": tuple(n for n in FREE if n != "si_zernikes")}),
     "no companion in the model": ({}, {"companions": 0}),
-    "internal wavefront error flipped": ({"flip_si_wfe": True}, {}),
+    "internal wavefront error flipped": ({"flip_si_wfe": False}, {}),
     "three wavelengths": ({"nlambda": 3}, {}),
 }
 

@@ -25,7 +25,8 @@ from hard_cases import (
 )
 
 from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
-from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, mask335r_complement
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.scene.objects import Planet, Scene
 from pyklip_diffrender.scene.simulation import expected_photons, planet_photons, star_photons
@@ -61,8 +62,8 @@ def _offset(mas: float) -> tuple[float, float]:
 def plain_fft(mas: float, route: str, sampling: float | None, dtype: torch.dtype) -> float:
     """Semi-analytic image against the plain FFT with 4 samples per lambda/D on the occulter."""
     model = small(
-        si_wfe=reference.lopsided_zernikes(), flip_si_wfe=True, dtype=dtype, route=route,
-        occulter_sampling=sampling,
+        si_wfe=reference.tabulated(reference.lopsided_zernikes(), WAVELENGTH), flip_si_wfe=True,
+        dtype=dtype, route=route, occulter_sampling=sampling,
     )  # fmt: skip
     return worst(model(reference.lopsided_opd(NPIX), _offset(mas)), _plain_fft(mas))
 
@@ -81,7 +82,7 @@ def occulter(dtype: torch.dtype) -> float:
         s = [mpmath.mpf(float(r)) * mpmath.mpf(reference.SIGMA) for r in radii]
         exact = [1.0 if x == 0 else float((2 * mpmath.besselj(1, x) / x) ** 2) for x in s]
     x = torch.from_numpy(radii)
-    got = mask335r_complement(x, torch.zeros_like(x)).to(dtype)
+    got = ROUND_MASKS["MASK335R"].complement(x, torch.zeros_like(x)).to(dtype)
     return float(np.abs(array(got) / exact - 1).max())
 
 

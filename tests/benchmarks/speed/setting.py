@@ -12,11 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pyklip_diffrender.instrument.nircam import (
-    MASK335R_RADIUS,
-    NIRCAM_LW_PIXELSCALE,
-    nircam_coronagraph,
-)
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -194,6 +191,6 @@ class Setting:
             diameter=model.diameter,
             cell=cell,
             pixel=NIRCAM_LW_PIXELSCALE * ARCSEC,
-            cells=2 * int(np.ceil(MASK335R_RADIUS * ARCSEC / cell)) + 2,
+            cells=2 * int(np.ceil(ROUND_MASKS["MASK335R"].radius * ARCSEC / cell)) + 2,
             pixels=self.fov,
         )

@@ -1,0 +1,203 @@
+"""NIRCam's embedded facts: what the numbers do in a model, and where they come from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.ndimage
+import torch
+from astropy.io import fits
+from astropy.table import Table
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.instrument.aberrations import ChromaticAberration, internal_wavefront_error
+from pyklip_diffrender.instrument.masks import ROUND_MASKS, filter_shift, mask_center
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.instrument.spectrum import filter_throughput
+from pyklip_diffrender.io.files import embedded_table
+from pyklip_diffrender.linear.forward_mode import jacfwd
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.wavefront.opd import random_opd
+
+SMALL = {"npix": 128, "fov_pixels": 24}
+
+
+@pytest.fixture(scope="module")
+def opd() -> torch.Tensor:
+    return torch.from_numpy(random_opd(5, npix=128).data)
+
+
+# -- masks -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mask", "filter_name"),
+    [("MASK210R", "F210M"), ("MASK335R", "F335M"), ("MASK430R", "F430M"), ("MASK430R", "f444w")],
+)
+def test_every_round_mask_hides_the_star_and_lets_a_planet_pass(
+    mask: str, filter_name: str, opd: torch.Tensor
+) -> None:
+    """At 6 lambda/D half of the planet's light passes the mask, ten times further out all of it."""
+    model = nircam_coronagraph(filter_name, image_mask=mask, nlambda=3, **SMALL)
+    clear = nircam_coronagraph(filter_name, image_mask=None, nlambda=3, **SMALL)
+    assert model.planes[0].name == mask
+    scale = ROUND_MASKS[mask].pixelscale
+    assert model.detector.pixelscale == (scale, scale)
+    unocculted = float(clear(opd).sum())
+    assert float(model(opd).sum()) < 0.03 * unocculted
+    half = float(model(opd, (1.3 / ROUND_MASKS[mask].sigma * 1.616, 0.0)).sum())
+    outside = (1.02 * ROUND_MASKS[mask].radius, 0.0)
+    beyond = float(model(opd, outside).sum() / clear(opd, outside).sum())
+    assert half < 0.8 * unocculted
+    assert beyond == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_wider_mask_takes_more_of_the_light(opd: torch.Tensor) -> None:
+    passed = [
+        float(nircam_coronagraph(image_mask=mask, nlambda=1, **SMALL)(opd, (0.6, 0.2)).sum())
+        for mask in ("MASK335R", "MASK430R")
+    ]
+    assert passed[1] < 0.8 * passed[0]
+
+
+def test_another_mask_brings_its_own_aberrations() -> None:
+    tables = {mask: internal_wavefront_error(mask) for mask in ROUND_MASKS}
+    rms = {mask: float(table[3:].norm() * 1e9) for mask, table in tables.items()}
+    # The official table's column WFE_RMS, nm: of the lit part of the pupil, not of the circle.
+    assert rms == pytest.approx({"MASK210R": 161, "MASK335R": 176, "MASK430R": 171}, rel=0.02)
+    flipped = internal_wavefront_error("MASK335R", flip=False)
+    changed = (flipped != tables["MASK335R"]).nonzero().flatten() + 1
+    # Noll's sines, which change sign with y: all odd ones that are not round.
+    assert changed.tolist() == [j for j in range(3, 36, 2) if j != 11]
+
+
+def test_focus_is_zero_where_the_table_was_made_and_tilt_at_the_reference() -> None:
+    """Elsewhere as by hand from stpsf's polynomials, nm: the focus of F444W is not negligible."""
+    long = ChromaticAberration(4.4e-6)
+    assert long(3.23e-6)[4] == 0
+    assert long(4.4e-6)[3] == 0
+    assert long(4.39e-6)[4] * 1e9 == pytest.approx(32.6, abs=0.05)
+    assert (long(4.39e-6)[3] - long(3.35e-6)[3]) * 1e9 == pytest.approx(-233.4, abs=0.05)
+    short = ChromaticAberration(2.1e-6, short_wave=True)
+    assert short(2.12e-6)[4] == 0
+    assert short(2.0e-6)[4] * 1e9 == pytest.approx(-15.8, abs=0.05)
+    assert short(2.0e-6)[3] * 1e9 == pytest.approx(-162.0, abs=0.05)
+
+
+# -- places on the detector --------------------------------------------------------------------
+
+
+def test_places_on_the_detector_count_from_zero() -> None:
+    assert mask_center("NRCA5_MASK335R") == pytest.approx((149.2, 173.6))
+    full, sub = mask_center("NRCA5_FULL_MASK335R"), mask_center("NRCA5_MASK335R")
+    # The corner of the subarray lies on a whole pixel.
+    assert [a - b for a, b in zip(full, sub, strict=True)] == pytest.approx([491, 1501])
+    assert filter_shift("F335M") == filter_shift("F210M") == (0.0, 0.0)
+    assert filter_shift("f444w") == (0.177, -0.205)
+
+
+def test_places_that_are_not_known_are_refused_with_those_that_are() -> None:
+    with pytest.raises(IncompatibleSetupError, match=r"'NRCB5_MASK335R'.*NRCA5_MASK335R"):
+        mask_center("NRCB5_MASK335R")
+    with pytest.raises(IncompatibleSetupError, match=r"F182M.*F480M, not for 'F277W'"):
+        filter_shift("F277W")
+
+
+# -- crosstalk ---------------------------------------------------------------------------------
+
+IPC = [[3.86e-4, 5.972e-3, 3.86e-4], [5.972e-3, 0.974569, 5.972e-3], [3.86e-4, 5.972e-3, 3.86e-4]]
+PPC = [[0, 0, 0], [0, 0.99877, 0.00123], [0, 0, 0]]
+
+
+def coupled(image: torch.Tensor) -> np.ndarray:
+    """The kernels of NRCA5 as scipy convolves with them, zero beyond the edges."""
+    array = image.numpy()
+    for kernel in (IPC, PPC):
+        array = scipy.ndimage.convolve(array, np.array(kernel) / np.sum(kernel), mode="constant")
+    return array
+
+
+@pytest.mark.parametrize("values", [{}, {"blur": 0.026}, {"blur": 0.026, "star_offset": (0.4, 0)}])
+@pytest.mark.parametrize("oversample", [1, 2])
+def test_crosstalk_couples_pixels_after_everything_else(
+    values: dict[str, object], oversample: int, opd: torch.Tensor
+) -> None:
+    def system(**changes: object) -> OpticalSystem:
+        return nircam_coronagraph(nlambda=2, oversample=oversample, **SMALL, **changes)  # type: ignore[arg-type]
+
+    plain, model = system()(opd, **values), system(crosstalk=True)(opd, **values)
+    truth = coupled(plain)
+    # The kernels above are rounded to 4 digits.
+    assert np.abs(model.numpy() - truth).max() < 2e-6 * truth.max()
+    assert np.abs(plain.numpy() - truth).max() > 5e-3 * truth.max()
+
+
+def test_what_the_right_neighbour_gets_is_on_the_right(opd: torch.Tensor) -> None:
+    detector = nircam_coronagraph(nlambda=1, crosstalk=True, **SMALL).detector
+    point = torch.zeros(24, 24, dtype=torch.float64)
+    point[10, 12] = 1
+    image = detector.image(point, {})
+    assert float(image[10, 13] - image[10, 11]) == pytest.approx(0.00123 * 0.9746, rel=0.02)
+    assert float(image[11, 12] - image[9, 12]) == pytest.approx(0, abs=1e-15)
+    assert float(image.sum()) == pytest.approx(1, abs=1e-12)
+
+
+def test_blur_can_be_fitted_with_crosstalk(opd: torch.Tensor) -> None:
+    model = nircam_coronagraph(nlambda=1, crosstalk=True, **SMALL)
+    model(opd)
+    width = torch.tensor([0.02], dtype=torch.float64)
+    slope = jacfwd(lambda w: model(opd, blur=w))(width)[..., 0]
+    change = (model(opd, blur=width + 1e-5) - model(opd, blur=width - 1e-5)) / 2e-5
+    torch.testing.assert_close(slope, change, rtol=1e-6, atol=1e-9 * float(change.abs().max()))
+
+
+def test_crosstalk_of_another_detector_is_refused() -> None:
+    with pytest.raises(IncompatibleSetupError, match=r"NRCA5.*F210M.*crosstalk=False"):
+        nircam_coronagraph("F210M", image_mask="MASK210R", crosstalk=True)
+
+
+# -- the official files ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def official(shared_data: Path) -> Path:
+    folder = shared_data / "stpsf-data"
+    if not folder.is_dir():
+        pytest.skip(f"needs STScI's files for stpsf in {folder}")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "name", [n for m in ("MASK210R", "MASK335R") for n in ROUND_MASKS[m].filters]
+)
+def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(
+    official: Path, name: str
+) -> None:
+    data = fits.getdata(official / "NIRCam" / "filters" / f"{name}_throughput.fits")
+    truth = data["THROUGHPUT"] / data["THROUGHPUT"].max()
+    wavelength, throughput = filter_throughput(name)
+    # The ends are where the table, in units of 0.1 Angstrom, has been rounded.
+    inside = (
+        np.abs(data["WAVELENGTH"] * 1e-10 - (wavelength[0] + wavelength[-1]) / 2)
+        <= np.ptp(wavelength) / 2 + 1e-11
+    )
+    mine = np.interp(data["WAVELENGTH"] * 1e-10, wavelength, throughput) * inside
+    assert np.abs(mine - truth).max() <= 0.002
+    assert mine.sum() == pytest.approx(truth.sum(), rel=2e-3)
+
+
+def test_aberrations_are_those_of_the_official_field_points(official: Path) -> None:
+    table = Table.read(official / "si_zernikes_coron_wfe.fits")
+    mine = embedded_table("nircam_si_zernikes")
+    for mask in ROUND_MASKS.values():
+        channel = "NIRCamSWA" if mask.short_wave else "NIRCamLWA"
+        point = f"Z{mask.name[4:]}_A"
+        (row,) = (
+            r
+            for r in table
+            if r["instrument"].strip() == channel and r["field_point_name"].strip() == point
+        )
+        truth = np.array([row[f"Zernike_{k}"] for k in range(1, 37)]) * 1e9
+        np.testing.assert_allclose(mine[mask.name], truth, rtol=1e-3, atol=1e-9)
