@@ -23,10 +23,8 @@ class Plan:
 
     Attributes
     ----------
-    model : OpticalSystem
-        The system to fit with.
-    given : OpticalSystem
-        The system as given, which errors are relative to.
+    model, given : OpticalSystem
+        The system to fit with, and the system as given, which errors are relative to.
     choice : Choice
         All settings.
     refine_options : dict
@@ -43,10 +41,8 @@ class Plan:
         everything as given. Ratios are good, absolute times depend on the machine.
     seed : int
         Of the wavefronts that were drawn.
-    pinned : tuple of str
-        Settings that the caller kept.
-    steps : tuple of str
-        Economies that the verification made finer again.
+    pinned, steps : tuple of str
+        Settings that the caller kept, and economies that the verification made finer again.
     final_error : ModelError, optional
         Of the refined star, against the model as given at the wavefront of the solution; only in
         the plan of a `Refinement`.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Self
@@ -12,15 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
-from pyklip_diffrender.optics.detector_effects import (
-    GaussianBlur,
-    LinearResampling,
-    PixelCrosstalk,
-)
+from pyklip_diffrender.optics.detector_effects import GaussianBlur, LinearResampling, PixelCrosstalk
 from pyklip_diffrender.optics.masks import FourierMask, SampledOcculter
 from pyklip_diffrender.optics.planes import CompactOcculter, Plane, Values
 from pyklip_diffrender.optics.sampled_planes import OrientedPupil, PupilOptic
@@ -75,16 +71,8 @@ class CheapSystem(OpticalSystem):
         """The same system, with a constant added to its fields that makes them right at one OPD.
 
         Copies made by `with_fidelity` are without the constant: they serve derivatives, which it
-        does not change, and other sources than the star, for which it would be wrong.
-
-        Parameters
-        ----------
-        fields : sequence of Tensor
-            Of a finer system with the same detector samples, at each wavelength.
-        opd : Tensor, (npix, npix)
-            Where they were taken, on this system's grid, m.
-        values : dict of Tensor
-            The other parameters there.
+        does not change, and other sources than the star, for which it would be wrong. `fields` are
+        those of a finer system at `opd` (m, on this system's grid) and `values`.
         """
         with torch.no_grad():
             there = self.fields(opd, **values)
@@ -106,19 +94,12 @@ def _remade(
 
 
 def coarse_steps(
-    model: OpticalSystem,
-    opd0: Value,
-    npix: int,
-    *,
-    dtype: torch.dtype | None = None,
-    values: Mapping[str, Value | None] | None = None,
+    model: OpticalSystem, opd0: Value, npix: int, dtype: torch.dtype | None = None
 ) -> CheapSystem:
     """A coarse copy of a system whose star is exact at one wavefront and almost so near it.
 
     Most of the error of a coarse pupil, how it samples segments and openings, does not depend on
-    the wavefront and cancels in ::
-
-        E(opd) = E_fine(opd0) + E_coarse(opd) - E_coarse(opd0)
+    the wavefront and cancels in ``E_fine(opd0) + E_coarse(opd) - E_coarse(opd0)``.
 
     Parameters
     ----------
@@ -130,28 +111,11 @@ def coarse_steps(
         Pupil samples of the copy, which takes wavefronts on this grid; must divide the model's.
     dtype : torch.dtype, optional
         Of the copy; default the model's.
-    values : mapping, optional
-        The model's other parameters at `opd0`.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If the coarse grid does not divide the fine one.
-    ShapeError
-        If `opd0` is not one map.
     """
-    if model.npix % npix:
-        raise IncompatibleSetupError(
-            f"npix: got {npix}, expected a divisor of the model's {model.npix} pupil samples"
-        )
     coarse = CheapSystem(model.with_fidelity(npix=npix, dtype=dtype or model.dtype))
-    there = model.values(values or {})
     with torch.no_grad():
         opd = model.opd(opd0)
-        if opd.ndim != 2:
-            raise ShapeError(f"opd0: got shape {tuple(opd.shape)}, expected one map")
-        fields = model.fields(opd, **there)
-    return coarse.stepping_from(fields, downsample(opd, npix), there)
+        return coarse.stepping_from(model.fields(opd), downsample(opd, npix), {})
 
 
 def _parts(model: OpticalSystem) -> dict[str, tuple[int, str, int]]:
@@ -179,23 +143,19 @@ def optional_parts(model: OpticalSystem) -> frozenset[str]:
 def _reduced(model: OpticalSystem, without: Collection[str]) -> tuple[list[Plane], Detector]:
     """Planes and detector of a system without some of its parts."""
     parts, planes, detector = _parts(model), list(model.planes), model.detector
-    for name in without:
-        if name not in parts:
-            raise IncompatibleSetupError(
-                f"without: got {name!r}, expected optional parts of this model: {tuple(parts)}"
-            )
+    if unknown := set(without) - set(parts):
+        raise IncompatibleSetupError(
+            f"without: got {unknown}, expected optional parts of this model: {tuple(parts)}"
+        )
     gone = {parts[name] for name in without}
     for place, attribute in {(place, attribute) for place, attribute, _ in gone}:
-        if attribute == "shear":
-            detector = replace(detector, shear=0.0)
-            continue
         old: Any = detector if place < 0 else planes[place]
-        items = enumerate(getattr(old, attribute))
+        items = enumerate(getattr(old, attribute) if attribute != "shear" else ())
         kept = tuple(item for k, item in items if (place, attribute, k) not in gone)
-        if place < 0:
-            detector = replace(old, **{attribute: kept})
-        else:
+        if place >= 0:
             planes[place] = SampledOcculter(kept, old.sampling, old.diameter, old.name)
+        else:
+            detector = replace(old, **{attribute: 0.0 if attribute == "shear" else kept})
     return planes, detector
 
 
