@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
 from astropy import units as u
 from astropy.table import QTable
 
@@ -100,9 +99,6 @@ class Plan:
         """The facts that belong in a header or a log: text and numbers by short names."""
         facts: dict[str, Any] = {
             **vars(self.choice),
-            "occulter_sampling": self.choice.occulter_sampling or "default",
-            "dtype": _type_name(self.choice.dtype),
-            "without": ", ".join(sorted(self.choice.without)) or "nothing",
             "budget": self.budget,
             "error": self.error.rms,
             "verified_error": self.verified_error.rms,
@@ -116,20 +112,11 @@ class Plan:
         return {f"plan_{name}": value for name, value in facts.items()}
 
 
-def _type_name(dtype: torch.dtype) -> str:
-    return str(dtype).removeprefix("torch.")
-
-
 def _label(name: str, choice: Choice) -> str:
     """What a choice has of an economy, in words."""
     return {
         "pupil grid": f"{choice.npix}" + " for differences" * choice.multifidelity,
-        "occulter sampling": f"{choice.occulter_sampling or 'default'}",
         "wavelengths": f"{choice.wavelengths}",
-        "precision": _type_name(choice.dtype),
-        "optional parts": "without " + ", ".join(sorted(choice.without))
-        if choice.without
-        else "all",
         "wavefront modes": f"to {choice.cycles:g} cycles",
     }[name]
 

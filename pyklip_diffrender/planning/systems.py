@@ -1,10 +1,9 @@
-"""Cheaper copies of a system: fewer wavelengths, parts left out, steps from a finer one."""
+"""Cheaper copies of a system: fewer wavelengths, coarser pupils, steps from a finer one."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, Self
 
@@ -12,60 +11,38 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.bandpass import Bandpass
-from pyklip_diffrender.optics.detector import Detector
-from pyklip_diffrender.optics.detector_effects import GaussianBlur, LinearResampling, PixelCrosstalk
-from pyklip_diffrender.optics.masks import FourierMask, SampledOcculter
-from pyklip_diffrender.optics.planes import CompactOcculter, Plane, Values
+from pyklip_diffrender.optics.planes import Values
 from pyklip_diffrender.optics.sampled_planes import OrientedPupil, PupilOptic
 from pyklip_diffrender.optics.system import OpticalSystem, Value
 from pyklip_diffrender.planning.choice import Choice
 
-__all__ = [
-    "CheapSystem",
-    "build",
-    "coarse_steps",
-    "occulter_sampling",
-    "optional_parts",
-    "quadrature",
-    "wavelengths_are_fixed",
-]
-
-_EFFECTS = {GaussianBlur: "blur", LinearResampling: "distortion", PixelCrosstalk: "crosstalk"}
+__all__ = ["CheapSystem", "build", "coarse_steps", "quadrature", "wavelengths_are_fixed"]
 
 
 class CheapSystem(OpticalSystem):
-    """Another system with other wavelengths, without some parts, or with corrected fields.
+    """Another system with other wavelengths, or with a constant added to its fields.
 
     Parameters
     ----------
     made : OpticalSystem
     bandpass : Bandpass, optional
         Default that of `made`.
-    without : collection of str
-        Names from `optional_parts`.
     """
 
-    def __init__(
-        self,
-        made: OpticalSystem,
-        bandpass: Bandpass | None = None,
-        without: Collection[str] = (),
-    ) -> None:
+    def __init__(self, made: OpticalSystem, bandpass: Bandpass | None = None) -> None:
         band = bandpass or made.bandpass
-        planes, detector = _reduced(made, without)
         super().__init__(
             made.entrance,
-            planes,
-            detector,
+            made.planes,
+            made.detector,
             band,
             recipe=made.recipe,
-            remake=partial(_remade, made, band, without) if made.adjustable else None,
+            remake=partial(_remade, made, band) if made.adjustable else None,
             route=made.route,
         )
-        self._corrections: dict[float, Tensor] = {}
+        self._constants: dict[float, Tensor] = {}
 
     def stepping_from(self, fields: Sequence[Tensor], opd: Tensor, values: Values) -> Self:
         """The same system, with a constant added to its fields that makes them right at one OPD.
@@ -78,19 +55,17 @@ class CheapSystem(OpticalSystem):
             there = self.fields(opd, **values)
             constants = [fine - coarse for fine, coarse in zip(fields, there, strict=True)]
         other = copy.copy(self)
-        other._corrections = dict(zip(self.bandpass.wavelengths, constants, strict=True))
+        other._constants = dict(zip(self.bandpass.wavelengths, constants, strict=True))
         return other
 
     def _field(self, opd: Tensor, wavelength: float, values: Values) -> Tensor:
         field = super()._field(opd, wavelength, values)
-        correction = self._corrections.get(wavelength)
-        return field if correction is None else field + correction
+        constant = self._constants.get(wavelength)
+        return field if constant is None else field + constant
 
 
-def _remade(
-    made: OpticalSystem, band: Bandpass, without: Collection[str], **recipe: Any
-) -> OpticalSystem:
-    return CheapSystem(made.with_fidelity(**recipe), band, without)
+def _remade(made: OpticalSystem, band: Bandpass, **recipe: Any) -> OpticalSystem:
+    return CheapSystem(made.with_fidelity(**recipe), band)
 
 
 def coarse_steps(
@@ -116,58 +91,6 @@ def coarse_steps(
     with torch.no_grad():
         opd = model.opd(opd0)
         return coarse.stepping_from(model.fields(opd), downsample(opd, npix), {})
-
-
-def _parts(model: OpticalSystem) -> dict[str, tuple[int, str, int]]:
-    """Optional parts by name: number of the plane (-1 for the detector), attribute, index."""
-    parts = {}
-    for place, plane in enumerate(model.planes):
-        if isinstance(plane, SampledOcculter):
-            # The first part is the spot; neutral-density squares and the holder come after.
-            for k in range(1, len(plane.parts)):
-                parts[f"{plane.name} part {k + 1}"] = (place, "parts", k)
-    for where in ("on_samples", "on_pixels"):
-        for k, effect in enumerate(getattr(model.detector, where, ())):
-            if type(effect) in _EFFECTS:
-                parts[f"{_EFFECTS[type(effect)]} {where} {k + 1}"] = (-1, where, k)
-    if model.detector.shear:
-        parts["shear"] = (-1, "shear", 0)
-    return parts
-
-
-def optional_parts(model: OpticalSystem) -> frozenset[str]:
-    """Names of what a system could do without: squares and bars of the mask, detector effects."""
-    return frozenset(_parts(model))
-
-
-def _reduced(model: OpticalSystem, without: Collection[str]) -> tuple[list[Plane], Detector]:
-    """Planes and detector of a system without some of its parts."""
-    parts, planes, detector = _parts(model), list(model.planes), model.detector
-    if unknown := set(without) - set(parts):
-        raise IncompatibleSetupError(
-            f"without: got {unknown}, expected optional parts of this model: {tuple(parts)}"
-        )
-    gone = {parts[name] for name in without}
-    for place, attribute in {(place, attribute) for place, attribute, _ in gone}:
-        old: Any = detector if place < 0 else planes[place]
-        items = enumerate(getattr(old, attribute) if attribute != "shear" else ())
-        kept = tuple(item for k, item in items if (place, attribute, k) not in gone)
-        if place >= 0:
-            planes[place] = SampledOcculter(kept, old.sampling, old.diameter, old.name)
-        else:
-            detector = replace(old, **{attribute: 0.0 if attribute == "shear" else kept})
-    return planes, detector
-
-
-def occulter_sampling(model: OpticalSystem) -> float | None:
-    """Cells per lambda/D on the occulters; None if there are none, or none that can be changed."""
-    # A padded Fourier transform takes whole numbers only.
-    fixed = any(isinstance(plane, FourierMask) for plane in model.planes)
-    if fixed or "occulter_sampling" not in model.adjustable:
-        return None
-    default = 2.0 if model.route == "lattice" else 4.0
-    masks = [p for p in model.planes if isinstance(p, CompactOcculter | SampledOcculter)]
-    return max((mask.sampling or default for mask in masks), default=None)
 
 
 def wavelengths_are_fixed(model: OpticalSystem) -> bool:
@@ -201,20 +124,6 @@ def quadrature(bandpass: Bandpass, count: int) -> Bandpass:
 
 
 def build(model: OpticalSystem, choice: Choice) -> CheapSystem:
-    """The system of a choice, without the steps from a finer one.
-
-    Parameters
-    ----------
-    model : OpticalSystem
-        As given.
-    choice : Choice
-    """
-    changes: dict[str, Any] = {}
-    if choice.npix != model.npix:
-        changes["npix"] = choice.npix
-    if choice.dtype != model.dtype:
-        changes["dtype"] = choice.dtype
-    if choice.occulter_sampling != model.recipe.get("occulter_sampling"):
-        changes["occulter_sampling"] = choice.occulter_sampling
-    made = model.with_fidelity(**changes) if changes else model
-    return CheapSystem(made, quadrature(model.bandpass, choice.wavelengths), choice.without)
+    """The system of a choice, without the steps from a finer one."""
+    made = model if choice.npix == model.npix else model.with_fidelity(npix=choice.npix)
+    return CheapSystem(made, quadrature(model.bandpass, choice.wavelengths))

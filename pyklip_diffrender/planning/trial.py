@@ -28,12 +28,7 @@ from pyklip_diffrender.planning.noise_model import (
     RidgeResidual,
     least_squares,
 )
-from pyklip_diffrender.planning.systems import (
-    CheapSystem,
-    build,
-    optional_parts,
-    wavelengths_are_fixed,
-)
+from pyklip_diffrender.planning.systems import CheapSystem, build, wavelengths_are_fixed
 from pyklip_diffrender.scene.objects import Scene
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import default_basis
@@ -77,8 +72,6 @@ class Trial:
         With the cheapest good options of the economies that were probed.
     grids : list of int
         Samples across coarser pupils that may be used, from coarse to fine.
-    parts : frozenset of str
-        Optional parts of the model.
     noise : NoiseModel
     drift : Drift
     """
@@ -97,15 +90,11 @@ class Trial:
 
     def __post_init__(self) -> None:
         model = self.model
-        self.parts = optional_parts(model)
         self.response_npix = coarse_npix(model, self.response_npix)
         self.finest = self.likely = Choice(
             npix=model.npix,
             multifidelity=False,
-            occulter_sampling=model.recipe.get("occulter_sampling"),
             wavelengths=len(model.bandpass.wavelengths),
-            dtype=model.dtype,
-            without=frozenset(),
             cycles=self.cycles,
         )
         halves = [model.npix >> k for k in range(6, 0, -1) if model.npix % (1 << k) == 0]
@@ -170,22 +159,23 @@ class Trial:
         Operations are counted, not timed, so that a plan is the same on a busy machine. The rates
         are those of one core in 2026; another machine scales nearly all options alike.
         """
-        model, detector, waves = self.model, self.model.detector, choice.wavelengths
-        modes, effects = self.drift.count(choice.cycles), len(self.parts) - len(choice.without)
+        detector, waves = self.model.detector, choice.wavelengths
         pixels = detector.shape[0] * detector.shape[1]
         samples = pixels * detector.oversample**2
-        planes, pupil = model.route == "planes", (choice.npix / 1024) ** 2
-        occulter = (choice.occulter_sampling or 4.0) / 4 if planes else 1.0
-        # Graphics cards have at most half their speed in double precision.
-        speed = 0.5 if choice.dtype == torch.float32 and model.device.type != "cpu" else 1.0
-        field = speed * (3e-3 + 4.5e-2 * pupil * occulter)
-        response = 4e-4 + 6e-8 * samples + (8e-8 * self.response_npix**2 if planes else 0.0)
-        row = samples * (8e-9 + 4e-9 * waves + 5e-9 * effects)
+        modes, pupil = self.drift.count(choice.cycles), (choice.npix / 1024) ** 2
+        response = 4e-4 + 6e-8 * samples
+        if self.model.route == "planes":
+            response += 8e-8 * self.response_npix**2
+        row = samples * (8e-9 + 4e-9 * waves)
         return (
-            10 * (waves * field + 3.3e-2 * pupil)  # Images, and the wavefronts they are made of.
-            + waves * (modes * response + 4 * 3e-2)  # Derivatives by the modes, by the alignment.
-            + 6 * modes * (row + 1.1e-11 * modes * pixels)  # Jacobians and their squares.
-            + 1.4e-10 * modes**3  # Solutions and inverses.
+            # Images, and the wavefronts they are made of.
+            10 * (waves * (3e-3 + 4.5e-2 * pupil) + 3.3e-2 * pupil)
+            # Derivatives by the modes, and by the alignment.
+            + waves * (modes * response + 4 * 3e-2)
+            # Jacobians and their squares.
+            + 6 * modes * (row + 1.1e-11 * modes * pixels)
+            # Solutions and inverses.
+            + 1.4e-10 * modes**3
         )
 
     def _fine_fields(self, wavelengths: int) -> list[Tensor]:
