@@ -18,9 +18,8 @@ from pyklip_diffrender.planning.choice import Choice, Economy, ModelError, Optio
 from pyklip_diffrender.planning.systems import wavelengths_are_fixed
 from pyklip_diffrender.planning.trial import PROBED, START, Trial
 
-__all__ = ["PROBES", "Probe"]
+__all__ = ["PROBES"]
 
-Probe = Callable[[Trial], Economy]
 Candidates = list[dict[str, Any]]
 
 _PAYS = 0.2
@@ -152,7 +151,7 @@ def pupil_grid(trial: Trial) -> Economy:
     return _measured(trial, "pupil grid", fields, candidates, _rendered(trial), fixed=fixed)
 
 
-PROBES: dict[str, Probe] = {
+PROBES: dict[str, Callable[[Trial], Economy]] = {
     "wavefront modes": wavefront_modes,
     "wavelengths": wavelengths,
     "pupil grid": pupil_grid,

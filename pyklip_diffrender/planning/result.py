@@ -137,15 +137,7 @@ def _why(trial: Trial, economy: Economy, option: Option) -> str:
 
 
 def plan_table(trial: Trial, economies: Sequence[Economy], picked: Sequence[Option]) -> QTable:
-    """The table of a plan; see `Plan`.
-
-    Parameters
-    ----------
-    trial : Trial
-    economies : sequence of Economy
-    picked : sequence of Option
-        Chosen of each economy.
-    """
+    """The table of a plan, see `Plan`; `picked` holds the option chosen of each economy."""
     rows = []
     for economy, option in zip(economies, picked, strict=True):
         alone = replace(trial.finest, **option.changes)
