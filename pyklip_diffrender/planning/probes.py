@@ -56,20 +56,20 @@ def _measured(
     candidates: Candidates,
     error: Callable[[Choice], ModelError],
     *,
-    fixed: bool = False,
+    fixed: str = "",
     monotonic: bool = False,
 ) -> Economy:
     """Options with their errors; only the model as given, if nothing else would pay.
 
     Measured are options from cheap to fine until one is good; where errors fall with the cost of
-    an option, from the cheapest that is inside the budget, which is found by bisection.
+    an option, from the cheapest that is inside the budget, which is found by bisection. `fixed`
+    says what this system cannot change.
     """
     given = {field: getattr(trial.finest, field) for field in fields}
     options = _allowed([] if fixed else candidates, given, trial)
     pinned = not trial.pins.keys().isdisjoint(fields)
     if options == [given]:
-        note = f"the {name} of this system is fixed" if fixed else "no choice"
-        return Economy(name, (Option(given),), "kept as asked" if pinned else note)
+        return Economy(name, (Option(given),), "kept as asked" if pinned else fixed or "no choice")
     seconds = [trial.seconds(replace(trial.likely, **each)) for each in options]
     whole = trial.seconds(trial.likely)
     if not pinned and whole - min(seconds) < _PAYS * whole:
@@ -126,7 +126,7 @@ def wavelengths(trial: Trial) -> Economy:
     """Fewer wavelengths, placed as Gauss quadrature has them."""
     count = trial.finest.wavelengths
     # Their error is the same on any pupil: it is measured on a coarse one.
-    npix = trial.rough.npix
+    npix, fixed = trial.rough.npix, "the wavelengths of this system are fixed"
     error = _rendered(trial, replace(trial.finest, npix=npix))
     return _measured(
         trial,
@@ -134,7 +134,7 @@ def wavelengths(trial: Trial) -> Economy:
         ("wavelengths",),
         [{"wavelengths": n} for n in range(1, count)],
         lambda choice: error(replace(choice, npix=npix)),
-        fixed=count > 1 and wavelengths_are_fixed(trial.model),
+        fixed=fixed if count > 1 and wavelengths_are_fixed(trial.model) else "",
         monotonic=True,
     )
 
@@ -147,7 +147,9 @@ def pupil_grid(trial: Trial) -> Economy:
         # Steps from a fine field are those of the star: derivatives need a copy without.
         if trial.response_npix < npix:
             candidates.append({"npix": npix, "multifidelity": True})
-    fields, fixed = ("npix", "multifidelity"), "npix" not in trial.model.adjustable
+    can_change = "npix" in trial.model.adjustable
+    fixed = "" if can_change else "the pupil grid of this system is fixed"
+    fields = ("npix", "multifidelity")
     return _measured(trial, "pupil grid", fields, candidates, _rendered(trial), fixed=fixed)
 
 
