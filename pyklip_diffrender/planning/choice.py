@@ -7,8 +7,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
-import torch
-
 __all__ = ["Choice", "Economy", "ModelError", "Option"]
 
 _WORST = 10.0
@@ -26,24 +24,15 @@ class Choice:
     multifidelity : bool
         Whether the coarse pupil gives only the change of the field since the starting wavefront,
         where the field is that of the model as given.
-    occulter_sampling : float or None
-        Cells per lambda/D on the occulter; None for the model's default.
     wavelengths : int
         Number of wavelengths, the nodes of a Gauss quadrature of the model's.
-    dtype : torch.dtype
-        float64 or float32.
-    without : frozenset of str
-        Optional parts that are left out, see `systems.optional_parts`.
     cycles : float
         Highest spatial frequency of the wavefront modes, cycles across the pupil.
     """
 
     npix: int
     multifidelity: bool
-    occulter_sampling: float | None
     wavelengths: int
-    dtype: torch.dtype
-    without: frozenset[str]
     cycles: float
 
     @property

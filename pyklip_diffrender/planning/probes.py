@@ -8,21 +8,18 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
-
-import torch
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.planning.choice import Choice, Economy, ModelError, Option
-from pyklip_diffrender.planning.systems import occulter_sampling, wavelengths_are_fixed
+from pyklip_diffrender.planning.systems import wavelengths_are_fixed
 from pyklip_diffrender.planning.trial import PROBED, START, Trial
 
-__all__ = ["PROBES", "Probe"]
+__all__ = ["PROBES"]
 
-Probe = Callable[[Trial], Economy]
 Candidates = list[dict[str, Any]]
 
 _PAYS = 0.2
@@ -52,45 +49,38 @@ def _allowed(candidates: Candidates, given: dict[str, Any], trial: Trial) -> Can
     return kept
 
 
-def _could_pay(trial: Trial, options: Iterable[dict[str, Any]]) -> bool:
-    """Whether the cheapest option saves enough of what the economies before it leave."""
-    whole = trial.seconds(trial.likely)
-    cheapest = min(trial.seconds(replace(trial.likely, **each)) for each in options)
-    return whole - cheapest >= _PAYS * whole
-
-
 def _measured(
     trial: Trial,
     name: str,
     fields: tuple[str, ...],
     candidates: Candidates,
-    error: Callable[[Choice], ModelError] | None = None,
+    error: Callable[[Choice], ModelError],
     *,
-    fixed: bool = False,
+    fixed: str = "",
     monotonic: bool = False,
 ) -> Economy:
     """Options with their errors; only the model as given, if nothing else would pay.
 
     Measured are options from cheap to fine until one is good; where errors fall with the cost of
-    an option, from the cheapest that is inside the budget, which is found by bisection. `error`
-    is that of a rendered star unless given, the larger of that at the start and after a drift.
+    an option, from the cheapest that is inside the budget, which is found by bisection. `fixed`
+    says what this system cannot change.
     """
     given = {field: getattr(trial.finest, field) for field in fields}
     options = _allowed([] if fixed else candidates, given, trial)
     pinned = not trial.pins.keys().isdisjoint(fields)
     if options == [given]:
-        note = f"the {name} of this system is fixed" if fixed else "no choice"
-        return Economy(name, (Option(given),), "kept as asked" if pinned else note)
-    if not pinned and not _could_pay(trial, options):
+        return Economy(name, (Option(given),), "kept as asked" if pinned else fixed or "no choice")
+    seconds = [trial.seconds(replace(trial.likely, **each)) for each in options]
+    whole = trial.seconds(trial.likely)
+    if not pinned and whole - min(seconds) < _PAYS * whole:
         return Economy(name, (Option(given),), "would hardly save time")
-    cheaper = [each for each in options if each != given]
-    cheaper.sort(key=lambda each: trial.seconds(replace(trial.likely, **each)))
+    order = sorted(range(len(options)), key=lambda k: seconds[k])
+    cheaper = [options[k] for k in order if options[k] != given]
     seen: dict[int, Option] = {}
 
     def measure(k: int) -> ModelError:
         if k not in seen:
-            choice = replace(trial.finest, **cheaper[k])
-            seen[k] = Option(cheaper[k], (error or _rendered(trial))(choice))
+            seen[k] = Option(cheaper[k], error(replace(trial.finest, **cheaper[k])))
         return seen[k].error
 
     places, first = range(len(cheaper)), 0
@@ -136,7 +126,7 @@ def wavelengths(trial: Trial) -> Economy:
     """Fewer wavelengths, placed as Gauss quadrature has them."""
     count = trial.finest.wavelengths
     # Their error is the same on any pupil: it is measured on a coarse one.
-    npix = trial.rough.npix
+    npix, fixed = trial.rough.npix, "the wavelengths of this system are fixed"
     error = _rendered(trial, replace(trial.finest, npix=npix))
     return _measured(
         trial,
@@ -144,7 +134,7 @@ def wavelengths(trial: Trial) -> Economy:
         ("wavelengths",),
         [{"wavelengths": n} for n in range(1, count)],
         lambda choice: error(replace(choice, npix=npix)),
-        fixed=count > 1 and wavelengths_are_fixed(trial.model),
+        fixed=fixed if count > 1 and wavelengths_are_fixed(trial.model) else "",
         monotonic=True,
     )
 
@@ -157,42 +147,15 @@ def pupil_grid(trial: Trial) -> Economy:
         # Steps from a fine field are those of the star: derivatives need a copy without.
         if trial.response_npix < npix:
             candidates.append({"npix": npix, "multifidelity": True})
-    fixed = "npix" not in trial.model.adjustable
-    return _measured(trial, "pupil grid", ("npix", "multifidelity"), candidates, fixed=fixed)
+    can_change = "npix" in trial.model.adjustable
+    fixed = "" if can_change else "the pupil grid of this system is fixed"
+    fields = ("npix", "multifidelity")
+    return _measured(trial, "pupil grid", fields, candidates, _rendered(trial), fixed=fixed)
 
 
-def occulter(trial: Trial) -> Economy:
-    """Fewer cells per lambda/D on the occulter."""
-    sampling = occulter_sampling(trial.model)
-    candidates = [{"occulter_sampling": s} for s in (1.5, 2.0, 3.0) if s < (sampling or 0.0)]
-    fields, fixed = ("occulter_sampling",), sampling is None
-    return _measured(trial, "occulter sampling", fields, candidates, fixed=fixed)
-
-
-def precision(trial: Trial) -> Economy:
-    """Single precision."""
-    fixed = "dtype" not in trial.model.adjustable
-    return _measured(trial, "precision", ("dtype",), [{"dtype": torch.float32}], fixed=fixed)
-
-
-def parts(trial: Trial) -> Economy:
-    """Without squares and bars of the mask, or effects of the detector."""
-    names, error = sorted(trial.parts), _rendered(trial)
-    candidates = [{"without": frozenset(trial.pins.get("without", ()))}]
-    if "without" not in trial.pins and names:
-        if _could_pay(trial, [{"without": trial.parts}]):
-            names.sort(key=lambda n: error(replace(trial.finest, without=frozenset({n}))).rms)
-        # The least important first: with every option there is one more part.
-        candidates = [{"without": frozenset(names[:k])} for k in range(len(names), 0, -1)]
-    return _measured(trial, "optional parts", ("without",), candidates)
-
-
-PROBES: dict[str, Probe] = {
+PROBES: dict[str, Callable[[Trial], Economy]] = {
     "wavefront modes": wavefront_modes,
     "wavelengths": wavelengths,
     "pupil grid": pupil_grid,
-    "occulter sampling": occulter,
-    "precision": precision,
-    "optional parts": parts,
 }
 """All economies, by name; first those that decide whether others pay."""

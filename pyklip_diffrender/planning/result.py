@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
 from astropy import units as u
 from astropy.table import QTable
 
@@ -23,10 +22,8 @@ class Plan:
 
     Attributes
     ----------
-    model : OpticalSystem
-        The system to fit with.
-    given : OpticalSystem
-        The system as given, which errors are relative to.
+    model, given : OpticalSystem
+        The system to fit with, and the system as given, which errors are relative to.
     choice : Choice
         All settings.
     refine_options : dict
@@ -43,10 +40,8 @@ class Plan:
         everything as given. Ratios are good, absolute times depend on the machine.
     seed : int
         Of the wavefronts that were drawn.
-    pinned : tuple of str
-        Settings that the caller kept.
-    steps : tuple of str
-        Economies that the verification made finer again.
+    pinned, steps : tuple of str
+        Settings that the caller kept, and economies that the verification made finer again.
     final_error : ModelError, optional
         Of the refined star, against the model as given at the wavefront of the solution; only in
         the plan of a `Refinement`.
@@ -104,9 +99,6 @@ class Plan:
         """The facts that belong in a header or a log: text and numbers by short names."""
         facts: dict[str, Any] = {
             **vars(self.choice),
-            "occulter_sampling": self.choice.occulter_sampling or "default",
-            "dtype": _type_name(self.choice.dtype),
-            "without": ", ".join(sorted(self.choice.without)) or "nothing",
             "budget": self.budget,
             "error": self.error.rms,
             "verified_error": self.verified_error.rms,
@@ -120,20 +112,11 @@ class Plan:
         return {f"plan_{name}": value for name, value in facts.items()}
 
 
-def _type_name(dtype: torch.dtype) -> str:
-    return str(dtype).removeprefix("torch.")
-
-
 def _label(name: str, choice: Choice) -> str:
     """What a choice has of an economy, in words."""
     return {
         "pupil grid": f"{choice.npix}" + " for differences" * choice.multifidelity,
-        "occulter sampling": f"{choice.occulter_sampling or 'default'}",
         "wavelengths": f"{choice.wavelengths}",
-        "precision": _type_name(choice.dtype),
-        "optional parts": "without " + ", ".join(sorted(choice.without))
-        if choice.without
-        else "all",
         "wavefront modes": f"to {choice.cycles:g} cycles",
     }[name]
 
@@ -154,15 +137,7 @@ def _why(trial: Trial, economy: Economy, option: Option) -> str:
 
 
 def plan_table(trial: Trial, economies: Sequence[Economy], picked: Sequence[Option]) -> QTable:
-    """The table of a plan; see `Plan`.
-
-    Parameters
-    ----------
-    trial : Trial
-    economies : sequence of Economy
-    picked : sequence of Option
-        Chosen of each economy.
-    """
+    """The table of a plan, see `Plan`; `picked` holds the option chosen of each economy."""
     rows = []
     for economy, option in zip(economies, picked, strict=True):
         alone = replace(trial.finest, **option.changes)

@@ -21,16 +21,9 @@ from pyklip_diffrender.linear.response import (
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.planning import cost
 from pyklip_diffrender.planning.choice import Choice, Economy, ModelError
-from pyklip_diffrender.planning.drift import Drift, RidgeResidual
-from pyklip_diffrender.planning.noise_model import NoiseModel, least_squares
-from pyklip_diffrender.planning.systems import (
-    CheapSystem,
-    build,
-    optional_parts,
-    wavelengths_are_fixed,
-)
+from pyklip_diffrender.planning.noise_model import Drift, NoiseModel, RidgeResidual, least_squares
+from pyklip_diffrender.planning.systems import CheapSystem, build, wavelengths_are_fixed
 from pyklip_diffrender.scene.objects import Scene
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import default_basis
@@ -41,17 +34,15 @@ __all__ = ["PROBED", "START", "Trial"]
 START, PROBED, VERIFIED = 0, 1, 2
 """Wavefronts: the starting one, the drifted one of the probes, an independent one to verify."""
 
-_MORE = tuple(range(3, 19))
-"""Further drifts, which tell how far the prior expects the star to move."""
+_MORE = range(3, 19)
+"""Further drifts, which tell how far the prior expects the star to move: sixteen, for that of a
+single one is uncertain by a third."""
 
 _ALIGNMENT = ("star_offset", "lyot_shift", "lyot_rotation")
 """Parameters whose misfit at the start is not that of the wavefront."""
 
 _LEAST = 0.3
 """The prior is never narrowed by more than this, however well the star fits the data."""
-
-_SURE = 3.0
-"""Standard deviations of the chi-squared that are added to it."""
 
 _ROUGH_NPIX, _ROUGH_WAVELENGTHS = 256, 3
 """Pupil samples and wavelengths at which differences that hardly depend on them are measured."""
@@ -74,8 +65,6 @@ class Trial:
         With the cheapest good options of the economies that were probed.
     grids : list of int
         Samples across coarser pupils that may be used, from coarse to fine.
-    parts : frozenset of str
-        Optional parts of the model.
     noise : NoiseModel
     drift : Drift
     """
@@ -94,15 +83,11 @@ class Trial:
 
     def __post_init__(self) -> None:
         model = self.model
-        self.parts = optional_parts(model)
         self.response_npix = coarse_npix(model, self.response_npix)
         self.finest = self.likely = Choice(
             npix=model.npix,
             multifidelity=False,
-            occulter_sampling=model.recipe.get("occulter_sampling"),
             wavelengths=len(model.bandpass.wavelengths),
-            dtype=model.dtype,
-            without=frozenset(),
             cycles=self.cycles,
         )
         halves = [model.npix >> k for k in range(6, 0, -1) if model.npix % (1 << k) == 0]
@@ -142,9 +127,9 @@ class Trial:
         columns = [noise.in_sigma(row)[valid] for row in (*rows, noise.image)]
         columns.append(1 / noise.sigma[valid])
         left = least_squares(columns, (noise.residual / noise.sigma)[valid])[1]
-        # As much as the noise leaves possible: a small misfit may be so by chance.
-        excess = float(left.square().mean()) - 1.0 + _SURE * math.sqrt(2 / len(left))
-        start = self._rendered(self.rough, START)
+        # Plus three standard deviations of chi-squared: a small misfit may be so by chance.
+        excess = float(left.square().mean()) - 1.0 + 3 * math.sqrt(2 / len(left))
+        start = self.image(self.rough, START)
         moved = [noise.in_sigma(self._rendered(self.rough, k) - start)[valid] for k in _MORE]
         expected = float(torch.stack(moved).square().mean())
         return max(_LEAST, math.sqrt(max(excess, 0.0) / max(expected, 1e-300)))
@@ -162,14 +147,22 @@ class Trial:
                 return
 
     def seconds(self, choice: Choice) -> float:
-        """Expected time of a refinement."""
-        return cost.seconds(
-            self.model,
-            choice,
-            modes=self.drift.count(choice.cycles),
-            effects=len(self.parts) - len(choice.without),
-            response_npix=self.response_npix,
-        )
+        """Expected time of a refinement on one core.
+
+        Operations are counted, not timed, so that a plan is the same on a busy machine: images,
+        derivatives by modes and alignment, Jacobians and their squares, solutions. The rates are
+        those of one core in 2026; another machine scales nearly all options alike.
+        """
+        detector, waves = self.model.detector, choice.wavelengths
+        pixels = detector.shape[0] * detector.shape[1]
+        samples = pixels * detector.oversample**2
+        modes, pupil = self.drift.count(choice.cycles), (choice.npix / 1024) ** 2
+        response = 4e-4 + 6e-8 * samples
+        if self.model.route == "planes":
+            response += 8e-8 * self.response_npix**2
+        jacobian = modes * (samples * (8e-9 + 4e-9 * waves) + 1.1e-11 * modes * pixels)
+        images = waves * (3e-3 + 4.5e-2 * pupil) + 3.3e-2 * pupil
+        return 10 * images + waves * (modes * response + 0.12) + 6 * jacobian + 1.4e-10 * modes**3
 
     def _fine_fields(self, wavelengths: int) -> list[Tensor]:
         """The given model's fields at the start, at so many wavelengths."""

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
+from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.planning import coarse_steps
 from tests.benchmarks.speed.case import Case, Found, missing
-from tests.benchmarks.speed.multifidelity import MultiFidelity
 from tests.benchmarks.speed.rivals import hcipy_image, load, paper_recipe, prysm_image
 from tests.benchmarks.speed.setting import CELLS, WAVELENGTH, Arrays, Setting
 
@@ -24,42 +25,39 @@ __all__ = ["FORWARD", "STEP", "forward", "step"]
 
 FORWARD, STEP = "forward", "forward + backward"
 
-Model = OpticalSystem | MultiFidelity
-
 _NAMES = {torch.float64: "float64", torch.float32: "float32"}
 
 
-def _models(here: Setting) -> Iterator[tuple[str, torch.dtype, Callable[[], Model]]]:
+def _models(here: Setting) -> Iterator[tuple[str, torch.dtype, Callable[[], OpticalSystem]]]:
     """This package at several fidelities: name, precision, how to make it."""
     for dtype in _NAMES:
         yield f"this package, {here.npix}", dtype, partial(here.model.with_fidelity, dtype=dtype)
     for npix in here.coarse[::-1]:
         for dtype in _NAMES:
-            mixed = partial(MultiFidelity, here.model, here.measured, npix=npix, dtype=dtype)
+            mixed = partial(coarse_steps, here.model, here.measured, npix, dtype)
             yield f"multi-fidelity, {npix}", dtype, mixed
     coarsest = here.coarse[-1]
     alone = partial(here.model.with_fidelity, npix=coarsest)
     yield f"coarse alone, {coarsest}", torch.float64, alone
 
 
-def _opd_for(model: Model, here: Setting) -> Tensor:
-    if here.npix == model.npix:
-        return here.opd
-    return torch.nn.functional.avg_pool2d(here.opd[None], here.npix // model.npix)[0]
-
-
-def _without_derivatives(make: Callable[[], Model], here: Setting) -> Callable[[], Tensor]:
+def _of_fine(make: Callable[[], OpticalSystem]) -> Callable[[Tensor], Tensor]:
+    """The image as a function of the wavefront on the fine grid, whatever that of the model."""
     model = make()
-    opd = _opd_for(model, here)
+    return lambda opd: model(downsample(opd, model.npix))
 
-    def image() -> Tensor:
+
+def _without_derivatives(make: Callable[[], OpticalSystem], here: Setting) -> Callable[[], Tensor]:
+    image = _of_fine(make)
+
+    def work() -> Tensor:
         with torch.no_grad():
-            return model(opd)
+            return image(here.opd)
 
-    return image
+    return work
 
 
-def _captured(make: Callable[[], Model], here: Setting) -> Callable[[], Tensor]:
+def _captured(make: Callable[[], OpticalSystem], here: Setting) -> Callable[[], Tensor]:
     """The forward model as one CUDA graph: no time is lost to starting its many small kernels."""
     work = _without_derivatives(make, here)
     side = torch.cuda.Stream()
@@ -252,7 +250,7 @@ def step(here: Setting) -> list[Case]:
                 Case(
                     STEP,
                     name,
-                    partial(differentiated, make),
+                    partial(differentiated, partial(_of_fine, make)),
                     lambda answer: here.judge(answer[0]),
                     precision=_NAMES[dtype],
                     memory=dtype == torch.float64,

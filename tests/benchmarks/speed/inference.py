@@ -12,16 +12,15 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
-from pyklip_diffrender.linear.forward_mode import jacfwd
-from pyklip_diffrender.linear.response import NANOMETRE, WavefrontResponse
+from pyklip_diffrender.linear.response import NANOMETRE, WavefrontResponse, downsample
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.planning import coarse_steps
 from pyklip_diffrender.refinement import Refinement, refine
 from pyklip_diffrender.scene.objects import Planet, Scene
 from pyklip_diffrender.scene.simulation import planet_photons
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
 from tests.benchmarks.speed.case import Case, Found
-from tests.benchmarks.speed.multifidelity import MultiFidelity
 from tests.benchmarks.speed.rivals import paper_recipe
 from tests.benchmarks.speed.setting import Setting
 
@@ -143,9 +142,7 @@ def _mode(model: OpticalSystem, basis: Basis, k: int) -> Tensor:
 def _along(model: OpticalSystem, opd: Tensor, basis: Basis, k: int) -> Tensor:
     """Derivative of the image along one mode, per nm."""
     mode = NANOMETRE * _mode(model, basis, k).to(opd.device)
-    step = torch.zeros((), dtype=opd.dtype, device=opd.device)
-    derivative: Tensor = jacfwd(lambda size: model(opd + size * mode))(step)
-    return derivative
+    return torch.func.jvp(lambda o: model(o), (opd,), (mode,))[1]
 
 
 # -- refinement ------------------------------------------------------------------------------------
@@ -185,12 +182,12 @@ def refinement(here: Setting) -> list[Case]:
 
     def judge_recipe(_: Any) -> Found:
         """All steps, at the pace of the multi-fidelity model, then the fine model's image."""
-        coarse = MultiFidelity(here.model, here.measured, npix=here.coarse[1])
-        small = torch.nn.functional.avg_pool2d(here.measured[None], here.npix // here.coarse[1])[0]
+        coarse = coarse_steps(here.model, here.measured, here.coarse[1])
+        small = downsample(here.measured, coarse.npix)
         one = recipe(coarse, small)
         for _step in range(20 if here.quick else _ADAM_STEPS):
             opd = one()
-        factor = here.npix // here.coarse[1]
+        factor = here.npix // coarse.npix
         change = (opd.detach() - small).repeat_interleave(factor, 0).repeat_interleave(factor, 1)
         with torch.no_grad():
             image = here.model(here.measured + change)

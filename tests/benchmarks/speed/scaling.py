@@ -12,13 +12,13 @@ from scipy.linalg import cholesky
 from scipy.linalg.blas import dsyrk
 from torch.utils.flop_counter import FlopCounterMode
 
-from pyklip_diffrender.linear.response import WavefrontResponse
+from pyklip_diffrender.linear.response import WavefrontResponse, downsample
+from pyklip_diffrender.planning import coarse_steps
 from pyklip_diffrender.refinement import refine
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
 from tests.benchmarks.speed.case import Case
 from tests.benchmarks.speed.inference import basis_of
-from tests.benchmarks.speed.multifidelity import MultiFidelity
 from tests.benchmarks.speed.setting import Setting
 from tests.benchmarks.speed.timing import interleaved
 
@@ -143,7 +143,7 @@ def limits(here: Setting) -> list[dict[str, float | str]]:
     rates = _rates(here.device)
     model, basis = here.model, basis_of(here)
     lit = float(model.entrance.lit.sum())
-    mixed = MultiFidelity(model, here.measured, npix=here.coarse[0], dtype=torch.float32)
+    mixed = coarse_steps(model, here.measured, here.coarse[0], torch.float32)
 
     def fine() -> Any:
         with torch.no_grad():
@@ -151,7 +151,7 @@ def limits(here: Setting) -> list[dict[str, float | str]]:
 
     def coarse() -> Any:
         with torch.no_grad():
-            return mixed(here.opd)
+            return mixed(downsample(here.opd, mixed.npix))
 
     def response() -> Any:
         return WavefrontResponse(model, basis, here.opd, {}, npix=here.coarse[0])
