@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import zoom
 
-from pyklip_diffrender.bridges.checks import check_opd
-from pyklip_diffrender.bridges.poppy import opd_to_hdus
+from pyklip_diffrender.bridges.maps import check_opd, opd_to_hdus
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,

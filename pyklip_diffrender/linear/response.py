@@ -58,7 +58,7 @@ def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
     field = max(n * s for n, s in zip(detector.shape[::-1], detector.pixelscale, strict=True))
     while npix < samples_for_field(field, min(model.bandpass.wavelengths), model.diameter):
         npix *= 2
-    if not model.recipe or model.npix <= npix or model.npix % npix:
+    if "npix" not in model.adjustable or model.npix <= npix or model.npix % npix:
         return model.npix
     return npix
 
@@ -66,13 +66,14 @@ def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
 def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     """A cheaper copy of a model for derivatives: coarse cells, single precision.
 
-    A model without a recipe, or one that is already as coarse, serves itself. A wide field takes
-    more samples, by powers of two, so that the image does not repeat inside it.
+    A model whose pupil cannot be made coarser, or is coarse already, serves itself. A wide field
+    takes more samples, by powers of two, so that the image does not repeat inside it.
     """
     npix = coarse_npix(model, npix)
     if npix == model.npix:
         return model
-    return model.with_fidelity(npix=npix, occulter_sampling=_CELLS, dtype=torch.float32)
+    coarser = {"npix": npix, "occulter_sampling": _CELLS, "dtype": torch.float32}
+    return model.with_fidelity(**{k: v for k, v in coarser.items() if k in model.adjustable})
 
 
 def downsample(opd: Tensor, npix: int) -> Tensor:
@@ -157,7 +158,7 @@ class WavefrontResponse:
             ):
                 stop = min(start + batch, len(basis))
                 sampled = basis.modes(full, start, stop)
-                modes = full.crop(sampled, window).to(model.device, coarse.dtype)
+                modes = coarse.entrance.on_window(sampled).to(model.device, coarse.dtype)
                 for kept, wavefront in zip(self.fields, pupils, strict=True):
                     # d(exp(i k OPD)) = i k exp(i k OPD) d(OPD), for 1 nm.
                     wavenumber = 2 * math.pi / wavefront.wavelength * NANOMETRE

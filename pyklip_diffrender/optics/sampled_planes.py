@@ -48,6 +48,9 @@ class OrientedPupil(EntrancePupil):
     turned : float
         How far planes behind turn the image, degrees counter-clockwise; a source is tilted the
         other way, so that it ends up where it was asked for.
+    collected : float, optional
+        Sum of the squared amplitude of the true pupil, in units of a sample's area. By default
+        that of `amplitude`; samples that are means over partly blocked areas have less.
     """
 
     def __init__(
@@ -62,10 +65,16 @@ class OrientedPupil(EntrancePupil):
         pointing: tuple[float, float] = (0.0, 0.0),
         chromatic: Mapping[float, Tensor] | None = None,
         turned: float = 0.0,
+        collected: float | None = None,
     ) -> None:
         array = orientation.apply(amplitude).contiguous().to(device)
         super().__init__(array, diameter, dtype, name)
+        if collected is not None:
+            self.amplitude = self.amplitude * math.sqrt(self.total / collected)
+            self.total = collected
         self.opd = opd.to(device, torch.float64)
+        self.lit = (amplitude > 0).to(device)
+        """Where light passes, (npix, npix), in the frame of the OPD."""
         self.orientation = orientation
         self.pointing = torch.tensor(pointing, dtype=torch.float64, device=device)
         self.chromatic = {w: extra.to(device) for w, extra in (chromatic or {}).items()}
@@ -76,13 +85,17 @@ class OrientedPupil(EntrancePupil):
             device=device,
         )
 
+    def on_window(self, maps: Tensor) -> Tensor:
+        """See `EntrancePupil.on_window`; the maps have the frame of the entrance pupil."""
+        return super().on_window(self.orientation.apply(maps))
+
     def field(self, opd: Tensor, wavelength: float, star_offset: Tensor | None) -> Wavefront:
         """See `EntrancePupil.field`; `opd` has the frame of the entrance pupil."""
         if wavelength in self.chromatic:
             opd = opd + self.chromatic[wavelength]
         offset = self.pointing if star_offset is None else star_offset + self.pointing
         offset = offset @ self._tilt
-        return super().field(self.orientation.apply(opd), wavelength, offset)
+        return super().field(opd, wavelength, offset)
 
 
 class PupilOptic:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -12,17 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.io.units import (
-    require_finite,
-    require_shape,
-    to_metres,
-    to_unit,
-    warn_of_rms,
-)
+from pyklip_diffrender.io.units import require_finite, to_metres, to_unit, warn_of_rms
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.fast.path import LatticeRoute
-from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.optics.planes import (
     CompactOcculter,
     EntrancePupil,
@@ -31,6 +26,7 @@ from pyklip_diffrender.optics.planes import (
     Wavefront,
 )
 from pyklip_diffrender.optics.psf_file import recipe_psf
+from pyklip_diffrender.optics.sampled_planes import OrientedPupil, PupilOptic
 from pyklip_diffrender.parameters import parameter
 
 __all__ = ["OpticalSystem"]
@@ -38,6 +34,9 @@ __all__ = ["OpticalSystem"]
 Value = Tensor | ArrayLike | float
 
 _ON_AXIS = (0.0, 0.0)
+
+_BAND = ("monochromatic", "nlambda", "source")
+"""Settings that decide the wavelengths."""
 
 
 class OpticalSystem:
@@ -54,9 +53,9 @@ class OpticalSystem:
     bandpass : Bandpass
         Wavelengths and weights.
     recipe : mapping, optional
-        What the system was made from, for provenance and for `with_fidelity`.
+        The arguments that the system was made with, for provenance and for `with_fidelity`.
     remake : callable, optional
-        Makes the same system from a changed recipe.
+        Takes the arguments of `recipe`, some of them changed, and makes another system.
     route : "auto", "lattice" or "planes"
         How light gets to the detector: by convolution on cells that fit the detector (`cells`),
         which is for one round occulter between pupils, or plane by plane, which is for all.
@@ -67,6 +66,14 @@ class OpticalSystem:
     IncompatibleSetupError
         For the route "lattice" through planes that it does not take.
     """
+
+    _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
+        "fov_pixels": ("fov_arcsec",),
+        "fov_arcsec": ("fov_pixels",),
+        "nlambda": ("monochromatic",),
+        "source": ("monochromatic",),
+    }
+    """For a setting, those that say the same in other words and are dropped when it is given."""
 
     def __init__(
         self,
@@ -84,6 +91,7 @@ class OpticalSystem:
         self.bandpass = bandpass
         self.recipe = dict(recipe or {})
         self._remake = remake
+        self._other_bandpass: Bandpass | None = None
         if route not in ("auto", "lattice", "planes"):
             raise IncompatibleSetupError(
                 f"route: got {route!r}, expected 'auto', 'lattice' or 'planes'"
@@ -141,26 +149,97 @@ class OpticalSystem:
         between = [name for plane in self.planes for name in plane.parameters]
         return (*self.entrance.parameters, *between, *self.detector.parameters)
 
-    def with_fidelity(self, **changes: Any) -> Self | OpticalSystem:
+    @property
+    def setup(self) -> dict[str, str]:
+        """What the system is a model of, as far as it knows.
+
+        Names in the spelling of stpsf under "filter", "image_mask", "pupil_mask" and "module";
+        empty for a system that is not an instrument's.
+        """
+        names = ("filter", "image_mask", "pupil_mask")
+        setup = {name: self.recipe[name] for name in names if self.recipe.get(name)}
+        # The embedded masks are those of NIRCam's module A.
+        return {**setup, "module": "A"} if "image_mask" in setup else setup
+
+    @property
+    def adjustable(self) -> frozenset[str]:
+        """Names of the settings that `with_fidelity` can change.
+
+        What a fit makes cheaper has the same name in every system that can change it: "npix",
+        "dtype", "occulter_sampling", "fov_pixels" and "bandpass" (a `Bandpass`). The other names
+        are arguments of the function that made the system. A system put together from planes can
+        change its bandpass only, and not even that if its planes were sampled for some
+        wavelengths.
+        """
+        names = set(self.recipe) if self._remake is not None else set()
+        sampled = isinstance(self.entrance, OrientedPupil) or any(
+            isinstance(plane, PupilOptic) for plane in self.planes
+        )
+        return frozenset(names if sampled else {*names, "bandpass"})
+
+    def with_fidelity(self, **changes: Any) -> OpticalSystem:
         """The same system with other numerical settings, such as ``npix=256``.
 
         Parameters
         ----------
         **changes
-            Arguments of the function that made this system.
+            Settings by name, out of `adjustable`. One that says the same in other words is
+            dropped: ``fov_pixels`` takes the place of ``fov_arcsec``, ``nlambda`` that of
+            ``monochromatic``. None for a setting that this system does not have changes nothing.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For a setting that this system cannot change, or a value that it does not take.
         """
-        if self._remake is None:
-            raise TypeError(
-                "this system was put together from planes and has no recipe to change; make a "
-                "second one with the settings you want"
+        refused = [n for n, v in changes.items() if n not in self.adjustable and v is not None]
+        if refused:
+            raise IncompatibleSetupError(
+                f"{', '.join(refused)}: {self!r} cannot change that; it can change "
+                f"{', '.join(sorted(self.adjustable)) or 'nothing'}. Make a second system with "
+                "the settings you want"
             )
-        return self._remake(**{**self.recipe, **changes})
+        changes = {name: value for name, value in changes.items() if name in self.adjustable}
+        return self._changed(changes) if changes else self
+
+    def _changed(self, changes: dict[str, Any]) -> OpticalSystem:
+        """See `with_fidelity`; the changes are possible."""
+        bandpass = changes.pop("bandpass", None)
+        if bandpass is None and not any(name in changes for name in _BAND):
+            bandpass = self._other_bandpass
+        made: OpticalSystem = self._remade(changes) if changes else self
+        if bandpass is None or bandpass == made.bandpass:
+            return made
+        # Planes that know their optics at any wavelength are shared, with all that they keep.
+        other = copy.copy(made)
+        other.bandpass = other._other_bandpass = bandpass
+        return other
+
+    def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
+        """Another system from the same recipe with some changes."""
+        assert self._remake is not None  # Otherwise its arguments are not adjustable.
+        dropped = {
+            other: None
+            for name in changes
+            for other in self._replaced.get(name, ())
+            if other in self.recipe and other not in changes
+        }
+        return self._remake(**{**self.recipe, **dropped, **changes})
 
     def opd(self, opd: Value | None) -> Tensor:
         """Check an OPD and bring it to the system's device: (..., npix, npix) in m.
 
-        None is the system's own wavefront, flat unless it came with one. Tensors pass through
-        unchanged in value, so that gradients flow; everything else goes through the unit gate.
+        Arrays, Quantities and maps that sample the pupil with another number of pixels are
+        resampled, see `grid.resample`. Tensors pass through unchanged in value, so that gradients
+        flow, and must have the system's own size. None is the system's own wavefront, flat unless
+        it came with one.
+
+        Raises
+        ------
+        ShapeError
+            For a map that is not square, or a tensor of another size.
+        UnitError, NonFiniteError
+            For a Quantity that is not a length, or values that are not finite.
 
         Warns
         -----
@@ -171,28 +250,27 @@ class OpticalSystem:
             return self.entrance.opd
         if opd is None:
             return torch.zeros(self.npix, self.npix, dtype=self.dtype, device=self.device)
-        if not isinstance(opd, Tensor):
-            array = to_metres(opd, "opd")
-            if array.ndim < 2:
-                raise ShapeError(f"opd: got shape {array.shape}, expected (..., npix, npix)")
-            require_finite(array, "opd (NaN is only allowed outside the pupil; set it to 0)")
-            self._warn_of_unit(opd, array)
-            opd = torch.from_numpy(array)
-        if opd.shape[-2:] != (self.npix, self.npix):
-            require_shape(
-                np.empty(opd.shape[-2:]),
-                (self.npix, self.npix),
-                "opd",
-                f"This system samples the pupil with {self.npix} pixels: make it with "
-                f"npix={opd.shape[-1]}, or resample the map with opd.resample",
-            )
-        return opd.to(self.device)
+        if isinstance(opd, str | os.PathLike):
+            raise TypeError(f"opd: got the path {opd!r}; read it first, with read_opd(path)")
+        if isinstance(opd, Tensor):
+            if opd.shape[-2:] != (self.npix, self.npix):
+                raise ShapeError(
+                    f"opd: got a tensor of shape {tuple(opd.shape)}, expected (..., {self.npix}, "
+                    f"{self.npix}). Tensors are not resampled, because gradients may flow through "
+                    f"them: pass opd.numpy(), or make the system with npix={opd.shape[-1]}"
+                )
+            return opd.to(self.device)
+        array = to_metres(opd, "opd")
+        require_finite(array, "opd (NaN is only allowed outside the pupil; set it to 0)")
+        array = resample(array, self.npix)
+        self._warn_of_unit(opd, array)
+        return torch.from_numpy(array).to(self.device)
 
     def _warn_of_unit(self, given: Any, array: NDArray[np.float64]) -> None:
-        """Of bare nanometres: arrays only, for tensors are what fits move, and maps know theirs."""
+        """Warn of an array in nanometres; maps know their unit, and fits move tensors."""
         lit = self.entrance.lit.cpu().numpy()
-        if isinstance(given, np.ndarray) and array.shape[-2:] == lit.shape and lit.any():
-            # Small ones are fair: what a mode of 1 pm does is a thing to ask a model.
+        if isinstance(given, np.ndarray) and lit.any():
+            # A small rms is fair: somebody may ask what a mode of 1 pm does.
             rms = float(array[..., lit].std(axis=-1).max())
             warn_of_rms(rms, "opd", stacklevel=6, small=False)
 
@@ -366,19 +444,7 @@ class OpticalSystem:
             "oversample": samples,
             "occulter_sampling": sampling,
         }
-        changes = {name: value for name, value in changes.items() if value is not None}
-        system: OpticalSystem = self
-        if changes:
-            # One way of giving a size or a band takes the place of the other.
-            for name, rival in (
-                ("fov_pixels", "fov_arcsec"),
-                ("fov_arcsec", "fov_pixels"),
-                ("nlambda", "monochromatic"),
-                ("source", "monochromatic"),
-            ):
-                if name in changes and rival not in changes:
-                    changes[rival] = None
-            system = self.with_fidelity(**changes)
+        system = self.with_fidelity(**{k: v for k, v in changes.items() if v is not None})
         hdus = recipe_psf(system, normalize, outfile, overwrite, opd, **parameters)
         if return_intermediates:
             return hdus, system.debug(opd, None, **parameters)

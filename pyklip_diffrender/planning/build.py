@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -52,18 +51,26 @@ class CheapSystem(OpticalSystem):
         bandpass: Bandpass | None = None,
         without: Sequence[str] = (),
     ) -> None:
-        band = bandpass or made.bandpass
+        made = made if bandpass is None else made.with_fidelity(bandpass=bandpass)
         planes, detector = _reduced(made, without)
         super().__init__(
-            made.entrance,
-            planes,
-            detector,
-            band,
-            recipe=made.recipe,
-            remake=partial(_remade, made, band, tuple(without)) if made.recipe else None,
-            route=made.route,
+            made.entrance, planes, detector, made.bandpass, recipe=made.recipe, route=made.route
         )
+        self._made, self._without = made, tuple(without)
         self._corrections: dict[float, Tensor] = {}
+
+    @property
+    def setup(self) -> dict[str, str]:
+        """As of the other system."""
+        return self._made.setup
+
+    @property
+    def adjustable(self) -> frozenset[str]:
+        """As of the other system."""
+        return self._made.adjustable
+
+    def _changed(self, changes: dict[str, Any]) -> OpticalSystem:
+        return CheapSystem(self._made.with_fidelity(**changes), without=self._without)
 
     def corrected(self, corrections: Sequence[Tensor]) -> Self:
         """The same system with something added to the star's field on the detector.
@@ -84,12 +91,6 @@ class CheapSystem(OpticalSystem):
         found = super()._field(opd, wavelength, values)
         correction = self._corrections.get(wavelength)
         return found if correction is None else found + correction
-
-
-def _remade(
-    made: OpticalSystem, band: Bandpass, without: tuple[str, ...], **recipe: Any
-) -> OpticalSystem:
-    return CheapSystem(made.with_fidelity(**recipe), band, without)
 
 
 def _parts(model: OpticalSystem) -> dict[str, tuple[str, int, int]]:
@@ -196,5 +197,6 @@ def build(model: OpticalSystem, choice: Choice) -> OpticalSystem:
         changes["dtype"] = DTYPES[choice.dtype]
     if choice.occulter_sampling != model.recipe.get("occulter_sampling"):
         changes["occulter_sampling"] = choice.occulter_sampling
-    made = model.with_fidelity(**changes) if changes else model
-    return CheapSystem(made, quadrature(model.bandpass, choice.wavelengths), choice.without)
+    if choice.wavelengths != len(model.bandpass.wavelengths):
+        changes["bandpass"] = quadrature(model.bandpass, choice.wavelengths)
+    return CheapSystem(model.with_fidelity(**changes), without=choice.without)

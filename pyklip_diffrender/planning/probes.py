@@ -35,6 +35,8 @@ _HOPELESS = 3.0
 _ENOUGH = 256
 """Pupil samples on which wavelengths are compared."""
 
+_FIXED = "the model cannot change it"
+
 
 def _measured(
     trial: Trial,
@@ -43,8 +45,11 @@ def _measured(
     candidates: Iterable[dict[str, Any]],
     error: Callable[[Choice], Error],
     how: str = "down",
+    why: str = "no choice",
 ) -> Economy:
     """Options with their errors; only what was given, if nothing else would pay.
+
+    `why` is said where there are no candidates.
 
     Looked at are those "down" from fine to cheap, until one is hopeless; "up", until one is good;
     by "halves", down to the cheapest that is inside the budget; or "all", where errors cost
@@ -55,7 +60,7 @@ def _measured(
     options = allowed(candidates, given, trial.pins)
     if options == [given]:
         pinned = not trial.pins.keys().isdisjoint(fields)
-        return Economy(name, (Option(given),), "kept as asked" if pinned else "no choice")
+        return Economy(name, (Option(given),), "kept as asked" if pinned else why)
     # Of what the economies before leave.
     likely = trial.likely
     seconds = {k: trial.seconds(likely.changed(each)) for k, each in enumerate(options)}
@@ -116,7 +121,13 @@ def pupil_grid(trial: Trial) -> Economy:
         if coarse_npix(model, trial.finest.response_npix) < npix:
             candidates.append({"npix": npix, "multifidelity": True})
     fields = ("npix", "multifidelity")
-    return _measured(trial, "pupil grid", fields, candidates, _rendered(trial), "up")
+    why = _why_none(trial, "npix")
+    return _measured(trial, "pupil grid", fields, candidates, _rendered(trial), "up", why)
+
+
+def _why_none(trial: Trial, setting: str) -> str:
+    """Why there are no candidates for a setting, if there are none."""
+    return "no choice" if setting in trial.model.adjustable else _FIXED
 
 
 def _grids(trial: Trial) -> list[int]:
@@ -128,25 +139,32 @@ def _grids(trial: Trial) -> list[int]:
     least = max(needed, trial.finest.response_npix)
     # Only grids that divide the given one: others smear the map.
     halves = [model.npix >> k for k in range(6, 0, -1) if model.npix % (1 << k) == 0]
-    return [npix for npix in halves if npix >= least and "npix" in model.recipe]
+    return [npix for npix in halves if npix >= least and "npix" in model.adjustable]
 
 
 def occulter(trial: Trial) -> Economy:
     """Fewer cells per lambda/D on the occulter."""
     given = trial.finest.occulter_sampling
     candidates = []
-    if "occulter_sampling" in trial.model.recipe:
+    if "occulter_sampling" in trial.model.adjustable:
         start = given or (2.0 if trial.work.lattice else 4.0)
         candidates = [{"occulter_sampling": s} for s in (1.5, 2.0, 3.0) if s < start]
     return _measured(
-        trial, "occulter sampling", ("occulter_sampling",), candidates, _rendered(trial)
+        trial,
+        "occulter sampling",
+        ("occulter_sampling",),
+        candidates,
+        _rendered(trial),
+        why=_why_none(trial, "occulter_sampling"),
     )
 
 
 def wavelengths(trial: Trial) -> Economy:
     """Fewer wavelengths, placed as Gauss quadrature has them."""
     finest = trial.finest
-    candidates = [{"wavelengths": n} for n in range(1, finest.wavelengths)]
+    candidates = []
+    if "bandpass" in trial.model.adjustable:
+        candidates = [{"wavelengths": n} for n in range(1, finest.wavelengths)]
     # What the wavelengths do is the same on any pupil: it is measured on a coarse one.
     grids = [npix for npix in _grids(trial) if npix >= _ENOUGH]
     base = {"npix": grids[0]} if grids else {}
@@ -154,15 +172,17 @@ def wavelengths(trial: Trial) -> Economy:
     def error(choice: Choice) -> Error:
         return _rendered(trial, finest.changed(base))(choice.changed(base))
 
-    return _measured(trial, "wavelengths", ("wavelengths",), candidates, error, "halves")
+    why = _why_none(trial, "bandpass")
+    return _measured(trial, "wavelengths", ("wavelengths",), candidates, error, "halves", why)
 
 
 def precision(trial: Trial) -> Economy:
     """Single precision."""
     candidates = []
-    if trial.finest.dtype == "float64" and "dtype" in trial.model.recipe:
+    if trial.finest.dtype == "float64" and "dtype" in trial.model.adjustable:
         candidates = [{"dtype": "float32"}]
-    return _measured(trial, "precision", ("dtype",), candidates, _rendered(trial))
+    why = _why_none(trial, "dtype")
+    return _measured(trial, "precision", ("dtype",), candidates, _rendered(trial), why=why)
 
 
 def parts(trial: Trial) -> Economy:

@@ -27,7 +27,7 @@ from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
 from pyklip_diffrender.io.headers import header_date, header_text, merged_header
 from pyklip_diffrender.io.units import native_float64, to_metres, warn_of_rms
-from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import FourierModes, SegmentMotions
 
 __all__ = ["OPDMap", "as_opd_map", "drift", "random_drift", "random_opd", "read_opd", "resample"]
@@ -169,25 +169,6 @@ def _check(data: NDArray[np.float64], name: str) -> NDArray[np.float64]:
     data = np.where(bad, 0.0, data)
     warn_of_rms(float(data[pupil].std()), name, stacklevel=4)
     return data
-
-
-def resample(opd: NDArray[np.float64], npix: int) -> NDArray[np.float64]:
-    """Resample a square map to `npix` pixels over the same pupil: means, or bilinear if finer.
-
-    Parameters
-    ----------
-    opd : ndarray, (n, n)
-    npix : int
-    """
-    count = opd.shape[-1]
-    if npix == count:
-        return opd
-    tensor = torch.from_numpy(native_float64(opd))[None, None]
-    if count % npix == 0:
-        return torch.nn.functional.avg_pool2d(tensor, count // npix)[0, 0].numpy()
-    return torch.nn.functional.interpolate(
-        tensor, size=(npix, npix), mode="bilinear", align_corners=False, antialias=True
-    )[0, 0].numpy()
 
 
 def drift(before: Any, after: Any, hours: float, interval: float = 86.0) -> NDArray[np.float64]:
