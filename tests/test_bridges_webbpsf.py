@@ -343,7 +343,8 @@ def test_a_map_upside_down_is_noticed(nircam: Callable[..., Any]) -> None:
 def test_a_map_of_another_size_is_resampled(nircam: Callable[..., Any]) -> None:
     opd = lopsided(NPIX, 99, 50e-9)
     fine = np.kron(opd, np.ones((4, 4)))
-    assert np.allclose(opd_to_webbpsf(fine, nircam())[0].data, opd_to_webbpsf(opd, nircam())[0].data)
+    taken, wanted = (opd_to_webbpsf(each, nircam())[0].data for each in (fine, opd))
+    assert np.abs(taken - wanted).max() < 1e-20
     with pytest.raises(ShapeError, match=r"got shape \(100, 90\)"):
         opd_to_webbpsf(np.zeros((100, 90)), nircam())
 

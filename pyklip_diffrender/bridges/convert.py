@@ -35,7 +35,13 @@ from pyklip_diffrender.optics.masks import (
 from pyklip_diffrender.optics.orientation import Orientation
 from pyklip_diffrender.optics.planes import Plane
 from pyklip_diffrender.optics.rotation import FreeRotation
-from pyklip_diffrender.optics.sampled_planes import Gain, OffsetDetector, OrientedPupil, PupilOptic
+from pyklip_diffrender.optics.sampled_planes import (
+    Gain,
+    MovableStop,
+    OffsetDetector,
+    OrientedPupil,
+    PupilOptic,
+)
 
 __all__ = ["Converted", "Converter"]
 
@@ -80,7 +86,8 @@ class Converter:
     recipe : dict
         Arguments of `from_poppy`.
     kinds : mapping of str to type, optional
-        Names of pupil planes that become a special kind of `PupilOptic`.
+        Names of pupil planes that become a special kind of `PupilOptic`. The first stop behind a
+        mask always becomes a `MovableStop`, unless it is trainable.
 
     Raises
     ------
@@ -117,6 +124,7 @@ class Converter:
         # A whole number of samples across the image of the pupil array, rounding aside.
         self.sampling = math.ceil(self.npix * sampling - 1e-9) / self.npix
         self.used: dict[str, str] = {}
+        self.has_stop = False
         self.fixed: set[str] = {"npix", "device"} if recipe["trainable"] else set()
 
     def convert(self) -> Converted:
@@ -139,7 +147,7 @@ class Converter:
                     else FreeRotation(angle, self.npix, self.diameter, optic.name)
                 )
             elif optic.planetype == PlaneType.pupil:
-                plane, centred = self._pupil(optic, turn, centred, self._between_masks(k))
+                plane, centred = self._pupil(k, turn, centred)
                 planes.append(plane)
             elif self.osys.planes[k + 1].planetype == PlaneType.image:
                 # Masks one behind the other in one image act as one.
@@ -248,9 +256,8 @@ class Converter:
                 total += optic.angle * sense
         return total
 
-    def _pupil(
-        self, optic: Any, turn: Orientation, centred: str, padded: bool
-    ) -> tuple[Plane, str]:
+    def _pupil(self, index: int, turn: Orientation, centred: str) -> tuple[Plane, str]:
+        optic, padded = self.osys.planes[index], self._between_masks(index)
         phasors: dict[float, Tensor] = {}
         latest: Array | None = None
         for wavelength in self.bandpass.wavelengths:
@@ -274,7 +281,13 @@ class Converter:
             and len({id(p) for p in phasors.values()}) == 1
         ):
             return Gain(optic.name, complex(latest.flat[0])), wave._image_centered
-        plane = self.kinds.get(optic.name, PupilOptic)(
+        kind = self.kinds.get(optic.name, PupilOptic)
+        behind_mask = any(p.planetype == PlaneType.image for p in self.osys.planes[:index])
+        if kind is PupilOptic and behind_mask and not (self.has_stop or trainable):
+            # An optic that leaves the amplitude alone is not a stop.
+            self.has_stop = bool(np.ptp(np.abs(latest)) > 1e-9)
+            kind = MovableStop if self.has_stop else PupilOptic
+        plane = kind(
             phasors,
             self.npix,
             self.diameter,

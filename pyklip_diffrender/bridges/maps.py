@@ -10,7 +10,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import DiffrenderWarning, UnitError
+from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.units import require_finite, to_metres
+from pyklip_diffrender.optics.grid import JWST_DIAMETER
 
 __all__ = ["check_opd", "opd_to_hdus"]
 
@@ -75,15 +77,20 @@ def check_opd(opd: Array, amplitude: Array, name: str) -> None:
         )
 
 
-def opd_to_hdus(opd: Any, diameter: float) -> fits.HDUList:
-    """An OPD in the form that poppy's and stpsf's readers take: metres, BUNIT and PUPLSCAL.
+def opd_to_hdus(opd: Any, diameter: float = JWST_DIAMETER) -> fits.HDUList:
+    """An OPD in the form that poppy's and stpsf's readers take, for ``nircam.pupilopd`` or a file.
 
     Parameters
     ----------
-    opd : Tensor, Quantity or array, (npix, npix)
-        Bare numbers are metres.
+    opd : OPDMap, Tensor, Quantity or array, (npix, npix)
+        Bare numbers are metres. The origin of an `OPDMap` goes into the header.
     diameter : float
         Side of the array, m.
+
+    Returns
+    -------
+    HDUList
+        One image in metres, with BUNIT and PUPLSCAL.
     """
     values = to_metres(opd, "opd")
     header = fits.Header()
@@ -91,4 +98,12 @@ def opd_to_hdus(opd: Any, diameter: float) -> fits.HDUList:
     header["PUPLDIAM"] = (diameter, "[m] side of the array")
     header["PUPLSCAL"] = (diameter / values.shape[-1], "[m / pixel]")
     header["CONTENTS"] = "OTE OPD, entrance pupil orientation"
+    if isinstance(opd, OPDMap):
+        header["OPDFILE"] = (opd.name, "Origin of the map")
+        if opd.aperture:
+            header["APERNAME"] = (opd.aperture, "Sensing field point")
+        if opd.date is not None:
+            header["DATE-OBS"], header["TIME-OBS"] = opd.date.isot.split("T")
+        for line in opd.history:
+            header.add_history(line)
     return fits.HDUList([fits.PrimaryHDU(values, header)])

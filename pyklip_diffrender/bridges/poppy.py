@@ -59,7 +59,7 @@ class PoppySystem(OpticalSystem):
         "wavelength": ("weights",),
     }
     _fixed: frozenset[str]
-    _copies: dict[frozenset[tuple[str, Any]], OpticalSystem]
+    _copies: dict[frozenset[tuple[str, Any]] | None, OpticalSystem]
 
     @classmethod
     def of(
@@ -96,26 +96,27 @@ class PoppySystem(OpticalSystem):
         """Arguments of `from_poppy` for a bandpass."""
         return {"wavelength": list(bandpass.wavelengths), "weights": list(bandpass.weights)}
 
-    def _changed(self, changes: dict[str, Any]) -> OpticalSystem:
-        try:
-            key = frozenset(changes.items())
-        except TypeError:  # Arrays and lists cannot be looked up.
-            return self._converted_again(changes)
-        if key not in self._copies:
-            while len(self._copies) >= _COPIES:
-                del self._copies[next(iter(self._copies))]
-            self._copies[key] = self._converted_again(changes)
-        return self._copies[key]
+    def at_wavelengths(self, bandpass: Bandpass) -> OpticalSystem:
+        """See `OpticalSystem.at_wavelengths`; optics are evaluated anew where they have to be."""
+        if set(bandpass.wavelengths) <= set(self.bandpass.wavelengths):
+            return super().at_wavelengths(bandpass)
+        return self._remade(self._band(bandpass))
 
-    def _converted_again(self, changes: dict[str, Any]) -> OpticalSystem:
-        bandpass = changes.get("bandpass")
-        others = {name: value for name, value in changes.items() if name != "bandpass"}
-        made = self._remade({**others, **({} if bandpass is None else self._band(bandpass))})
+    def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
+        # By name and value; arrays and other things that cannot be looked up are not kept.
+        key = frozenset(changes.items()) if _hashable(changes) else None
+        if key in self._copies:
+            return self._copies[key]
+        made = super()._remade(changes)
         assert isinstance(made, PoppySystem)
         for name, (opd, transmission) in self.trainable.items():
             # The same tensors: what has been trained, and what will be, holds for both.
             plane = made.plane(name)
             plane.opd, plane.transmission = opd, transmission
+        if key is not None:
+            while len(self._copies) >= _COPIES:
+                del self._copies[next(iter(self._copies))]
+            self._copies[key] = made
         return made
 
     def plane(self, name: str) -> Any:
@@ -203,6 +204,14 @@ class PoppySystem(OpticalSystem):
         return hdus, intermediate_wavefronts(
             system, system.frames, normalize, only_last=not return_intermediates
         )
+
+
+def _hashable(changes: Mapping[str, Any]) -> bool:
+    try:
+        hash(frozenset(changes.items()))
+    except TypeError:
+        return False
+    return True
 
 
 def from_poppy(

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from astropy.io import fits
-from poppy.poppy_core import PlaneType
 
 from pyklip_diffrender.bridges.convert import Converter
 from pyklip_diffrender.bridges.instrument import (
@@ -28,9 +27,9 @@ from pyklip_diffrender.io.units import to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.detector_effects import ChainDetector
-from pyklip_diffrender.optics.grid import JWST_DIAMETER, resample
+from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.psf_file import poppy_psf, save
-from pyklip_diffrender.optics.sampled_planes import AberrationOptic, MovableStop, PupilOptic
+from pyklip_diffrender.optics.sampled_planes import AberrationOptic
 from pyklip_diffrender.optics.system import OpticalSystem
 
 __all__ = ["WebbSystem", "from_webbpsf", "opd_to_webbpsf"]
@@ -240,12 +239,13 @@ def from_webbpsf(
     # As it was given: the field dependence has values beside the pupil, too.
     given = getattr(first, "_opd_original", first.opd)
     check_opd(np.asarray(given), np.asarray(first.amplitude), "pupilopd")
-    flipped = _set_flip(osys, flip_si_wfe)
+    aberrations = _aberrations(osys)
+    flipped = None if aberrations is None else _set_flip(aberrations, flip_si_wfe)
     converter = Converter(
         osys,
         # The detector has the field of view already.
         {**recipe, "wavelength": wavelengths, "weights": weights, "fov_pixels": None},
-        _kinds(osys),
+        {} if aberrations is None else {aberrations.name: AberrationOptic},
     )
     converted = converter.convert()
     detector = _with_effects(converted.detector, instrument, sampling, add_distortion)
@@ -262,35 +262,14 @@ def _aberrations(osys: Any) -> Any:
     return None
 
 
-def _set_flip(osys: Any, wanted: bool | None) -> bool | None:
+def _set_flip(plane: Any, wanted: bool | None) -> bool:
     """Flip the map of internal aberrations if wanted; return whether it is flipped."""
-    plane = _aberrations(osys)
-    if plane is None:
-        return None
     flipped = bool(getattr(plane, "_is_OPD_flipped_for_NRC_coron", False))
     if wanted is None or wanted == flipped:
         return flipped
     # The map alone: focus and tilt, which depend on the wavelength, are added to it later.
     plane.opd = plane.opd[::-1].copy()
     return wanted
-
-
-def _kinds(osys: Any) -> dict[str, type[PupilOptic]]:
-    """Pupil planes with free parameters: Lyot stop and internal aberrations, by name."""
-    kinds: dict[str, type[PupilOptic]] = {}
-    behind_mask = False
-    aberrations = _aberrations(osys)
-    for plane in osys.planes:
-        behind_mask |= plane.planetype == PlaneType.image
-        if plane is aberrations:
-            kinds[plane.name] = AberrationOptic
-        elif (
-            behind_mask
-            and plane.planetype == PlaneType.pupil
-            and MovableStop not in (kinds.values())
-        ):
-            kinds[plane.name] = MovableStop
-    return kinds
 
 
 def _with_effects(
@@ -347,7 +326,7 @@ def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:
         amplitude = np.asarray(instrument._get_telescope_pupil_and_aberrations().amplitude)
     values = resample(to_metres(opd, "opd"), len(amplitude))
     check_opd(values, amplitude, "opd")
-    hdus = opd_to_hdus(values, JWST_DIAMETER)
+    hdus = opd_to_hdus(values)
     instrument.pupilopd = hdus
     with data_errors():
         added = np.asarray(instrument._get_telescope_pupil_and_aberrations().opd) - values

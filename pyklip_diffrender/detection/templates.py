@@ -104,7 +104,8 @@ class Templates:
         offsets = torch.from_numpy(self.grid[rows, columns])
         found = {}
         for k, fit in enumerate(self.fits):
-            if self._aligned(k):
+            # Calls of the model are faster on a coarse pupil.
+            if self._aligned(k) and self._points(k).route == "lattice":
                 images = self._points(k).images(rows, columns)
             else:
                 images = self._many(fit, self._turned(k, offsets))

@@ -25,7 +25,7 @@ from pyklip_diffrender.optics.planes import (
     Values,
     Wavefront,
 )
-from pyklip_diffrender.optics.psf_file import recipe_psf
+from pyklip_diffrender.optics.psf_file import instrument_psf
 from pyklip_diffrender.optics.sampled_planes import OrientedPupil, PupilOptic
 from pyklip_diffrender.parameters import parameter
 
@@ -35,7 +35,7 @@ Value = Tensor | ArrayLike | float
 
 _ON_AXIS = (0.0, 0.0)
 
-_BAND = ("monochromatic", "nlambda", "source")
+_BAND = ("monochromatic", "nlambda", "source", "wavelength")
 """Settings that decide the wavelengths."""
 
 
@@ -172,10 +172,7 @@ class OpticalSystem:
         wavelengths.
         """
         names = set(self.recipe) if self._remake is not None else set()
-        sampled = isinstance(self.entrance, OrientedPupil) or any(
-            isinstance(plane, PupilOptic) for plane in self.planes
-        )
-        return frozenset(names if sampled else {*names, "bandpass"})
+        return frozenset(names if self._is_sampled else {*names, "bandpass"})
 
     def with_fidelity(self, **changes: Any) -> OpticalSystem:
         """The same system with other numerical settings, such as ``npix=256``.
@@ -185,14 +182,18 @@ class OpticalSystem:
         **changes
             Settings by name, out of `adjustable`. One that says the same in other words is
             dropped: ``fov_pixels`` takes the place of ``fov_arcsec``, ``nlambda`` that of
-            ``monochromatic``. None for a setting that this system does not have changes nothing.
+            ``monochromatic``. Settings that keep their value are accepted for all systems.
 
         Raises
         ------
         IncompatibleSetupError
             For a setting that this system cannot change, or a value that it does not take.
         """
-        refused = [n for n, v in changes.items() if n not in self.adjustable and v is not None]
+        refused = [
+            name
+            for name, value in changes.items()
+            if name not in self.adjustable and value is not self.recipe.get(name)
+        ]
         if refused:
             raise IncompatibleSetupError(
                 f"{', '.join(refused)}: {self!r} cannot change that; it can change "
@@ -200,20 +201,46 @@ class OpticalSystem:
                 "the settings you want"
             )
         changes = {name: value for name, value in changes.items() if name in self.adjustable}
-        return self._changed(changes) if changes else self
-
-    def _changed(self, changes: dict[str, Any]) -> OpticalSystem:
-        """See `with_fidelity`; the changes are possible."""
         bandpass = changes.pop("bandpass", None)
-        if bandpass is None and not any(name in changes for name in _BAND):
+        if bandpass is None and changes.keys().isdisjoint(_BAND):
             bandpass = self._other_bandpass
-        made: OpticalSystem = self._remade(changes) if changes else self
-        if bandpass is None or bandpass == made.bandpass:
-            return made
-        # Planes that know their optics at any wavelength are shared, with all that they keep.
-        other = copy.copy(made)
+        made = self._remade(changes) if changes else self
+        return made if bandpass is None else made.at_wavelengths(bandpass)
+
+    def at_wavelengths(self, bandpass: Bandpass) -> OpticalSystem:
+        """The same system with another bandpass.
+
+        Its planes are shared, with all that they have computed so far. Systems that
+        `with_fidelity` makes of the result have the other bandpass, too.
+
+        Parameters
+        ----------
+        bandpass : Bandpass
+            Any wavelengths if "bandpass" is in `adjustable`; otherwise some of those that the
+            system has.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For wavelengths at which the planes were not sampled.
+        """
+        if bandpass == self.bandpass:
+            return self
+        known = set(bandpass.wavelengths) <= set(self.bandpass.wavelengths)
+        if not known and self._is_sampled:
+            raise IncompatibleSetupError(
+                f"bandpass: got the wavelengths {bandpass.wavelengths} m, but planes of {self!r} "
+                f"were sampled at {self.bandpass.wavelengths} m"
+            )
+        other = copy.copy(self)
         other.bandpass = other._other_bandpass = bandpass
         return other
+
+    @property
+    def _is_sampled(self) -> bool:
+        """Whether planes are known at the wavelengths of the bandpass only."""
+        planes = (self.entrance, *self.planes)
+        return any(isinstance(plane, OrientedPupil | PupilOptic) for plane in planes)
 
     def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
         """Another system from the same recipe with some changes."""
@@ -445,7 +472,7 @@ class OpticalSystem:
             "occulter_sampling": sampling,
         }
         system = self.with_fidelity(**{k: v for k, v in changes.items() if v is not None})
-        hdus = recipe_psf(system, normalize, outfile, overwrite, opd, **parameters)
+        hdus = instrument_psf(system, normalize, outfile, overwrite, opd, **parameters)
         if return_intermediates:
             return hdus, system.debug(opd, None, **parameters)
         return hdus

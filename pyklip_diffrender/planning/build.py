@@ -51,7 +51,7 @@ class CheapSystem(OpticalSystem):
         bandpass: Bandpass | None = None,
         without: Sequence[str] = (),
     ) -> None:
-        made = made if bandpass is None else made.with_fidelity(bandpass=bandpass)
+        made = made if bandpass is None else made.at_wavelengths(bandpass)
         planes, detector = _reduced(made, without)
         super().__init__(
             made.entrance, planes, detector, made.bandpass, recipe=made.recipe, route=made.route
@@ -69,7 +69,8 @@ class CheapSystem(OpticalSystem):
         """As of the other system."""
         return self._made.adjustable
 
-    def _changed(self, changes: dict[str, Any]) -> OpticalSystem:
+    def with_fidelity(self, **changes: Any) -> OpticalSystem:
+        """See `OpticalSystem.with_fidelity`."""
         return CheapSystem(self._made.with_fidelity(**changes), without=self._without)
 
     def corrected(self, corrections: Sequence[Tensor]) -> Self:

@@ -153,6 +153,10 @@ def refine(
             f"refine(method={method!r}): {error}. It takes "
             f"{', '.join(field.name for field in fields(settings))}"
         ) from error
+    if "free" not in options and not isinstance(chosen, AdamOptions):
+        # A system without a Lyot stop has no parameters of one.
+        known = (*model.parameters, "flux", "background")
+        chosen = replace(chosen, free=tuple(name for name in chosen.free if name in known))
     several = not isinstance(observation, Observation)
     observations = [observation] if isinstance(observation, Observation) else list(observation)
     if not observations:
