@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from poppy.poppy_core import PlaneType
 
 from pyklip_diffrender.bridges import from_poppy, opd_to_poppy
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.optics.grid import resample
 
 Array = NDArray[np.float64]
 Plane = tuple[str, Any]
@@ -320,7 +321,10 @@ def test_there_and_back(inversion: str) -> None:
     assert relative(model.calc_psf(opd=opd[::-1].copy())[0].data, truth) > 1e-3
     own = opd_to_poppy(model.entrance.opd, system).calc_psf(WAVELENGTH)[0].data
     assert relative(own, system.calc_psf(WAVELENGTH)[0].data) < 1e-12
-    with pytest.raises(IncompatibleSetupError, match="shape"):
+    coarse = resample(opd, NPIX // 2)
+    taken = opd_to_poppy(coarse, system).planes[0].opd
+    assert np.array_equal(taken, resample(coarse, NPIX))
+    with pytest.raises(ShapeError, match=r"\(95, 96\), expected square maps"):
         opd_to_poppy(opd[:-1], system)
 
 

@@ -25,6 +25,7 @@ from pyklip_diffrender.errors import (
     DiffrenderWarning,
     IncompatibleSetupError,
     NonFiniteError,
+    ShapeError,
     UnitError,
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
@@ -149,7 +150,7 @@ def test_the_users_object_and_the_model_do_not_touch_each_other(
     instrument.options["source_offset_x"] = 1.0
     instrument.image_mask = "MASK430R"
     assert torch.equal(model(), image)
-    assert torch.equal(model.with_fidelity()(), image)
+    assert torch.equal(model.with_fidelity(monochromatic=4.5e-6)(), image)
 
 
 def test_a_refined_wavefront_goes_back(nircam: Callable[..., Any]) -> None:
@@ -339,9 +340,13 @@ def test_a_map_upside_down_is_noticed(nircam: Callable[..., Any]) -> None:
         from_webbpsf(instrument, **FAST)
 
 
-def test_a_wrong_shape_says_so(nircam: Callable[..., Any]) -> None:
-    with pytest.raises(IncompatibleSetupError, match=r"got shape \(100, 100\)"):
-        opd_to_webbpsf(np.zeros((100, 100)), nircam())
+def test_a_map_of_another_size_is_resampled(nircam: Callable[..., Any]) -> None:
+    opd = lopsided(NPIX, 99, 50e-9)
+    fine = np.kron(opd, np.ones((4, 4)))
+    taken, wanted = (opd_to_webbpsf(each, nircam())[0].data for each in (fine, opd))
+    assert np.abs(taken - wanted).max() < 1e-20
+    with pytest.raises(ShapeError, match=r"got shape \(100, 90\)"):
+        opd_to_webbpsf(np.zeros((100, 90)), nircam())
 
 
 @pytest.fixture

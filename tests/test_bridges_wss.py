@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
-from stpsf_data import wss_file
+from stpsf_data import pupil, wss_file
 
-from pyklip_diffrender.bridges import from_webbpsf, load_wss_opd, load_wss_opd_by_date
+from pyklip_diffrender.bridges import (
+    from_webbpsf,
+    load_wss_opd,
+    load_wss_opd_by_date,
+    opd_to_hdus,
+)
 from pyklip_diffrender.bridges.wss import interpolate_wss
 from pyklip_diffrender.errors import (
     CorruptFileError,
@@ -19,6 +24,8 @@ from pyklip_diffrender.errors import (
     MissingOPDError,
     UnitError,
 )
+from pyklip_diffrender.optics.grid import resample
+from pyklip_diffrender.wavefront.opd import read_opd
 
 NPIX = 256
 
@@ -41,20 +48,23 @@ def test_it_is_the_map_that_stpsf_loads(stpsf_path: Path, wss: Path) -> None:
     loaded = load_wss_opd(wss, npix=NPIX)
     truth = instrument.pupilopd[0].data
     instrument.pupilopd.close()
-    assert np.abs(loaded.opd - truth).max() <= 1e-12
+    assert np.abs(loaded.data - truth).max() <= 1e-12
     for turned in (np.flipud, np.fliplr, np.transpose):
-        assert np.abs(turned(loaded.opd) - truth).max() > 1e-8
-    assert loaded.epoch == Time("2022-08-11T02:00:00")
+        assert np.abs(turned(loaded.data) - truth).max() > 1e-8
+    assert loaded.date == Time("2022-08-11T02:00:00")
     assert loaded.aperture == "NRCA3_FP1"
     assert any("sha256" in line for line in loaded.history)
     # Through a file or an HDUList it is the same PSF.
     call = {"monochromatic": 4.5e-6, "oversample": 1, "fov_pixels": 30}
     wanted = from_webbpsf(instrument, **call)()
-    instrument.pupilopd = loaded.hdus()
+    instrument.pupilopd = opd_to_hdus(loaded)
     assert np.abs((from_webbpsf(instrument, **call)() - wanted).numpy()).max() < 1e-12 * (
         wanted.max()
     )
-    assert loaded.hdus()[0].header["DATE-OBS"] == "2022-08-11"
+    header = opd_to_hdus(loaded)[0].header
+    assert header["DATE-OBS"] == "2022-08-11"
+    assert header["APERNAME"] == "NRCA3_FP1"
+    assert "subtracted SI WFE" in str(header["HISTORY"])
 
 
 def test_finer_maps_are_placed_as_stpsf_places_them(stpsf_path: Path, wss: Path) -> None:
@@ -62,18 +72,51 @@ def test_finer_maps_are_placed_as_stpsf_places_them(stpsf_path: Path, wss: Path)
 
     hdus = mast_wss.import_wss_opd(str(wss), npix_out=1024)
     loaded = load_wss_opd(wss, npix=1024, backout_si_wfe=False)
-    inside = loaded.opd != 0
+    inside = loaded.data != 0
     assert inside.mean() > 0.4
-    assert np.abs(loaded.opd - hdus[0].data)[inside].max() <= 1e-12
+    assert np.abs(loaded.data - hdus[0].data)[inside].max() <= 1e-12
     hdus.close()
 
 
 def test_without_stpsf_data_the_sum_can_be_read(wss: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("STPSF_PATH", raising=False)
     loaded = load_wss_opd(wss, npix=NPIX, backout_si_wfe=False)
-    assert 4e-8 < loaded.opd[loaded.opd != 0].std() < 1e-7
+    assert 4e-8 < loaded.data[loaded.data != 0].std() < 1e-7
     with pytest.raises(CorruptFileError, match="backout_si_wfe=False"):
-        load_wss_opd(wss, npix=NPIX)
+        load_wss_opd(wss, npix=NPIX, backout_si_wfe=True)
+    # Unless told otherwise it is read all the same, and said to be another map.
+    with pytest.warns(DiffrenderWarning, match=r"what the sensing camera saw.*63 nm.*STPSF_PATH"):
+        kept = load_wss_opd(wss, npix=NPIX)
+    assert np.array_equal(kept.data, loaded.data)
+    assert kept.history[-1].startswith("kept SI WFE")
+
+
+def test_read_opd_recognises_the_file_by_its_content(
+    stpsf_path: Path, wss: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    renamed = tmp_path / "map.fits"
+    renamed.write_bytes(wss.read_bytes())
+    with fits.open(wss) as hdus:
+        coarse = hdus["RESULT_PHASE"].data.astype(float) * 1e-6
+    # The finest pupil in stpsf's data has 256 samples.
+    got, wanted = read_opd(renamed), load_wss_opd(wss, npix=NPIX, backout_si_wfe=True)
+    assert np.array_equal(got.data, wanted.data)
+    assert got.date == Time("2022-08-11T02:00:00")
+    assert got.aperture == "NRCA3_FP1"
+    # As it is, on its own samples, if the extension is asked for.
+    assert np.allclose(read_opd(renamed, extension="RESULT_PHASE").data, coarse, rtol=1e-7)
+    monkeypatch.delenv("STPSF_PATH")
+    with pytest.warns(DiffrenderWarning, match="what the sensing camera saw"):
+        summed = read_opd(renamed)
+    assert summed.shape == (1024, 1024)
+    inside = resample(pupil(NPIX), 1024) == 1
+    assert np.corrcoef(summed.data[inside], resample(coarse, 1024)[inside])[0, 1] > 0.99
+    assert np.corrcoef(summed.data[inside], resample(coarse[::-1], 1024)[inside])[0, 1] < 0.9
+    with fits.open(wss) as hdus:
+        hdus["RESULT_PHASE"].data[:] = 0
+        hdus.writeto(tmp_path / "empty.fits")
+    with pytest.raises(CorruptFileError, match="all values of RESULT_PHASE are zero"):
+        read_opd(tmp_path / "empty.fits")
 
 
 def test_interpolation_in_time_warns(wss: Path, tmp_path: Path) -> None:
@@ -82,8 +125,8 @@ def test_interpolation_in_time_warns(wss: Path, tmp_path: Path) -> None:
     maps = [load_wss_opd(path, npix=NPIX, backout_si_wfe=False) for path in (wss, later)]
     with pytest.warns(DiffrenderWarning, match=r"interpolation, 67% of R2022081102"):
         between = interpolate_wss(*maps, "2022-08-12T02:00:00")
-    assert np.allclose(between.opd, (2 * maps[0].opd + maps[1].opd) / 3, atol=1e-15)
-    assert between.epoch == Time("2022-08-12T02:00:00")
+    assert np.allclose(between.data, (2 * maps[0].data + maps[1].data) / 3, atol=1e-15)
+    assert between.date == Time("2022-08-12T02:00:00")
     with pytest.raises(IncompatibleSetupError, match="not between"):
         interpolate_wss(*maps, "2022-08-15")
 
@@ -148,7 +191,7 @@ def test_files_that_are_something_else(wss: Path, tmp_path: Path) -> None:
         load_wss_opd(tmp_path / "undated.fits", npix=NPIX, backout_si_wfe=False)
     bare = tmp_path / "R2023010203-NRCA3_FP1-1.fits"
     loaded = load_wss_opd(bare, npix=NPIX, backout_si_wfe=False)
-    assert loaded.epoch == Time("2023-01-02")
+    assert loaded.date == Time("2023-01-02")
 
 
 def test_the_sensing_camera_must_be_known(stpsf_path: Path, wss: Path, tmp_path: Path) -> None:
@@ -158,6 +201,8 @@ def test_the_sensing_camera_must_be_known(stpsf_path: Path, wss: Path, tmp_path:
         hdus[0].header["APERNAME"] = "NRCA3_FP9"
         hdus.writeto(tmp_path / "unknown.fits")
     with pytest.raises(CorruptFileError, match="no APERNAME"):
-        load_wss_opd(tmp_path / "nameless.fits", npix=NPIX)
+        load_wss_opd(tmp_path / "nameless.fits", npix=NPIX, backout_si_wfe=True)
     with pytest.raises(CorruptFileError, match="NRCA3_FP9"):
-        load_wss_opd(tmp_path / "unknown.fits", npix=NPIX)
+        load_wss_opd(tmp_path / "unknown.fits", npix=NPIX, backout_si_wfe=True)
+    with pytest.warns(DiffrenderWarning, match=r"nameless\.fits.*no APERNAME"):
+        load_wss_opd(tmp_path / "nameless.fits", npix=NPIX)

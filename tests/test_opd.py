@@ -87,7 +87,7 @@ def test_quantities_in_any_unit_give_the_same_image(opd: np.ndarray) -> None:
 
 def test_a_file_without_a_unit_asks_for_one_and_takes_it(tmp_path: Path, opd: np.ndarray) -> None:
     path = write(tmp_path / "wss.fits", opd * 1e6, None)
-    with pytest.raises(UnitError, match=r"wss\.fits.*BUNIT.*unit='m'.*micron"):
+    with pytest.raises(UnitError, match=r"wss\.fits.*BUNIT.*unit='m'.*'um', 'nm'"):
         read_opd(path)
     for unit in ("um", u.um):
         np.testing.assert_allclose(read_opd(path, unit=unit).data, opd, rtol=1e-14, atol=1e-24)
@@ -191,6 +191,22 @@ def test_a_file_without_a_map_is_refused(tmp_path: Path, opd: np.ndarray) -> Non
         read_opd(tmp_path / "nowhere.fits")
 
 
+def test_a_file_of_zeros_is_refused(tmp_path: Path, opd: np.ndarray) -> None:
+    with pytest.raises(CorruptFileError, match=r"blank\.fits: all values of the map are zero"):
+        read_opd(write(tmp_path / "blank.fits", 0 * opd))
+
+
+def test_stpsfs_own_files_are_read(tmp_path: Path) -> None:
+    """An OPD in metres in the primary HDU, with stpsf's keywords: nothing is converted."""
+    from stpsf_data import make_stpsf_data
+
+    folder = make_stpsf_data(tmp_path / "data", npix=NPIX)
+    got = read_opd(folder / "JWST_OTE_OPD_cycle1_example_2022-07-30.fits")
+    inside = jwst_pupil(NPIX).numpy() > 0.999
+    assert got.shape == (NPIX, NPIX)
+    assert 4e-8 < got.data[inside].std() < 9e-8
+
+
 def test_a_map_that_is_not_square_is_refused(tmp_path: Path, opd: np.ndarray) -> None:
     with pytest.raises(ShapeError, match=r"map\.fits.*\(96, 90\).*square"):
         read_opd(write(tmp_path / "map.fits", opd[:, :90]))
@@ -273,6 +289,39 @@ def test_resampling_keeps_a_plane_and_its_orientation() -> None:
         (3 * PupilGrid.full(60).x[None, :] - 2 * PupilGrid.full(60).y[:, None])[2:-2, 2:-2],
         atol=1e-12,
     )
+
+
+@pytest.mark.parametrize("given", [48, 96, 130, 192])
+def test_a_model_takes_maps_of_any_size(given: int) -> None:
+    model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=12)
+    map_ = random_opd(5, npix=given)
+    wanted = model(torch.from_numpy(resample(map_.data, NPIX)))
+    stack = np.stack([map_.data, 2 * map_.data])
+    for value in (map_, map_.data, map_.data * 1e9 * u.nm, map_.data.tolist()):
+        torch.testing.assert_close(model(value), wanted, rtol=1e-9, atol=1e-20)
+    torch.testing.assert_close(model(stack)[0], wanted, rtol=1e-9, atol=1e-20)
+    (field,) = model.fields(map_)
+    torch.testing.assert_close(field.abs() ** 2, wanted, rtol=1e-9, atol=1e-20)
+    psf = model.calc_psf(opd=map_)["DET_SAMP"].data
+    np.testing.assert_allclose(psf, wanted.numpy(), rtol=1e-9, atol=1e-20)
+    # Another orientation or another wavefront is another image.
+    for other in (map_.data[::-1], map_.data.T, 1.01 * map_.data):
+        assert not torch.allclose(model(other.copy()), wanted, rtol=1e-3, atol=0)
+
+
+def test_a_model_refuses_what_it_cannot_resample(tmp_path: Path) -> None:
+    model = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=12)
+    with pytest.raises(ShapeError, match=r"tensor of shape \(48, 48\).*96.*opd\.numpy\(\)"):
+        model(torch.zeros(48, 48, requires_grad=True))
+    for shape in ((96, 90), (96,), (0, 0)):
+        with pytest.raises(ShapeError, match="expected square maps"):
+            model(np.zeros(shape))
+    with pytest.raises(TypeError, match=r"read_opd\(path\)"):
+        model(tmp_path / "map.fits")
+
+
+def test_a_map_shows_where_it_comes_from_and_not_its_values(opd: np.ndarray) -> None:
+    assert repr(as_opd_map(opd)) == "OPDMap(date=None, name='array', aperture='')"
 
 
 def test_resampling_to_fewer_pixels_takes_means(opd: np.ndarray) -> None:

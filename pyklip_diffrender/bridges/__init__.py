@@ -1,6 +1,6 @@
-"""The same systems from the user's own poppy and webbpsf objects, and back.
+"""Conversions between this package and the user's own poppy and stpsf (webbpsf) objects.
 
-poppy and stpsf are loaded when a bridge is first used.
+poppy and stpsf are imported when a conversion is first used.
 """
 
 from __future__ import annotations
@@ -9,26 +9,27 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pyklip_diffrender.bridges.maps import opd_to_hdus
     from pyklip_diffrender.bridges.poppy import from_poppy, opd_to_poppy
     from pyklip_diffrender.bridges.webbpsf import from_webbpsf, opd_to_webbpsf
-    from pyklip_diffrender.bridges.wss import WSSMap, load_wss_opd, load_wss_opd_by_date
+    from pyklip_diffrender.bridges.wss import load_wss_opd, load_wss_opd_by_date
 
 __all__ = [
-    "WSSMap",
     "from_poppy",
     "from_webbpsf",
     "load_wss_opd",
     "load_wss_opd_by_date",
+    "opd_to_hdus",
     "opd_to_poppy",
     "opd_to_webbpsf",
 ]
 
 _MODULE_OF = {
-    "WSSMap": "wss",
     "from_poppy": "poppy",
     "from_webbpsf": "webbpsf",
     "load_wss_opd": "wss",
     "load_wss_opd_by_date": "wss",
+    "opd_to_hdus": "maps",
     "opd_to_poppy": "poppy",
     "opd_to_webbpsf": "webbpsf",
 }

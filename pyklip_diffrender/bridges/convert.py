@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +22,6 @@ from pyklip_diffrender.bridges.sampling import (
     complement_box,
     pupil_phasor,
 )
-from pyklip_diffrender.bridges.supported import check_supported
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, native_float64, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
@@ -35,7 +35,13 @@ from pyklip_diffrender.optics.masks import (
 from pyklip_diffrender.optics.orientation import Orientation
 from pyklip_diffrender.optics.planes import Plane
 from pyklip_diffrender.optics.rotation import FreeRotation
-from pyklip_diffrender.optics.sampled_planes import Gain, OffsetDetector, OrientedPupil, PupilOptic
+from pyklip_diffrender.optics.sampled_planes import (
+    Gain,
+    MovableStop,
+    OffsetDetector,
+    OrientedPupil,
+    PupilOptic,
+)
 
 __all__ = ["Converted", "Converter"]
 
@@ -44,16 +50,20 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Converted:
-    """What becomes of a poppy system.
+    """A poppy system as planes of ours.
 
     Attributes
     ----------
     entrance, planes, detector, bandpass
-        For an `OpticalSystem`.
+        The arguments of an `OpticalSystem`.
     propagation : dict of str to str
         For every image plane, "compact" or "fft".
     frames : list of Orientation
         For every plane of poppy's, from its frame to the frame of the system's pupils.
+    sampling : float
+        Samples per lambda/D in image planes.
+    fixed : frozenset of str
+        Settings that cannot be changed without making it another system.
     """
 
     entrance: OrientedPupil
@@ -62,6 +72,8 @@ class Converted:
     bandpass: Bandpass
     propagation: dict[str, str]
     frames: list[Orientation]
+    sampling: float
+    fixed: frozenset[str]
 
 
 class Converter:
@@ -70,10 +82,17 @@ class Converter:
     Parameters
     ----------
     osys : poppy.OpticalSystem
+        One that `poppy.check_supported` lets pass.
     recipe : dict
         Arguments of `from_poppy`.
     kinds : mapping of str to type, optional
-        Names of pupil planes that are to be of a special kind of `PupilOptic`.
+        Names of pupil planes that become a special kind of `PupilOptic`. The first stop behind a
+        mask always becomes a `MovableStop`, unless it is trainable.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For settings that do not fit the system.
     """
 
     def __init__(
@@ -90,13 +109,23 @@ class Converter:
         weights = recipe["weights"]
         given = np.ones(len(wavelengths)) if weights is None else native_float64(weights)
         self.bandpass = Bandpass(tuple(wavelengths.tolist()), tuple(np.atleast_1d(given).tolist()))
-        check_supported(osys)
         first = osys.input_wavefront(wavelengths[0] * u.m)
-        self.npix = int(first.wavefront.shape[0])
+        self.sampled = int(first.wavefront.shape[0])
+        """Samples across the pupil where poppy's optics are evaluated."""
+        self.npix = int(recipe["npix"] or self.sampled)
+        if self.npix < 1 or self.sampled % self.npix:
+            raise IncompatibleSetupError(
+                f"npix: got {self.npix}, expected a divisor of the {self.sampled} samples that "
+                "poppy has across the pupil, because planes are averaged over whole blocks"
+            )
+        self.block = self.sampled // self.npix
         self.diameter = float(first.diam.to_value(u.m))
-        sampling = recipe["occulter_sampling"]
-        self.sampling = float(osys.oversample if sampling is None else sampling)
+        sampling = float(recipe["occulter_sampling"] or osys.oversample)
+        # A whole number of samples across the image of the pupil array, rounding aside.
+        self.sampling = math.ceil(self.npix * sampling - 1e-9) / self.npix
         self.used: dict[str, str] = {}
+        self.has_stop = False
+        self.fixed: set[str] = {"npix", "device"} if recipe["trainable"] else set()
 
     def convert(self) -> Converted:
         """Go through the planes in order."""
@@ -118,7 +147,7 @@ class Converter:
                     else FreeRotation(angle, self.npix, self.diameter, optic.name)
                 )
             elif optic.planetype == PlaneType.pupil:
-                plane, centred = self._pupil(optic, turn, centred, self._between_masks(k))
+                plane, centred = self._pupil(k, turn, centred)
                 planes.append(plane)
             elif self.osys.planes[k + 1].planetype == PlaneType.image:
                 # Masks one behind the other in one image act as one.
@@ -134,6 +163,8 @@ class Converter:
             self.bandpass,
             self.used,
             [self._to_system(turn) for turn in after],
+            self.sampling,
+            frozenset(self.fixed),
         )
 
     def _turns_behind(self) -> list[Orientation]:
@@ -161,25 +192,25 @@ class Converter:
     def _wave(self, wavelength: float, padded: bool = False) -> poppy.Wavefront:
         wave = poppy.Wavefront(
             wavelength=wavelength * u.m,
-            npix=self.npix,
+            npix=self.sampled,
             diam=self.diameter * u.m,
             oversample=self.osys.oversample,
         )
         if padded:
-            wave.wavefront = np.ones((self.npix * self.osys.oversample,) * 2, dtype=complex)
+            wave.wavefront = np.ones((self.sampled * self.osys.oversample,) * 2, dtype=complex)
             wave.ispadded = True
         return wave
 
     def _entrance(self, turn: Orientation) -> OrientedPupil:
         optic = self.osys.planes[0]
-        shape = (self.npix, self.npix)
+        shape = (self.sampled, self.sampled)
         amplitude, opds = None, {}
         for wavelength in self.bandpass.wavelengths:
             wave = self._wave(wavelength)
             phasor, opd = pupil_phasor(optic, wave)
             if amplitude is None:
                 amplitude = np.broadcast_to(np.abs(phasor), shape)
-            opds[wavelength] = np.broadcast_to(opd, shape)
+            opds[wavelength] = self._averaged(np.broadcast_to(opd, shape))
         base = opds[self.bandpass.wavelengths[0]]
         chromatic = {
             w: torch.from_numpy(opd - base) for w, opd in opds.items() if (opd != base).any()
@@ -188,7 +219,7 @@ class Converter:
         r, theta = float(self.osys.source_offset_r), np.deg2rad(self.osys.source_offset_theta)
         pointing = complex(-r * np.sin(theta), r * np.cos(theta))
         return OrientedPupil(
-            torch.from_numpy(native_float64(amplitude)),
+            torch.from_numpy(native_float64(self._averaged(amplitude))),
             torch.from_numpy(native_float64(base)),
             self.diameter,
             self.dtype,
@@ -198,7 +229,19 @@ class Converter:
             (pointing.real, pointing.imag),
             chromatic,
             turned=self._free_turn(),
+            collected=float((amplitude**2).sum()) / self.block**2,
         )
+
+    def _averaged(self, array: Array) -> Array:
+        """Mean over the blocks of an array that reaches equally far on all sides of the pupil."""
+        if self.block == 1:
+            return array
+        beside = (len(array) - self.sampled) // 2
+        dropped = beside % self.block
+        count = self.npix + 2 * (beside // self.block)
+        kept = slice(dropped, dropped + count * self.block)
+        blocks = array[kept, kept].reshape(count, self.block, count, self.block)
+        return np.asarray(blocks.mean(axis=(1, 3)))
 
     def _free_turn(self) -> float:
         """Rotation of the image by planes that turn by other than right angles, degrees."""
@@ -213,9 +256,8 @@ class Converter:
                 total += optic.angle * sense
         return total
 
-    def _pupil(
-        self, optic: Any, turn: Orientation, centred: str, padded: bool
-    ) -> tuple[Plane, str]:
+    def _pupil(self, index: int, turn: Orientation, centred: str) -> tuple[Plane, str]:
+        optic, padded = self.osys.planes[index], self._between_masks(index)
         phasors: dict[float, Tensor] = {}
         latest: Array | None = None
         for wavelength in self.bandpass.wavelengths:
@@ -225,8 +267,9 @@ class Converter:
             if latest is not None and np.array_equal(phasor, latest):
                 phasors[wavelength] = phasors[self.bandpass.wavelengths[len(phasors) - 1]]
             else:
+                whole = np.broadcast_to(phasor, wave.shape)
                 phasors[wavelength] = torch.from_numpy(
-                    np.array(np.broadcast_to(phasor, wave.shape), dtype=np.complex128)
+                    np.array(self._averaged(whole), dtype=np.complex128)
                 )
             latest = phasor
         assert latest is not None
@@ -238,7 +281,13 @@ class Converter:
             and len({id(p) for p in phasors.values()}) == 1
         ):
             return Gain(optic.name, complex(latest.flat[0])), wave._image_centered
-        plane = self.kinds.get(optic.name, PupilOptic)(
+        kind = self.kinds.get(optic.name, PupilOptic)
+        behind_mask = any(p.planetype == PlaneType.image for p in self.osys.planes[:index])
+        if kind is PupilOptic and behind_mask and not (self.has_stop or trainable):
+            # An optic that leaves the amplitude alone is not a stop.
+            self.has_stop = bool(np.ptp(np.abs(latest)) > 1e-9)
+            kind = MovableStop if self.has_stop else PupilOptic
+        plane = kind(
             phasors,
             self.npix,
             self.diameter,
@@ -317,12 +366,16 @@ class Converter:
         return complement
 
     def _fourier(self, optic: Any, turn: Orientation, centred: str) -> FourierMask:
-        padding = self.sampling
-        if padding != int(padding):
-            raise IncompatibleSetupError(
-                f"occulter_sampling: the FFT for {optic.name!r} takes a whole number, got {padding}"
-            )
-        count = self.npix * int(padding)
+        padding = math.ceil(self.sampling)
+        if centred == "corner":
+            # The planes around such a mask shift the image by half of poppy's own sample.
+            self.fixed.add("occulter_sampling")
+            if padding != self.osys.oversample:
+                raise IncompatibleSetupError(
+                    f"occulter_sampling: {optic.name!r} is aligned to poppy's own samples of the "
+                    f"image, {self.osys.oversample} per lambda/D; got {padding}"
+                )
+        count = self.npix * padding
         diameter, oversample = self.diameter, self.osys.oversample
         to_system = self._to_system(turn)
 
@@ -341,7 +394,7 @@ class Converter:
             phasor = np.broadcast_to(np.asarray(optic.get_phasor(wave)), (count, count))
             return to_system.apply_to_lattice(torch.from_numpy(np.array(phasor, dtype=complex)))
 
-        return FourierMask(transmission, int(padding), self.npix, diameter, optic.name)
+        return FourierMask(transmission, padding, self.npix, diameter, optic.name)
 
     def _detector(self) -> OffsetDetector:
         detector = self.osys.planes[-1]
@@ -352,11 +405,14 @@ class Converter:
                 "that converts to 'arcsec / pix'"
             )
         arcsec = float(np.atleast_1d(scale.to_value(u.arcsec / u.pix))[0])
-        shape = tuple(int(n) for n in detector.shape)
+        wanted = self.recipe["fov_pixels"]
+        shape = tuple(np.broadcast_to(detector.shape if wanted is None else wanted, 2).tolist())
+        if min(shape) < 1:
+            raise IncompatibleSetupError(f"fov_pixels: got {wanted}, expected at least 1")
         samples = arcsec / detector.oversample
         offset = (0.0, 0.0) if detector.offset is None else tuple(detector.offset)
         return OffsetDetector(
-            shape=(shape[0], shape[1]),
+            shape=(int(shape[0]), int(shape[1])),
             pixelscale=(arcsec, arcsec),
             oversample=int(detector.oversample),
             dtype=self.dtype,

@@ -4,29 +4,39 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import poppy
 import torch
 from astropy import units as u
-from astropy.io import fits
 from poppy.poppy_core import PlaneType
+from poppy.sub_sampled_optics import Subapertures
 from torch import Tensor
 
 from pyklip_diffrender.bridges.convert import Converted, Converter
 from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres
+from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.orientation import Orientation
 from pyklip_diffrender.optics.psf_file import poppy_psf
 from pyklip_diffrender.optics.sampled_planes import PupilOptic
 from pyklip_diffrender.optics.system import OpticalSystem
 
-__all__ = ["PoppySystem", "from_poppy", "opd_to_hdus", "opd_to_poppy"]
+__all__ = ["PoppySystem", "check_supported", "from_poppy", "opd_to_poppy"]
 
 _POPPY_OPTIONS = ("display_intermediates", "progressbar")
+
+_COPIES = 4
+"""Systems with other settings that are kept: a fit asks for the same ones again and again."""
+
+_SUPPORTED = (
+    "pupil and image planes of any optic that gives a transmission and an OPD, coordinate "
+    "inversions and rotations in pupils, and a Detector at the end"
+)
 
 
 class PoppySystem(OpticalSystem):
@@ -42,6 +52,14 @@ class PoppySystem(OpticalSystem):
 
     propagation: dict[str, str]
     frames: list[Orientation]
+    _sources: ClassVar[tuple[str, ...]] = ("osys", "trainable")
+    """Arguments that make it another system, not the same one with other settings."""
+    _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
+        **OpticalSystem._replaced,
+        "wavelength": ("weights",),
+    }
+    _fixed: frozenset[str]
+    _copies: dict[frozenset[tuple[str, Any]] | None, OpticalSystem]
 
     @classmethod
     def of(
@@ -57,14 +75,58 @@ class PoppySystem(OpticalSystem):
             converted.planes,
             detector or converted.detector,
             converted.bandpass,
-            recipe=recipe,
+            recipe={**recipe, "occulter_sampling": converted.sampling},
             remake=remake,
         )
         system.propagation, system.frames = converted.propagation, converted.frames
+        system._fixed = converted.fixed
+        system._copies = {}
         return system
 
+    @property
+    def adjustable(self) -> frozenset[str]:
+        """See `OpticalSystem.adjustable`.
+
+        "npix" is not among them if planes are trainable, nor "occulter_sampling" if a mask
+        depends on poppy's own sampling of the image (four-quadrant masks).
+        """
+        return frozenset({*self.recipe, "bandpass"} - {*self._sources, *self._fixed})
+
+    def _band(self, bandpass: Bandpass) -> dict[str, Any]:
+        """Arguments of `from_poppy` for a bandpass."""
+        return {"wavelength": list(bandpass.wavelengths), "weights": list(bandpass.weights)}
+
+    def at_wavelengths(self, bandpass: Bandpass) -> OpticalSystem:
+        """See `OpticalSystem.at_wavelengths`; optics are evaluated anew where they have to be."""
+        if set(bandpass.wavelengths) <= set(self.bandpass.wavelengths):
+            return super().at_wavelengths(bandpass)
+        return self._remade(self._band(bandpass))
+
+    def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
+        # By name and value; arrays and other things that cannot be looked up are not kept.
+        key = frozenset(changes.items()) if _hashable(changes) else None
+        if key in self._copies:
+            return self._copies[key]
+        made = super()._remade(changes)
+        assert isinstance(made, PoppySystem)
+        for name, (opd, transmission) in self.trainable.items():
+            # The same tensors: what has been trained, and what will be, holds for both.
+            plane = made.plane(name)
+            plane.opd, plane.transmission = opd, transmission
+        if key is not None:
+            while len(self._copies) >= _COPIES:
+                del self._copies[next(iter(self._copies))]
+            self._copies[key] = made
+        return made
+
     def plane(self, name: str) -> Any:
-        """The plane of this name."""
+        """The plane of this name.
+
+        Raises
+        ------
+        KeyError
+            If there is none.
+        """
         planes: list[Any] = [self.entrance, *self.planes, self.detector]
         for plane in planes:
             if plane.name == name:
@@ -74,7 +136,10 @@ class PoppySystem(OpticalSystem):
 
     @property
     def trainable(self) -> dict[str, tuple[Tensor, Tensor]]:
-        """The leaf tensors (OPD change in m, transmission factor) of every trainable plane."""
+        """The leaf tensors (OPD change in m, transmission factor) of every trainable plane.
+
+        Systems that `with_fidelity` makes share them.
+        """
         return {
             plane.name: (plane.opd, plane.transmission)
             for plane in self.planes
@@ -104,18 +169,19 @@ class PoppySystem(OpticalSystem):
         wavelength : Quantity, float (m) or sequence of them, optional
             Default: the wavelengths that the system was made for.
         weight : sequence of float, optional
-            One per wavelength.
+            One per wavelength; default equal.
         source : dict, optional
             With "wavelengths" and "weights", in place of the two above.
         normalize : str
             "first", "last", "exit_pupil" or "none", as in poppy.
         return_intermediates, return_final : bool
-            Also return a list of `poppy.Wavefront`: of every pupil plane and the detector, or of
-            the detector. Summed over wavelengths as poppy does.
+            Also return a list of `poppy.Wavefront`: one for every pupil plane and the detector,
+            or the one on the detector. They are summed over wavelengths as poppy does.
         opd, **options
-            As in a call of the system; options of poppy's without a meaning here are dropped.
+            As in a call of the system. Options of poppy's that have no meaning here are dropped.
         save_intermediates, save_intermediates_what, display
-            Taken for poppy's sake. Nothing is drawn; saving asks for `return_intermediates`.
+            Accepted for compatibility with poppy. Nothing is drawn, and saving is refused with a
+            pointer to `return_intermediates`.
 
         Returns
         -------
@@ -123,7 +189,7 @@ class PoppySystem(OpticalSystem):
         """
         if save_intermediates:
             raise IncompatibleSetupError(
-                "save_intermediates: this system writes no files on its own; take "
+                "save_intermediates: this system writes no files on its own; pass "
                 "return_intermediates=True and call .writeto() on the wavefronts"
             )
         if source is not None:
@@ -140,6 +206,14 @@ class PoppySystem(OpticalSystem):
         )
 
 
+def _hashable(changes: Mapping[str, Any]) -> bool:
+    try:
+        hash(frozenset(changes.items()))
+    except TypeError:
+        return False
+    return True
+
+
 def from_poppy(
     osys: poppy.OpticalSystem,
     wavelength: Any = 1e-6 * u.m,
@@ -147,6 +221,8 @@ def from_poppy(
     *,
     propagation: str | Mapping[str, str] = "auto",
     occulter_sampling: float | None = None,
+    npix: int | None = None,
+    fov_pixels: int | tuple[int, int] | None = None,
     trainable: Collection[str] = (),
     dtype: torch.dtype = torch.float64,
     device: str | torch.device = "cpu",
@@ -157,61 +233,78 @@ def from_poppy(
     replaces the OPD of the first plane, in that plane's own frame; ``model.entrance.opd`` is the
     one it has. Source offsets of `osys` are kept, and `star_offset` adds to them.
 
+    The result can be passed to `refine` and `detect` like any other system.
+
     Parameters
     ----------
     osys : poppy.OpticalSystem
         Fraunhofer system of pupil, image and detector planes. It is not changed, and later
         changes to it do not reach the model.
     wavelength : Quantity, float (m) or sequence of them
-        Where the optics are sampled.
+        Wavelengths at which the optics are evaluated.
     weights : sequence of float, optional
         One per wavelength; default equal.
     propagation : "auto", "compact", "fft", or mapping of plane name to one of these
-        How to pass image planes: on the part of the image that the mask blocks, if that is
-        bounded, or by FFTs padded as poppy's. "auto" takes the first where it can; what was taken
-        is in ``model.propagation``.
+        How to pass image planes. "compact" evaluates a mask only where it blocks light, which
+        must be a bounded part of the image; "fft" uses FFTs padded as poppy's. "auto" takes
+        "compact" where that is possible; ``model.propagation`` says which was taken.
     occulter_sampling : float, optional
-        Lattice points per lambda/D in image planes; default ``osys.oversample``, with which the
-        model and poppy agree to rounding either way.
+        Samples per lambda/D in image planes; default ``osys.oversample``, with which the model
+        and poppy agree to rounding either way. FFTs are padded by the next whole number.
+    npix : int, optional
+        Samples across the pupil, a divisor of poppy's number: the sampled planes are averaged
+        over blocks. Default poppy's own.
+    fov_pixels : int or (ny, nx), optional
+        Detector pixels; default those of the system's detector.
     trainable : collection of str
         Names of pupil planes that get leaf tensors to train, see ``model.trainable``.
-    dtype, device
-        Of the computation.
+    dtype : torch.dtype
+        torch.float64 or torch.float32.
+    device : str or torch.device
+
+    Returns
+    -------
+    PoppySystem
 
     Raises
     ------
     IncompatibleSetupError
-        For a plane that is not supported, by name, saying what is.
+        For a plane that is not supported (the message names it, and what is), or a setting that
+        does not fit.
     """
-    recipe = {k: v for k, v in locals().items() if k != "recipe"}
-    recipe["osys"] = osys = copy.deepcopy(osys)
-    return PoppySystem.of(Converter(osys, recipe).convert(), recipe, from_poppy)
+    recipe = {k: v for k, v in locals().items() if k != "osys"}
+    check_supported(osys)
+    return _from_private(osys=copy.deepcopy(osys), **recipe)
+
+
+def _from_private(**recipe: Any) -> PoppySystem:
+    """As `from_poppy`, with a system that nobody else changes."""
+    return PoppySystem.of(Converter(recipe["osys"], recipe).convert(), recipe, _from_private)
 
 
 def opd_to_poppy(opd: Any, osys: poppy.OpticalSystem) -> poppy.OpticalSystem:
-    """A copy of a poppy system whose first plane has another OPD.
+    """Copy a poppy system and replace the OPD of its first plane.
 
     Parameters
     ----------
-    opd : Tensor, Quantity or array, (npix, npix)
-        m, frame of the first plane: for instance ``fit.opd``.
+    opd : Tensor, Quantity or array, (n, n)
+        m, frame of the first plane: for instance a refined wavefront. It is resampled to the
+        pixels of the first plane.
     osys : poppy.OpticalSystem
         Not changed.
+
+    Raises
+    ------
+    ShapeError
+        If the map is not square.
     """
     changed = copy.deepcopy(osys)
     first = changed.planes[0]
     wave = changed.input_wavefront(1e-6 * u.m)
-    transmission = np.array(np.broadcast_to(first.get_transmission(wave), wave.shape))
-    values = to_metres(opd, "opd")
-    if values.shape != transmission.shape:
-        raise IncompatibleSetupError(
-            f"opd: got shape {values.shape}, the first plane of {osys.name} has "
-            f"{transmission.shape}"
-        )
     replacement = poppy.ArrayOpticalElement(
         name=first.name,
-        transmission=transmission,
-        opd=values,
+        transmission=np.array(np.broadcast_to(first.get_transmission(wave), wave.shape)),
+        opd=resample(to_metres(opd, "opd"), wave.shape[0]),
         pixelscale=wave.pixelscale,
         planetype=PlaneType.pupil,
     )
@@ -220,12 +313,50 @@ def opd_to_poppy(opd: Any, osys: poppy.OpticalSystem) -> poppy.OpticalSystem:
     return changed
 
 
-def opd_to_hdus(opd: Any, diameter: float) -> fits.HDUList:
-    """An OPD as poppy's and stpsf's readers take it: metres, with BUNIT and PUPLSCAL."""
-    values = to_metres(opd, "opd")
-    header = fits.Header()
-    header["BUNIT"] = "m"
-    header["PUPLDIAM"] = (diameter, "[m] side of the array")
-    header["PUPLSCAL"] = (diameter / values.shape[-1], "[m / pixel]")
-    header["CONTENTS"] = "OTE OPD, entrance pupil orientation"
-    return fits.HDUList([fits.PrimaryHDU(values, header)])
+def check_supported(osys: Any) -> None:
+    """Raise `IncompatibleSetupError` for a poppy system that cannot be converted.
+
+    The message names the first plane that is not supported, and what is.
+    """
+    if isinstance(osys, poppy.FresnelOpticalSystem):
+        raise IncompatibleSetupError(
+            f"{osys.name}: Fresnel propagation is not supported. Supported are Fraunhofer "
+            f"systems (poppy.OpticalSystem) of {_SUPPORTED}"
+        )
+    if not isinstance(osys, poppy.OpticalSystem):
+        raise IncompatibleSetupError(
+            f"from_poppy: got a {type(osys).__name__}, expected a poppy.OpticalSystem. For an "
+            "Instrument, pass what its get_optical_system() returns, or use from_webbpsf"
+        )
+    if isinstance(osys, poppy.MatrixFTCoronagraph):
+        raise IncompatibleSetupError(
+            f"{osys.name}: poppy.MatrixFTCoronagraph samples its image planes in a way of its "
+            "own; convert the OpticalSystem that it was made from"
+        )
+    planes = list(osys.planes)
+    if not planes or planes[0].planetype != PlaneType.pupil:
+        raise IncompatibleSetupError(
+            f"{osys.name}: the first plane must be a pupil, got "
+            f"{planes[0] if planes else 'no planes'}. Supported are {_SUPPORTED}"
+        )
+    if not isinstance(planes[-1], poppy.Detector):
+        raise IncompatibleSetupError(
+            f"{osys.name}: the last plane must be a Detector, got {planes[-1]}. Add one with "
+            "add_detector(pixelscale=, fov_pixels=)"
+        )
+    known = (PlaneType.pupil, PlaneType.image, PlaneType.rotation, PlaneType.inversion)
+    previous = planes[0]
+    for plane in planes[:-1]:
+        if isinstance(plane, Subapertures) or plane.planetype not in known:
+            raise IncompatibleSetupError(
+                f"plane {plane.name!r} ({type(plane).__name__}, {plane.planetype}) is not "
+                f"supported. Supported are {_SUPPORTED}"
+            )
+        turning = plane.planetype in (PlaneType.rotation, PlaneType.inversion)
+        if turning and previous.planetype == PlaneType.image:
+            raise IncompatibleSetupError(
+                f"plane {plane.name!r} turns the field in the image plane {previous.name!r}, "
+                "where poppy moves it by one sample as well. Put it in front of that plane, "
+                "or behind the next pupil"
+            )
+        previous = plane

@@ -4,37 +4,35 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from astropy.io import fits
-from numpy.typing import NDArray
-from poppy.poppy_core import PlaneType
 
-from pyklip_diffrender.bridges.checks import check_opd
 from pyklip_diffrender.bridges.convert import Converter
-from pyklip_diffrender.bridges.detector import stpsf_effects
-from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
-from pyklip_diffrender.bridges.poppy import PoppySystem, opd_to_hdus
-from pyklip_diffrender.bridges.settings import (
+from pyklip_diffrender.bridges.instrument import (
     band,
     data_errors,
     kernel_files_left_open,
     oversampling,
     private_copy,
+    stpsf_effects,
 )
+from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
+from pyklip_diffrender.bridges.maps import check_opd, opd_to_hdus
+from pyklip_diffrender.bridges.poppy import PoppySystem, check_supported
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres
+from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.detector_effects import ChainDetector
-from pyklip_diffrender.optics.grid import JWST_DIAMETER
+from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.psf_file import poppy_psf, save
-from pyklip_diffrender.optics.sampled_planes import AberrationOptic, MovableStop, PupilOptic
+from pyklip_diffrender.optics.sampled_planes import AberrationOptic
+from pyklip_diffrender.optics.system import OpticalSystem
 
 __all__ = ["WebbSystem", "from_webbpsf", "opd_to_webbpsf"]
-
-Array = NDArray[np.float64]
 
 
 class WebbSystem(PoppySystem):
@@ -51,6 +49,33 @@ class WebbSystem(PoppySystem):
 
     instrument: Any
     si_wfe_flipped: bool | None
+    _sources: ClassVar[tuple[str, ...]] = ("nircam", "trainable")
+    _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
+        **PoppySystem._replaced,
+        "monochromatic": ("bandpass",),
+        "nlambda": ("bandpass", "monochromatic"),
+        "source": ("bandpass", "monochromatic"),
+        "oversample": ("detector_oversample", "fft_oversample", "occulter_sampling"),
+        "fft_oversample": ("occulter_sampling",),
+    }
+
+    @property
+    def setup(self) -> dict[str, str]:
+        """See `OpticalSystem.setup`."""
+        names = ("filter", "image_mask", "pupil_mask", "module")
+        return {name: v for name in names if (v := getattr(self.instrument, name))}
+
+    def _band(self, bandpass: Bandpass) -> dict[str, Any]:
+        """Arguments of `from_webbpsf` for a bandpass."""
+        return {"bandpass": bandpass}
+
+    def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
+        if {"fft_oversample", "detector_oversample"} <= changes.keys():
+            changes = {"oversample": None, **changes}
+        if changes.keys().isdisjoint(("bandpass", "monochromatic", "nlambda", "source")):
+            # stpsf need not work out the wavelengths once more.
+            changes = {"bandpass": self.bandpass, **changes}
+        return super()._remade(changes)
 
     def calc_psf(  # type: ignore[override]  # An instrument's arguments, not an OpticalSystem's.
         self,
@@ -75,15 +100,15 @@ class WebbSystem(PoppySystem):
     ) -> Any:
         """PSF as an HDUList, with the arguments, extensions and keywords of stpsf's `calc_psf`.
 
-        Arguments that are not given are those that the system was made with. The image is this
-        system's; jitter, distortion, detector effects and header are then added by stpsf itself.
+        Arguments that are not given keep the values that the system was made with. The image is
+        this system's; stpsf itself then adds jitter, distortion, detector effects and header.
 
         Parameters
         ----------
         opd, **parameters
             As in a call of the system, for the PSF of a refined wavefront.
         display, save_intermediates
-            Taken for stpsf's sake; nothing is drawn, and saving is not supported.
+            Accepted for compatibility with stpsf; nothing is drawn, and saving is refused.
 
         Returns
         -------
@@ -92,7 +117,7 @@ class WebbSystem(PoppySystem):
         """
         if save_intermediates:
             raise IncompatibleSetupError(
-                "save_intermediates: this system writes no files on its own; take "
+                "save_intermediates: this system writes no files on its own; pass "
                 "return_intermediates=True and call .writeto() on the wavefronts"
             )
         changes = {
@@ -106,7 +131,7 @@ class WebbSystem(PoppySystem):
             "fft_oversample": fft_oversample,
         }
         changes = {name: value for name, value in changes.items() if value is not None}
-        system: Any = self._with_changes(changes) if changes else self
+        system: Any = self.with_fidelity(**changes)
         result = poppy_psf(system, normalize, opd, **parameters)
         instrument = system.instrument
         options = {
@@ -114,7 +139,7 @@ class WebbSystem(PoppySystem):
             "add_distortion": add_distortion,
             "crop_psf": crop_psf,
             "detector_oversample": system.detector.oversample,
-            "fft_oversample": int(system.recipe_oversample[0]),
+            "fft_oversample": oversampling(system.recipe)[0],
         }
         with kernel_files_left_open():
             instrument._apply_jitter(result, options)
@@ -130,28 +155,6 @@ class WebbSystem(PoppySystem):
             )
         return result
 
-    @property
-    def recipe_oversample(self) -> tuple[int, int]:
-        """Oversampling of the image planes and of the detector."""
-        return oversampling(self.recipe)
-
-    def _with_changes(self, changes: dict[str, Any]) -> Any:
-        """Another system; one way of giving a size or a band takes the place of the other."""
-        rivals = {
-            "fov_pixels": ("fov_arcsec",),
-            "fov_arcsec": ("fov_pixels",),
-            "oversample": ("detector_oversample", "fft_oversample"),
-            "nlambda": ("monochromatic",),
-            "source": ("monochromatic",),
-        }
-        cleared: dict[str, Any] = {
-            rival: None
-            for name in changes
-            for rival in rivals.get(name, ())
-            if rival not in changes
-        }
-        return self.with_fidelity(**{**cleared, **changes})
-
 
 def from_webbpsf(
     nircam: Any,
@@ -164,20 +167,25 @@ def from_webbpsf(
     monochromatic: Any = None,
     nlambda: int | None = None,
     source: Any = None,
+    bandpass: Bandpass | None = None,
     add_distortion: bool = False,
     flip_si_wfe: bool | None = None,
     propagation: str | Mapping[str, str] = "auto",
     occulter_sampling: float | None = None,
+    npix: int | None = None,
     trainable: Collection[str] = (),
     dtype: torch.dtype = torch.float64,
     device: str | torch.device = "cpu",
 ) -> WebbSystem:
     """Make a differentiable system of a configured `stpsf.NIRCam` (or `webbpsf.NIRCam`).
 
-    It takes over filter, masks, options (source offset, pupil shift and rotation, shift of the
-    occulter, ND squares, jitter), pixel scale, OPD and internal wavefront errors with their field
-    dependence. ``model()`` is stpsf's DET_SAMP, or DET_DIST with `add_distortion`; ``model(opd)``
-    replaces the whole OPD of the telescope, and ``model.entrance.opd`` is the one it has.
+    The system has the instrument's filter, masks, options (source offset, pupil shift and
+    rotation, shift of the occulter, ND squares, jitter), pixel scale, OPD and internal wavefront
+    errors with their field dependence. ``model()`` is stpsf's DET_SAMP, or DET_DIST with
+    `add_distortion`; ``model(opd)`` replaces the whole OPD of the telescope, and
+    ``model.entrance.opd`` is the one it has.
+
+    The result can be passed to `refine` and `detect` like any other system.
 
     Parameters
     ----------
@@ -186,13 +194,20 @@ def from_webbpsf(
     fov_pixels, fov_arcsec, oversample, detector_oversample, fft_oversample, monochromatic,
     nlambda, source
         As in stpsf's `calc_psf`, with its defaults.
+    bandpass : Bandpass, optional
+        Wavelengths and weights, in place of `monochromatic`, `nlambda` and `source`.
     add_distortion : bool
         Include what stpsf adds up to DET_DIST: rotation, distortion, charge diffusion, IPC, PPC.
     flip_si_wfe : bool, optional
         Whether to flip the coronagraph's internal wavefront error vertically; default as the
-        installed stpsf does (it does from 2.2.0 on). ``model.si_wfe_flipped`` says what was done.
-    propagation, occulter_sampling, trainable, dtype, device
-        See `from_poppy`; the sampling is `fft_oversample` unless given.
+        installed stpsf does (stpsf flips it from 2.2.0 on). ``model.si_wfe_flipped`` says which.
+    propagation, occulter_sampling, npix, trainable, dtype, device
+        See `from_poppy`; the default sampling is `fft_oversample`, the default `npix` that of
+        ``nircam.pupil``.
+
+    Returns
+    -------
+    WebbSystem
 
     Raises
     ------
@@ -219,20 +234,18 @@ def from_webbpsf(
             fov_pixels=fov_pixels,
             options=instrument.options,
         )
+    check_supported(osys)
     first = osys.planes[0]
     # As it was given: the field dependence has values beside the pupil, too.
     given = getattr(first, "_opd_original", first.opd)
     check_opd(np.asarray(given), np.asarray(first.amplitude), "pupilopd")
-    flipped = _set_flip(osys, flip_si_wfe)
+    aberrations = _aberrations(osys)
+    flipped = None if aberrations is None else _set_flip(aberrations, flip_si_wfe)
     converter = Converter(
         osys,
-        {
-            **recipe,
-            "osys": osys,
-            "wavelength": wavelengths,
-            "weights": weights,
-        },
-        _kinds(osys),
+        # The detector has the field of view already.
+        {**recipe, "wavelength": wavelengths, "weights": weights, "fov_pixels": None},
+        {} if aberrations is None else {aberrations.name: AberrationOptic},
     )
     converted = converter.convert()
     detector = _with_effects(converted.detector, instrument, sampling, add_distortion)
@@ -249,35 +262,14 @@ def _aberrations(osys: Any) -> Any:
     return None
 
 
-def _set_flip(osys: Any, wanted: bool | None) -> bool | None:
-    """Flip the map of internal aberrations if it is not as wanted; say how it is."""
-    plane = _aberrations(osys)
-    if plane is None:
-        return None
+def _set_flip(plane: Any, wanted: bool | None) -> bool:
+    """Flip the map of internal aberrations if wanted; return whether it is flipped."""
     flipped = bool(getattr(plane, "_is_OPD_flipped_for_NRC_coron", False))
     if wanted is None or wanted == flipped:
         return flipped
     # The map alone: focus and tilt, which depend on the wavelength, are added to it later.
     plane.opd = plane.opd[::-1].copy()
     return wanted
-
-
-def _kinds(osys: Any) -> dict[str, type[PupilOptic]]:
-    """Pupil planes with parameters: the stop behind the occulter, the internal aberrations."""
-    kinds: dict[str, type[PupilOptic]] = {}
-    behind_mask = False
-    aberrations = _aberrations(osys)
-    for plane in osys.planes:
-        behind_mask |= plane.planetype == PlaneType.image
-        if plane is aberrations:
-            kinds[plane.name] = AberrationOptic
-        elif (
-            behind_mask
-            and plane.planetype == PlaneType.pupil
-            and MovableStop not in (kinds.values())
-        ):
-            kinds[plane.name] = MovableStop
-    return kinds
 
 
 def _with_effects(
@@ -305,36 +297,38 @@ def _with_effects(
 
 
 def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:
-    """A refined wavefront as `pupilopd` of a NIRCam object.
+    """A refined wavefront in the form of ``nircam.pupilopd``.
 
-    stpsf adds the telescope's field dependence to `pupilopd`; it is taken out here, so that the
+    stpsf adds the telescope's field dependence to `pupilopd`; it is subtracted here, so that the
     telescope as a whole has the given OPD at the position of `nircam`.
 
     Parameters
     ----------
-    opd : Tensor, Quantity or array, (npix, npix)
-        m, entrance-pupil orientation: for instance ``fit.opd``.
+    opd : Tensor, Quantity or array, (n, n)
+        m, entrance-pupil orientation: for instance a refined wavefront. It is resampled to the
+        pixels of ``nircam.pupil``.
     nircam : stpsf.NIRCam
         Not changed. Set its ``pupilopd`` to the result.
 
+    Returns
+    -------
+    HDUList
+
     Raises
     ------
-    UnitError, NonFiniteError, IncompatibleSetupError
+    UnitError, NonFiniteError, ShapeError
         If the map cannot be right.
+    CorruptFileError
+        If stpsf misses a file of its data directory.
     """
-    values = to_metres(opd, "opd")
     instrument = private_copy(nircam)
-    hdus = opd_to_hdus(values, JWST_DIAMETER)
+    with data_errors():
+        amplitude = np.asarray(instrument._get_telescope_pupil_and_aberrations().amplitude)
+    values = resample(to_metres(opd, "opd"), len(amplitude))
+    check_opd(values, amplitude, "opd")
+    hdus = opd_to_hdus(values)
     instrument.pupilopd = hdus
-    try:
-        with data_errors():
-            optic = instrument._get_telescope_pupil_and_aberrations()
-    except (AssertionError, ValueError) as error:
-        raise IncompatibleSetupError(
-            f"opd: got shape {values.shape}; stpsf does not take it with the pupil "
-            f"{instrument.pupil!r} ({error})"
-        ) from error
-    check_opd(values, np.asarray(optic.amplitude), "opd")
-    added = np.asarray(optic.opd) - values
+    with data_errors():
+        added = np.asarray(instrument._get_telescope_pupil_and_aberrations().opd) - values
     hdus[0].data = values - added
     return hdus

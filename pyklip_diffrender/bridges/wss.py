@@ -1,17 +1,18 @@
-"""Wavefront-sensing maps (WSS) as MAST archives them, turned into maps of the telescope.
+"""Maps of JWST's wavefront-sensing software (WSS) as MAST archives them.
 
 The steps are those of stpsf's `load_wss_opd`: fill the gaps, interpolate, convert microns, mask,
-and take out what is not the telescope's common wavefront: the internal aberration of the sensing
+and subtract what is not the telescope's common wavefront: the internal aberration of the sensing
 camera and the telescope's field dependence, both at the sensing field point.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import re
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import zoom
 
-from pyklip_diffrender.bridges.checks import check_opd
-from pyklip_diffrender.bridges.poppy import opd_to_hdus
+from pyklip_diffrender.bridges.maps import check_opd, opd_to_hdus
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
@@ -32,14 +32,18 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
+from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.units import native_float64, require_shape
-from pyklip_diffrender.optics.grid import JWST_DIAMETER
 
-__all__ = ["WSSMap", "interpolate_wss", "load_wss_opd", "load_wss_opd_by_date"]
+__all__ = ["EXTENSION", "interpolate_wss", "load_wss_opd", "load_wss_opd_by_date"]
 
 Array = NDArray[np.float64]
 
 _LOG = logging.getLogger(__name__)
+
+EXTENSION = "RESULT_PHASE"
+"""Name of the extension that holds the map; no other kind of file has one."""
+
 _TARGET_PHASES = {
     "NRCA3_FP1": "wss_target_phase_fp1.fits",
     "NRCA1_FP6": "wss_target_phase_fp6.fits",
@@ -47,87 +51,74 @@ _TARGET_PHASES = {
 _TO_METRES = {"um": 1e-6, "micron": 1e-6, "microns": 1e-6, "m": 1.0, "meter": 1.0, "nm": 1e-9}
 
 
-@dataclass(frozen=True)
-class WSSMap:
-    """A wavefront map of the telescope, with where it comes from.
-
-    Attributes
-    ----------
-    opd : ndarray, (npix, npix)
-        m, entrance-pupil orientation, 0 outside the pupil. The telescope's wavefront common to
-        the field; stpsf adds the field dependence where it is used.
-    epoch : Time or None
-        When the wavefront was measured.
-    name : str
-        File, or files.
-    aperture : str
-        Sensing field point.
-    history : tuple of str
-        What was done, with hashes of the files.
-    sensing_si_wfe, sensing_ote_wfe : ndarray or None
-        What was taken out, m.
-    """
-
-    opd: Array
-    epoch: Time | None
-    name: str
-    aperture: str
-    history: tuple[str, ...] = ()
-    sensing_si_wfe: Array | None = field(default=None, repr=False)
-    sensing_ote_wfe: Array | None = field(default=None, repr=False)
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
-        return np.array(self.opd, dtype=dtype)
-
-    def hdus(self) -> fits.HDUList:
-        """For ``nircam.pupilopd``, or for a file that every reader of OPDs takes."""
-        hdus = opd_to_hdus(self.opd, JWST_DIAMETER)
-        header = hdus[0].header
-        header["APERNAME"] = (self.aperture, "Sensing field point")
-        header["WSSFILE"] = self.name
-        if self.epoch is not None:
-            header["DATE-OBS"], header["TIME-OBS"] = self.epoch.isot.split("T")
-        for line in self.history:
-            header.add_history(line)
-        return hdus
-
-
 def load_wss_opd(
-    path: str | os.PathLike[str], *, npix: int = 1024, backout_si_wfe: bool = True
-) -> WSSMap:
+    path: str | os.PathLike[str],
+    *,
+    npix: int | None = None,
+    backout_si_wfe: bool | None = None,
+) -> OPDMap:
     """Read a wavefront-sensing file.
 
     Parameters
     ----------
     path : path
         File as MAST has it, such as ``R2022081102-NRCA3_FP1-1.fits``.
-    npix : int
-        Samples across the map; one that stpsf has a pupil for if the sensing terms are taken out.
-    backout_si_wfe : bool
-        Take out the sensing camera's aberration and the telescope's field dependence at the
-        sensing field point, with stpsf's models. False keeps the measured sum.
+    npix : int, optional
+        Samples across the map. To subtract the sensing terms, stpsf's data must hold a pupil with
+        as many. Default 1024, or as many as the finest pupil in stpsf's data has.
+    backout_si_wfe : bool, optional
+        Subtract the sensing camera's aberration and the telescope's field dependence at the
+        sensing field point, with stpsf's models. False keeps the measured sum. By default they
+        are subtracted where stpsf and its data are installed (``STPSF_PATH``); otherwise the sum
+        is kept, with a warning.
+
+    Returns
+    -------
+    OPDMap
+        The telescope's wavefront common to the field; stpsf adds the field dependence at the
+        position of an instrument when it is used there. 0 outside the pupil.
 
     Raises
     ------
     CorruptFileError
         If it is not such a file, or stpsf's data are incomplete.
-    UnitError
-        If the values cannot be microns.
+    IncompatibleSetupError
+        If its unit is not a length, or stpsf is needed and not installed.
+    UnitError, NonFiniteError
+        If the values cannot be a wavefront in that unit.
+
+    Warns
+    -----
+    DiffrenderWarning
+        If the sensing terms are kept because stpsf's models are not available, or if the map
+        seems to be flipped.
+
+    Notes
+    -----
+    At NRCA3_FP1, where most maps are sensed, the terms have 27 nm rms (field dependence of the
+    telescope) and 22 nm rms (NIRCam) in the models of stpsf 2.2. With them a map typically has
+    63 nm rms where the telescope alone has 54 nm rms.
     """
     path = Path(path)
     with open_fits(path) as hdus:
-        if "RESULT_PHASE" not in hdus:
+        if EXTENSION not in hdus:
             raise CorruptFileError(
-                f"{path}: no extension RESULT_PHASE; those there are are "
-                f"{[hdu.name for hdu in hdus]}. Expected a wavefront-sensing product of MAST"
+                f"{path}: no extension {EXTENSION}, but {[hdu.name for hdu in hdus]}. Expected a "
+                "wavefront-sensing product of MAST"
             )
-        coarse = native_float64(hdus["RESULT_PHASE"].data)
-        header, unit = hdus[0].header.copy(), hdus["RESULT_PHASE"].header.get("BUNIT", "micron")
-    require_shape(coarse, (None, None), f"{path}: RESULT_PHASE", "It must be an image")
+        coarse = native_float64(hdus[EXTENSION].data)
+        header, unit = hdus[0].header.copy(), hdus[EXTENSION].header.get("BUNIT", "micron")
+    require_shape(coarse, (None, None), f"{path}: {EXTENSION}", "It must be an image")
     if unit.strip().lower() not in _TO_METRES:
-        raise IncompatibleSetupError(f"{path}: RESULT_PHASE has BUNIT={unit!r}, expected 'micron'")
+        raise IncompatibleSetupError(f"{path}: {EXTENSION} has BUNIT={unit!r}, expected 'micron'")
+    if not coarse.any():
+        raise CorruptFileError(
+            f"{path}: all values of {EXTENSION} are zero, expected a measured wavefront. Fetch "
+            "the file again"
+        )
+    npix = npix or _finest_pupil()
     aperture = header.get("APERNAME", "")
-    pupil = _pupil(npix, required=backout_si_wfe)
+    pupil = _pupil(npix, required=backout_si_wfe is True)
     opd = _interpolated(_gaps_filled(coarse), npix) * _TO_METRES[unit.strip().lower()]
     history = [
         f"{path.name} sha256 {sha256(path)}",
@@ -135,28 +126,41 @@ def load_wss_opd(
     ]
     check_opd(np.where(_drawn(coarse, npix), opd, 0), pupil, str(path))
     opd = opd * pupil
-    si_wfe = ote_wfe = None
-    if backout_si_wfe:
-        if not aperture:
-            raise CorruptFileError(
-                f"{path}: no APERNAME in the primary header, so the sensing camera's aberration "
-                "cannot be taken out. Pass backout_si_wfe=False to keep the sum"
-            )
-        si_wfe, ote_wfe, source = _sensing_terms(aperture, opd, npix)
-        opd = opd - (si_wfe + ote_wfe) * pupil
-        history.append(f"subtracted SI WFE ({source}) and OTE field dependence at {aperture}")
-    epoch = _epoch(header, path.name)
-    return WSSMap(opd, epoch, path.name, aperture, tuple(history), si_wfe, ote_wfe)
+    if backout_si_wfe is not False:
+        try:
+            terms, source = _sensing_terms(aperture, opd, npix, path.name)
+        except (CorruptFileError, IncompatibleSetupError) as error:
+            if backout_si_wfe:
+                raise
+            _warn_of_terms(path.name, error)
+            history.append("kept SI WFE and OTE field dependence at the sensing field point")
+        else:
+            opd = opd - terms * pupil
+            history.append(f"subtracted SI WFE ({source}) and OTE field dependence at {aperture}")
+    date = _date(header, path.name)
+    return OPDMap(opd, date, path.name, sha256(path), aperture, tuple(history))
+
+
+def _warn_of_terms(name: str, reason: Exception) -> None:
+    warnings.warn(
+        f"{name}: the map is what the sensing camera saw. It contains that camera's own "
+        "aberration and the telescope's field dependence at the sensing field point, typically "
+        "63 nm rms in all where the telescope alone has 54 nm rms, because stpsf's models of them "
+        f"are not available ({reason}). A refinement with a wide enough prior corrects for it; "
+        "load_wss_opd(path, backout_si_wfe=False) keeps the terms without this warning",
+        DiffrenderWarning,
+        stacklevel=4,
+    )
 
 
 def load_wss_opd_by_date(
     date: str | Time,
     choice: str = "closest",
     *,
-    npix: int = 1024,
-    backout_si_wfe: bool = True,
+    npix: int | None = None,
+    backout_si_wfe: bool | None = None,
     folder: str | os.PathLike[str] | None = None,
-) -> WSSMap:
+) -> OPDMap:
     """Read the wavefront-sensing map of a date, through stpsf's own retrieval from MAST.
 
     Parameters
@@ -164,13 +168,21 @@ def load_wss_opd_by_date(
     date : str (ISO, UTC) or Time
     choice : "closest", "before", "after" or "interpolate"
         Which measurement; the last interpolates linearly between the two around the date.
+    npix, backout_si_wfe
+        See `load_wss_opd`.
     folder : path, optional
         Where downloads are kept; default stpsf's own cache.
+
+    Returns
+    -------
+    OPDMap
 
     Raises
     ------
     MissingOPDError
-        If MAST cannot be reached or has none.
+        If MAST cannot be reached, or has no map.
+    IncompatibleSetupError
+        For another `choice`, or if stpsf is not installed.
     """
     if choice not in ("closest", "before", "after", "interpolate"):
         raise IncompatibleSetupError(
@@ -195,8 +207,13 @@ def load_wss_opd_by_date(
     return maps[0] if len(maps) == 1 else interpolate_wss(maps[0], maps[1], when)
 
 
-def interpolate_wss(before: WSSMap, after: WSSMap, date: str | Time) -> WSSMap:
+def interpolate_wss(before: OPDMap, after: OPDMap, date: str | Time) -> OPDMap:
     """Interpolate linearly in time between two maps.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If a map has no date, or the date is not between theirs.
 
     Warns
     -----
@@ -204,38 +221,38 @@ def interpolate_wss(before: WSSMap, after: WSSMap, date: str | Time) -> WSSMap:
         Always: segments move in steps, and nobody measured this wavefront.
     """
     when = Time(date)
-    if before.epoch is None or after.epoch is None:
+    if before.date is None or after.date is None:
         raise IncompatibleSetupError(
             f"{before.name}, {after.name}: both need a date to interpolate between them"
         )
-    if not before.epoch <= when <= after.epoch or before.epoch == after.epoch:
+    if not before.date <= when <= after.date or before.date == after.date:
         raise IncompatibleSetupError(
-            f"{when.isot} is not between {before.epoch.isot} and {after.epoch.isot}"
+            f"{when.isot} is not between {before.date.isot} and {after.date.isot}"
         )
-    share = float((when - before.epoch).jd / (after.epoch - before.epoch).jd)
+    share = float((when - before.date).jd / (after.date - before.date).jd)
     warnings.warn(
         f"the wavefront of {when.isot} is an interpolation, {1 - share:.0%} of {before.name} and "
         f"{share:.0%} of {after.name}: not a measurement, and blind to steps in between",
         DiffrenderWarning,
         stacklevel=2,
     )
+    data = (1 - share) * before.data + share * after.data
     return replace(
         before,
-        opd=(1 - share) * before.opd + share * after.opd,
-        epoch=when,
+        data=data,
+        date=when,
         name=f"{before.name} + {after.name}",
+        sha256=hashlib.sha256(data.tobytes()).hexdigest(),
         history=(
             *before.history,
             *after.history,
             f"interpolated linearly in time: {1 - share:.6f} and {share:.6f} of the two",
         ),
-        sensing_si_wfe=None,
-        sensing_ote_wfe=None,
     )
 
 
 def _gaps_filled(opd: Array) -> Array:
-    """Blank samples next to valid ones become the mean of their valid neighbours."""
+    """Replace blank samples next to valid ones by the mean of their valid neighbours."""
     valid = opd != 0
     total, count = np.zeros_like(opd), np.zeros_like(opd)
     for dy in (-1, 0, 1):
@@ -247,11 +264,11 @@ def _gaps_filled(opd: Array) -> Array:
 
 
 def _interpolated(opd: Array, npix: int) -> Array:
-    """Cubic spline onto `npix` samples, as stpsf places them.
+    """Interpolate to `npix` samples by a cubic spline, placed as stpsf places them.
 
     Output sample i is taken at ``i dim / npix`` on the input's index, not at the same place in the
     pupil: the map moves by (1 - dim / npix) / 2 input samples. stpsf's maps have that shift, and
-    those that are compared with them need it.
+    maps that are compared with them need it.
     """
     index = np.arange(len(opd), dtype=float)
     wanted = np.arange(npix) * (len(opd) / npix)
@@ -259,7 +276,7 @@ def _interpolated(opd: Array, npix: int) -> Array:
 
 
 def _drawn(coarse: Array, npix: int) -> NDArray[np.bool_]:
-    """Where the map has values, on the output's samples."""
+    """Where the map has values, on the samples of the output."""
     index = (np.arange(npix) * len(coarse)) // npix
     return (coarse != 0)[np.ix_(index, index)]
 
@@ -282,8 +299,16 @@ def _data_folder() -> Path | None:
     return Path(folder) if folder else None
 
 
+def _finest_pupil() -> int:
+    """Samples across the finest pupil in stpsf's data; 1024 without such data."""
+    folder = _data_folder()
+    names = [] if folder is None else [path.name for path in folder.glob("jwst_pupil_RevW_npix*")]
+    found = [re.search(r"npix(\d+)\.fits", name) for name in names]
+    return max((int(each[1]) for each in found if each), default=1024)
+
+
 def _pupil(npix: int, required: bool) -> Array:
-    """1 inside the pupil: stpsf's where its data are, else the embedded outlines."""
+    """1 inside the pupil: stpsf's where its data are, otherwise the embedded outlines."""
     folder = _data_folder()
     for ending in ("fits.gz", "fits"):
         path = None if folder is None else folder / f"jwst_pupil_RevW_npix{npix}.{ending}"
@@ -298,15 +323,24 @@ def _pupil(npix: int, required: bool) -> Array:
     return native_float64(jwst_pupil(npix) > 0)
 
 
-def _sensing_terms(aperture: str, opd: Array, npix: int) -> tuple[Array, Array, str]:
-    """What the sensing camera adds: its own aberration, the telescope's field dependence; m."""
-    stpsf = _stpsf("to take out the sensing terms")
+def _sensing_terms(aperture: str, opd: Array, npix: int, name: str) -> tuple[Array, str]:
+    """The sensing camera's aberration and the telescope's field dependence, m, and its source."""
+    if not aperture:
+        raise CorruptFileError(
+            f"{name}: no APERNAME in the primary header, so the sensing camera is not known. Pass "
+            "backout_si_wfe=False to keep the sum"
+        )
     folder = _data_folder()
-    assert folder is not None  # _pupil has read from it.
+    if folder is None:
+        raise CorruptFileError(
+            "STPSF_PATH is not set. Set it to the complete stpsf data files, or pass "
+            "backout_si_wfe=False"
+        )
+    stpsf = _stpsf("to subtract the sensing terms")
     try:
         instrument = stpsf.instrument(aperture[:3])
         instrument.pupil = str(next(folder.glob(f"jwst_pupil_RevW_npix{npix}.fits*")))
-        instrument.pupilopd = opd_to_hdus(opd, JWST_DIAMETER)
+        instrument.pupilopd = opd_to_hdus(opd)
         instrument.set_position_from_aperture_name(aperture)
         if aperture in _TARGET_PHASES:
             source = _TARGET_PHASES[aperture]
@@ -322,20 +356,20 @@ def _sensing_terms(aperture: str, opd: Array, npix: int) -> tuple[Array, Array, 
             f"the models of stpsf for {aperture!r} could not be read from {folder} ({error}). "
             "STPSF_PATH must hold the complete stpsf data files"
         ) from error
-    if npix != 1024 and len(si_wfe) != npix:
-        si_wfe = native_float64(zoom(si_wfe, npix / 1024))
-    return si_wfe, ote_wfe, source
+    if len(si_wfe) != npix:
+        si_wfe = native_float64(zoom(si_wfe, npix / len(si_wfe)))
+    return si_wfe + ote_wfe, source
 
 
-def _epoch(header: Any, name: str) -> Time | None:
-    """When it was measured: from the header, or to the day from the name."""
+def _date(header: fits.Header, name: str) -> Time | None:
+    """When the wavefront was measured: from the header, or to the day from the file's name."""
     if "DATE-OBS" in header:
-        epoch = f"{header['DATE-OBS']}T{header.get('TIME-OBS', '00:00:00')}"
+        date = f"{header['DATE-OBS']}T{header.get('TIME-OBS', '00:00:00')}"
         try:
-            return Time(epoch, scale="utc")
+            return Time(date, scale="utc")
         except ValueError as error:
             raise CorruptFileError(
-                f"{name}: DATE-OBS and TIME-OBS are {epoch!r}, expected such as "
+                f"{name}: DATE-OBS and TIME-OBS are {date!r}, expected such as "
                 "'2022-08-11T01:02:03'. Correct the header, or fetch the file again"
             ) from error
     found = re.match(r"[A-Z](\d{4})(\d{2})(\d{2})\d{2}-", name)

@@ -114,7 +114,8 @@ class Templates:
         offsets = torch.from_numpy(self.grid[rows, columns])
         images = {}
         for k, frame in self.frames.items():
-            if self._aligned(k):
+            # Calls of the model are faster on a coarse pupil.
+            if self._aligned(k) and self._points(k).route == "lattice":
                 sources = self._points(k).images(rows, columns)
             else:
                 sources = self._many(frame, self._turned(k, offsets))

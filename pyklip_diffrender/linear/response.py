@@ -72,7 +72,8 @@ def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     npix = coarse_npix(model, npix)
     if npix == model.npix:
         return model
-    return model.with_fidelity(npix=npix, occulter_sampling=_CELLS, dtype=torch.float32)
+    coarser = {"npix": npix, "occulter_sampling": _CELLS, "dtype": torch.float32}
+    return model.with_fidelity(**{k: v for k, v in coarser.items() if k in model.adjustable})
 
 
 def downsample(opd: Tensor, npix: int) -> Tensor:
@@ -166,7 +167,7 @@ class WavefrontResponse:
             ):
                 stop = min(start + batch, len(basis))
                 sampled = basis.modes(full, start, stop)
-                modes = full.crop(sampled, window).to(model.device, coarse.dtype)
+                modes = coarse.entrance.on_window(sampled).to(model.device, coarse.dtype)
                 for kept, wavefront in zip(self.fields, pupils, strict=True):
                     # d(exp(i k OPD)) = i k exp(i k OPD) d(OPD), for 1 nm.
                     wavenumber = 2 * math.pi / wavefront.wavelength * NANOMETRE

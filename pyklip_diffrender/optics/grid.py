@@ -11,14 +11,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.io.units import ARCSEC, native_float64
 
 __all__ = [
     "JWST_DIAMETER",
     "PupilGrid",
     "polygon_coverage",
+    "resample",
     "samples_for_field",
     "transform_polygons",
     "widen_polygon",
@@ -128,6 +131,48 @@ def samples_for_field(field: float, wavelength: float, diameter: float = JWST_DI
         m; the shortest wavelength, and the side of the pupil array.
     """
     return math.ceil(field * ARCSEC * diameter / wavelength)
+
+
+def resample(opd: NDArray[np.float64], npix: int, name: str = "opd") -> NDArray[np.float64]:
+    """Resample square pupil maps to another number of pixels across the same pupil.
+
+    Blocks are averaged where the numbers of pixels divide; otherwise the map is interpolated
+    bilinearly, after smoothing if the new pixels are larger. A map that has the wanted size
+    already is returned as it is, not copied.
+
+    Parameters
+    ----------
+    opd : ndarray, (..., n, n)
+        Real values.
+    npix : int
+    name : str
+        What the map is, for the message.
+
+    Returns
+    -------
+    ndarray, (..., npix, npix), float64
+
+    Raises
+    ------
+    ShapeError
+        If the maps are not square.
+    """
+    if opd.ndim < 2 or opd.shape[-1] != opd.shape[-2] or not opd.size:
+        raise ShapeError(
+            f"{name}: got shape {opd.shape}, expected square maps, (..., npix, npix), whose sides "
+            "are those of the pupil array. Pad what is missing with zeros"
+        )
+    count = opd.shape[-1]
+    if npix == count:
+        return opd
+    maps = torch.from_numpy(native_float64(opd)).reshape(-1, 1, count, count)
+    if count % npix == 0:
+        maps = torch.nn.functional.avg_pool2d(maps, count // npix)
+    else:
+        maps = torch.nn.functional.interpolate(
+            maps, size=(npix, npix), mode="bilinear", align_corners=False, antialias=True
+        )
+    return np.asarray(maps.reshape(*opd.shape[:-2], npix, npix).numpy())
 
 
 def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:

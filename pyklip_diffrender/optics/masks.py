@@ -20,7 +20,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.planes import Values, Wavefront
+from pyklip_diffrender.optics.planes import CompactOcculter, Values, Wavefront
 
 __all__ = ["Box", "BoxPart", "FourierMask", "MaskPart", "SampledOcculter", "SeparablePart"]
 
@@ -210,6 +210,30 @@ class SampledOcculter:
                 blocked = part.cells(wavefront, spacing)[2]
                 return field * (1 - blocked.to(field)), spacing
         raise IncompatibleSetupError(f"{self.name} has no part in a box to look at")
+
+    def compact(
+        self, wavelength: float, dtype: torch.dtype, device: torch.device
+    ) -> CompactOcculter | None:
+        """The first part as a `CompactOcculter`, without the other parts.
+
+        None if that part has no box, or changes the phase of the light.
+        """
+        part = self.parts[0]
+        if not isinstance(part, BoxPart):
+            return None
+        left, right, bottom, top = part.box
+        x = torch.linspace(left, right, 65, dtype=torch.float64)
+        y = torch.linspace(bottom, top, 65, dtype=torch.float64)
+        if bool((part.complement(x[None, :], y[:, None], wavelength).imag != 0).any()):
+            return None
+
+        def complement(x: Tensor, y: Tensor) -> Tensor:
+            return part.complement(x, y, wavelength).real
+
+        radius = max(map(abs, part.box))
+        return CompactOcculter(
+            complement, radius, self.sampling, self.diameter, dtype, device, self.name
+        )
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Subtract what every part takes away."""

@@ -118,6 +118,10 @@ class EntrancePupil:
         self.lit = amplitude > 0
         """Where light passes, (npix, npix)."""
 
+    def on_window(self, maps: Tensor) -> Tensor:
+        """OPD maps (..., npix, npix) on the samples of the field, (..., rows, columns)."""
+        return self.full.crop(maps, self.grid)
+
     def field(self, opd: Tensor, wavelength: float, star_offset: Tensor | None) -> Wavefront:
         """The field behind the pupil.
 
@@ -130,7 +134,7 @@ class EntrancePupil:
         star_offset : Tensor, (..., 2), or None
             arcsec, image orientation; None on the axis.
         """
-        opd = self.full.crop(opd, self.grid)
+        opd = self.on_window(opd)
         wavenumber = 2 * math.pi / wavelength
         amplitude = self.amplitude
         if opd.is_complex():

@@ -1,4 +1,4 @@
-"""PSFs as poppy and stpsf give them: HDULists with their extensions and keywords."""
+"""PSFs in the form that poppy and stpsf give them: HDULists with their extensions and keywords."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from pyklip_diffrender import __version__
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import write_fits
 
-__all__ = ["NORMALIZATIONS", "bin_down", "normalised_samples", "poppy_psf", "recipe_psf", "save"]
+__all__ = ["instrument_psf", "poppy_psf", "save"]
 
 Array = NDArray[np.float64]
 
-NORMALIZATIONS = ("first", "last", "exit_pupil", "none")
+_NORMALIZATIONS = ("first", "last", "exit_pupil", "none")
 
 
 class System(Protocol):
-    """What is needed of an optical system, see `optics.OpticalSystem`."""
+    """The part of `optics.system.OpticalSystem` that is used here."""
 
     entrance: Any
     planes: tuple[Any, ...]
@@ -34,11 +34,18 @@ class System(Protocol):
     bandpass: Any
     recipe: dict[str, Any]
 
+    @property
+    def setup(self) -> dict[str, str]:
+        """Filter and masks."""
+
     def opd(self, opd: Any) -> Tensor:
         """OPD as a tensor."""
 
     def values(self, given: dict[str, Any]) -> dict[str, Tensor]:
         """Parameters as tensors."""
+
+    def fields(self, opd: Any = None, **parameters: Any) -> list[Tensor]:
+        """Field on the detector's samples at each wavelength."""
 
     def pupil_field(self, opd: Tensor, wavelength: float, values: Any) -> Any:
         """Field behind the entrance pupil."""
@@ -47,42 +54,47 @@ class System(Protocol):
         """Windows of the planes."""
 
 
-def normalised_samples(system: System, normalize: str, opd: Any = None, **parameters: Any) -> Array:
-    """Light on the detector's samples, before binning, in one of poppy's normalisations.
+def _samples(system: System, normalize: str, opd: Any, parameters: dict[str, Any]) -> Array:
+    """Light on the detector's samples, before binning, (oversample ny, oversample nx).
 
-    Parameters
-    ----------
-    normalize : str
-        What adds up to 1 at every wavelength: the light behind the "first" plane, on the "last",
-        in the "exit_pupil"; or "none", for a field of 1 where the pupil is clear.
-
-    Returns
-    -------
-    ndarray, (oversample ny, oversample nx)
+    `normalize` says what adds up to 1 at every wavelength: the light behind the "first" plane, on
+    the "last", or in the "exit_pupil"; with "none" the field is 1 where the pupil is clear.
     """
-    if normalize.lower() not in NORMALIZATIONS:
-        raise IncompatibleSetupError(
-            f"normalize: got {normalize!r}, expected one of {', '.join(NORMALIZATIONS)}"
-        )
     kind = normalize.lower()
+    if kind not in _NORMALIZATIONS:
+        raise IncompatibleSetupError(
+            f"normalize: got {normalize!r}, expected one of {', '.join(_NORMALIZATIONS)}"
+        )
     total = np.zeros(())
     with torch.no_grad():
-        tensor, values = system.opd(opd), system.values(parameters)
-        for wavelength, weight in zip(
-            system.bandpass.wavelengths, system.bandpass.weights, strict=True
+        tensor = system.opd(opd)
+        for field, wavelength, weight in zip(
+            system.fields(tensor, **parameters),
+            system.bandpass.wavelengths,
+            system.bandpass.weights,
+            strict=True,
         ):
-            wavefront = system.pupil_field(tensor, wavelength, values)
-            for plane, onto in zip(system.planes, system.windows(values), strict=True):
-                wavefront = plane.apply(wavefront, values, onto)
-            light = system.detector.field(wavefront, values).abs() ** 2
+            light = field.abs() ** 2
             if kind == "last":
                 light = light / light.sum()
             elif kind == "exit_pupil":
-                light = light / ((wavefront.field.abs() ** 2).sum() * wavefront.grid.spacing**2)
+                light = light / _exit_light(system, tensor, wavelength, parameters)
             elif kind == "none":
                 light = light * system.entrance.total
             total = total + weight * light.double().cpu().numpy()
     return np.asarray(total, dtype=np.float64)
+
+
+def _exit_light(
+    system: System, opd: Tensor, wavelength: float, parameters: dict[str, Any]
+) -> Tensor:
+    """Share of the light that reaches the last pupil."""
+    values = system.values(parameters)
+    wavefront = system.pupil_field(opd, wavelength, values)
+    for plane, onto in zip(system.planes, system.windows(values), strict=True):
+        wavefront = plane.apply(wavefront, values, onto)
+    light: Tensor = (wavefront.field.abs() ** 2).sum() * wavefront.grid.spacing**2
+    return light
 
 
 def _propagations(system: System) -> str:
@@ -134,19 +146,22 @@ def _header(system: System, normalize: str, header: fits.Header) -> None:
 def poppy_psf(
     system: System, normalize: str = "first", opd: Any = None, **parameters: Any
 ) -> fits.HDUList:
-    """What `poppy.OpticalSystem.calc_psf` returns: one oversampled image."""
-    hdu = fits.PrimaryHDU(normalised_samples(system, normalize, opd, **parameters))
+    """The return value of `poppy.OpticalSystem.calc_psf`: one oversampled image.
+
+    Parameters
+    ----------
+    system : OpticalSystem
+    normalize : "first", "last", "exit_pupil" or "none"
+        As in poppy.
+    opd, **parameters
+        As in a call of the system.
+    """
+    hdu = fits.PrimaryHDU(_samples(system, normalize, opd, parameters))
     _header(system, normalize, hdu.header)
     return fits.HDUList([hdu])
 
 
-def bin_down(image: Array, factor: int) -> Array:
-    """Sum blocks of `factor` by `factor` samples."""
-    ny, nx = image.shape
-    return image.reshape(ny // factor, factor, nx // factor, factor).sum(axis=(1, 3))
-
-
-def recipe_psf(
+def instrument_psf(
     system: System,
     normalize: str = "first",
     outfile: str | os.PathLike[str] | None = None,
@@ -154,34 +169,51 @@ def recipe_psf(
     opd: Any = None,
     **parameters: Any,
 ) -> fits.HDUList:
-    """What `poppy.Instrument.calc_psf` returns: the samples, and the pixels they fall into.
+    """The return value of `poppy.Instrument.calc_psf`: samples, and the pixels they fall into.
 
     Parameters
     ----------
+    system : OpticalSystem
+    normalize : "first", "last", "exit_pupil" or "none"
+        As in poppy.
+    outfile : path, optional
+        Write the result there.
+    overwrite : bool
     opd, **parameters
-        Of the call of the system.
+        As in a call of the system.
 
     Returns
     -------
     HDUList
         Extensions OVERSAMP and DET_SAMP.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For another normalisation.
+    FileExistsError
+        If the file exists and must not be overwritten.
     """
     factor = system.detector.oversample
-    primary = fits.PrimaryHDU(normalised_samples(system, normalize, opd, **parameters))
+    primary = fits.PrimaryHDU(_samples(system, normalize, opd, parameters))
     header = primary.header
     _header(system, normalize, header)
     header["EXTNAME"] = ("OVERSAMP", "This extension is oversampled.")
     now = datetime.datetime.now(datetime.UTC)
     header["DATE"] = (f"{now:%Y-%m-%dT%H:%M:%S}", "Date of calculation")
-    for name, (argument, comment) in _RECIPE_KEYWORDS.items():
-        value = system.recipe.get(argument)
-        if value is not None and not isinstance(value, tuple):
-            header[name] = (value, comment)
-    if "filter" in system.recipe:
+    for name, (key, comment) in _SETUP_KEYWORDS.items():
+        if key in system.setup:
+            header[name] = (system.setup[key], comment)
+    sampling = system.recipe.get("occulter_sampling")
+    if sampling is not None:
+        header["OVERSAMP"] = (sampling, "Oversampling factor for FFTs in computation")
+    if "filter" in system.setup:
         header["INSTRUME"] = ("NIRCam", "Instrument")
     header["PUPILOPD"] = ("NONE - perfect telescope! " if opd is None else "OPD of the call",
                           "Pupil OPD source")  # fmt: skip
-    detector = fits.ImageHDU(bin_down(primary.data, factor), header.copy())
+    ny, nx = system.detector.shape
+    pixels = primary.data.reshape(ny, factor, nx, factor).sum(axis=(1, 3))
+    detector = fits.ImageHDU(pixels, header.copy())
     detector.header["EXTNAME"] = "DET_SAMP"
     detector.header["OVERSAMP"] = (1, "These data are rebinned to detector pixels")
     detector.header["CALCSAMP"] = (factor, "This much oversampling used in calculation")
@@ -191,21 +223,20 @@ def recipe_psf(
     return hdus
 
 
-_RECIPE_KEYWORDS = {
+_SETUP_KEYWORDS = {
     "FILTER": ("filter", "Filter name"),
     "CORONMSK": ("image_mask", "Image plane mask"),
     "PUPIL": ("pupil_mask", "Pupil plane mask"),
-    "OVERSAMP": ("occulter_sampling", "Oversampling factor for FFTs in computation"),
 }
 
 
 def save(hdus: fits.HDUList, outfile: str | os.PathLike[str] | None, overwrite: bool) -> None:
-    """Write a PSF if a file is asked for.
+    """Write a PSF to a file, or do nothing if `outfile` is None.
 
     Raises
     ------
     FileExistsError
-        If it is there and must not be overwritten.
+        If the file exists and must not be overwritten.
     """
     if outfile is None:
         return
@@ -213,6 +244,6 @@ def save(hdus: fits.HDUList, outfile: str | os.PathLike[str] | None, overwrite: 
         raise FileExistsError(f"{outfile} exists; pass overwrite=True, or another outfile")
     hdus[0].header["FILENAME"] = (os.path.basename(outfile), "Name of this file")
     with warnings.catch_warnings():
-        # Some comments of stpsf's are longer than a card.
+        # Some of stpsf's comments are longer than a card.
         warnings.filterwarnings("ignore", "Card is too long", VerifyWarning)
         write_fits(hdus, outfile)

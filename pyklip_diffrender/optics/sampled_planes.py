@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.differentiation import is_plain
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.orientation import Orientation
 from pyklip_diffrender.optics.planes import EntrancePupil, Values, Wavefront
@@ -48,6 +50,9 @@ class OrientedPupil(EntrancePupil):
     turned : float
         How far planes behind turn the image, degrees counter-clockwise; a source is tilted the
         other way, so that it ends up where it was asked for.
+    collected : float, optional
+        Sum of the squared amplitude of the true pupil, in units of a sample's area. By default
+        that of `amplitude`; samples that are means over partly blocked areas have less.
     """
 
     def __init__(
@@ -62,10 +67,16 @@ class OrientedPupil(EntrancePupil):
         pointing: tuple[float, float] = (0.0, 0.0),
         chromatic: Mapping[float, Tensor] | None = None,
         turned: float = 0.0,
+        collected: float | None = None,
     ) -> None:
         array = orientation.apply(amplitude).contiguous().to(device)
         super().__init__(array, diameter, dtype, name)
+        if collected is not None:
+            self.amplitude = self.amplitude * math.sqrt(self.total / collected)
+            self.total = collected
         self.opd = opd.to(device, torch.float64)
+        self.lit = (amplitude > 0).to(device)
+        """Where light passes, (npix, npix), in the frame of the OPD."""
         self.orientation = orientation
         self.pointing = torch.tensor(pointing, dtype=torch.float64, device=device)
         self.chromatic = {w: extra.to(device) for w, extra in (chromatic or {}).items()}
@@ -76,13 +87,17 @@ class OrientedPupil(EntrancePupil):
             device=device,
         )
 
+    def on_window(self, maps: Tensor) -> Tensor:
+        """See `EntrancePupil.on_window`; the maps have the frame of the entrance pupil."""
+        return super().on_window(self.orientation.apply(maps))
+
     def field(self, opd: Tensor, wavelength: float, star_offset: Tensor | None) -> Wavefront:
         """See `EntrancePupil.field`; `opd` has the frame of the entrance pupil."""
         if wavelength in self.chromatic:
             opd = opd + self.chromatic[wavelength]
         offset = self.pointing if star_offset is None else star_offset + self.pointing
         offset = offset @ self._tilt
-        return super().field(self.orientation.apply(opd), wavelength, offset)
+        return super().field(opd, wavelength, offset)
 
 
 class PupilOptic:
@@ -155,24 +170,24 @@ class PupilOptic:
 class MovableStop(PupilOptic):
     """A stop known from its samples only, that can be shifted and turned.
 
-    At rest the samples are taken as they are. Elsewhere they are interpolated with cubic
-    polynomials, which shifts by whole samples leave exact. Parameters as of `planes.LyotStop`.
+    At rest the samples are taken as they are. Elsewhere they are interpolated by cubic convolution
+    (R. Keys, IEEE Trans. Acoust. Speech Signal Process. 29, 1153, 1981), which shifts by whole
+    samples leave exact. Parameters as of `planes.LyotStop`.
     """
 
     parameters = ("lyot_shift", "lyot_rotation")
     margin = 0.06
     """Room for shifts and rotations, as a fraction of the diameter."""
+    _latest: tuple[Any, Tensor] | None = None
 
     def _moves(self, values: Values) -> bool:
         return any(name in values for name in self.parameters)
 
     def window(self, values: Values) -> PupilGrid:
-        """See `PupilOptic.window`; with some room where it may move."""
-        return (
-            self.grid.widened(self.margin * self._full.diameter)
-            if self._moves(values)
-            else (self.grid)
-        )
+        """See `PupilOptic.window`; with a margin if the stop may move."""
+        if not self._moves(values):
+            return self.grid
+        return self.grid.widened(self.margin * self._full.diameter)
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Multiply by the stop where it is."""
@@ -180,30 +195,71 @@ class MovableStop(PupilOptic):
             return super().apply(wavefront, values, onto)
         window = self.window(values)
         field = wavefront.grid.crop(wavefront.field, window)
-        phasor = self.grid.crop(self._phasors[wavefront.wavelength], window)
-        device = phasor.device
-        zero = torch.zeros(2, dtype=torch.float64, device=device)
+        stop = self._moved(self._phasors[wavefront.wavelength], window, values)
+        return replace(wavefront, field=field * stop, grid=window)
+
+    def _moved(self, phasor: Tensor, window: PupilGrid, values: Values) -> Tensor:
+        """The stop on a window; kept for the values that it was last computed with."""
+        moving = [value for name in self.parameters if (value := values.get(name)) is not None]
+        key = None
+        if all(is_plain(value) for value in moving):
+            numbers = tuple(tuple(value.flatten().tolist()) for value in moving)
+            key = (id(phasor), window, "lyot_shift" in values, numbers)
+            # Looked at once, for another thread may put its own there at any moment.
+            latest = self._latest
+            if latest is not None and latest[0] == key:
+                return latest[1]
+        zero = torch.zeros(2, dtype=torch.float64, device=phasor.device)
         shift = values.get("lyot_shift", zero) * self._full.diameter
         angle = torch.deg2rad(values.get("lyot_rotation", zero[:1])).reshape(())
-        x = window.x.to(device)[None, :] - shift[0]
-        y = window.y.to(device)[:, None] - shift[1]
-        # From where the light of each sample is taken: the motion backwards.
+        x = window.x.to(phasor.device)[None, :] - shift[0]
+        y = window.y.to(phasor.device)[:, None] - shift[1]
+        # From where each sample of the moved stop comes: the motion backwards.
         from_x = torch.cos(angle) * x + torch.sin(angle) * y
         from_y = -torch.sin(angle) * x + torch.cos(angle) * y
-        middles = [(axis[0] + axis[-1]) / 2 for axis in (window.x, window.y)]
-        rows, columns = window.shape
-        positions = torch.stack(
-            [
-                (from_x - middles[0]) / (columns * window.spacing / 2),
-                (from_y - middles[1]) / (rows * window.spacing / 2),
-            ],
-            dim=-1,
+        spacing = self.grid.spacing
+        rows = (from_y - float(self.grid.y[0])) / spacing
+        columns = (from_x - float(self.grid.x[0])) / spacing
+        found = _cubic(phasor, rows, columns)
+        if key is not None:
+            self._latest = (key, found)
+        return found
+
+
+def _cubic(array: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """Values of an array at positions in samples, by cubic convolution; zero outside.
+
+    Made of operations that have derivatives of both modes, unlike torch's `grid_sample`.
+
+    Parameters
+    ----------
+    array : Tensor, (ny, nx)
+    rows, columns : Tensor, (...)
+    """
+    ny, nx = array.shape
+    edge = 4  # Positions far outside are moved here, where all four samples are zero.
+    flat = torch.nn.functional.pad(array, (edge,) * 4).flatten()
+    taps = []
+    for position, count in ((rows, ny), (columns, nx)):
+        below = torch.floor(position.detach())
+        t = position - below
+        weights = (
+            ((2 - t) * t - 1) * t / 2,
+            ((3 * t - 5) * t * t + 2) / 2,
+            ((4 - 3 * t) * t + 1) * t / 2,
+            (t - 1) * t * t / 2,
         )
-        parts = torch.stack([phasor.real, phasor.imag])[None]
-        moved = torch.nn.functional.grid_sample(
-            parts, positions[None].to(parts.dtype), mode="bicubic", align_corners=False
-        )[0]
-        return replace(wavefront, field=field * torch.complex(moved[0], moved[1]), grid=window)
+        first = (below.to(torch.int64) + edge - 1).clamp(0, count + edge)
+        taps.append((first, [weight.to(array.real.dtype) for weight in weights]))
+    (top, down), (left, across) = taps
+    corner = top * (nx + 2 * edge) + left
+    total = torch.zeros((), dtype=array.dtype, device=array.device)
+    for i, row_weight in enumerate(down):
+        line = torch.zeros((), dtype=array.dtype, device=array.device)
+        for j, column_weight in enumerate(across):
+            line = line + column_weight * flat[corner + (i * (nx + 2 * edge) + j)]
+        total = total + row_weight * line
+    return total
 
 
 class AberrationOptic(PupilOptic):

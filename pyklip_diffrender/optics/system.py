@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -13,17 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.io.units import (
-    require_finite,
-    require_shape,
-    to_metres,
-    to_unit,
-    warn_of_rms,
-)
+from pyklip_diffrender.io.units import require_finite, to_metres, to_unit, warn_of_rms
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.fast.path import LatticeRoute
-from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.optics.planes import (
     CompactOcculter,
     EntrancePupil,
@@ -31,7 +25,8 @@ from pyklip_diffrender.optics.planes import (
     Values,
     Wavefront,
 )
-from pyklip_diffrender.optics.psf_file import recipe_psf
+from pyklip_diffrender.optics.psf_file import instrument_psf
+from pyklip_diffrender.optics.sampled_planes import OrientedPupil, PupilOptic
 from pyklip_diffrender.parameters import parameter
 
 __all__ = ["OpticalSystem"]
@@ -39,6 +34,9 @@ __all__ = ["OpticalSystem"]
 Value = Tensor | ArrayLike | float
 
 _ON_AXIS = (0.0, 0.0)
+
+_BAND = ("monochromatic", "nlambda", "source", "wavelength")
+"""Settings that decide the wavelengths."""
 
 
 class OpticalSystem:
@@ -55,9 +53,9 @@ class OpticalSystem:
     bandpass : Bandpass
         Wavelengths and weights.
     recipe : mapping, optional
-        What the system was made from, for provenance and for `with_fidelity`.
+        The arguments that the system was made with, for provenance and for `with_fidelity`.
     remake : callable, optional
-        Makes the same system from a changed recipe.
+        Takes the arguments of `recipe`, some of them changed, and makes another system.
     route : "auto", "lattice" or "planes"
         How light gets to the detector: by convolution on cells that fit the detector (`cells`),
         which is for one round occulter between pupils, or plane by plane, which is for all.
@@ -80,6 +78,14 @@ class OpticalSystem:
         For defaults that `values` refuses.
     """
 
+    _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
+        "fov_pixels": ("fov_arcsec",),
+        "fov_arcsec": ("fov_pixels",),
+        "nlambda": ("monochromatic",),
+        "source": ("monochromatic",),
+    }
+    """For a setting, those that say the same in other words and are dropped when it is given."""
+
     def __init__(
         self,
         entrance: EntrancePupil,
@@ -97,6 +103,7 @@ class OpticalSystem:
         self.bandpass = bandpass
         self.recipe = dict(recipe or {})
         self._remake = remake
+        self._other_bandpass: Bandpass | None = None
         if route not in ("auto", "lattice", "planes"):
             raise IncompatibleSetupError(
                 f"route: got {route!r}, expected 'auto', 'lattice' or 'planes'"
@@ -167,36 +174,123 @@ class OpticalSystem:
         return (*self.entrance.parameters, *between, *self.detector.parameters)
 
     @property
-    def adjustable(self) -> frozenset[str]:
-        """Names that `with_fidelity` takes, such as "npix" or "dtype"; none without a recipe."""
-        return frozenset(() if self._remake is None else self.recipe)
+    def setup(self) -> dict[str, str]:
+        """What the system is a model of, as far as it knows.
 
-    def with_fidelity(self, **changes: Any) -> Self | OpticalSystem:
+        Names in the spelling of stpsf under "filter", "image_mask", "pupil_mask" and "module";
+        empty for a system that is not an instrument's.
+        """
+        names = ("filter", "image_mask", "pupil_mask")
+        setup = {name: self.recipe[name] for name in names if self.recipe.get(name)}
+        # The embedded masks are those of NIRCam's module A.
+        return {**setup, "module": "A"} if "image_mask" in setup else setup
+
+    @property
+    def adjustable(self) -> frozenset[str]:
+        """Names of the settings that `with_fidelity` can change.
+
+        What a fit makes cheaper has the same name in every system that can change it: "npix",
+        "dtype", "occulter_sampling", "fov_pixels" and "bandpass" (a `Bandpass`). The other names
+        are arguments of the function that made the system. A system put together from planes can
+        change its bandpass only, and not even that if its planes were sampled for some
+        wavelengths.
+        """
+        names = set(self.recipe) if self._remake is not None else set()
+        return frozenset(names if self._is_sampled else {*names, "bandpass"})
+
+    def with_fidelity(self, **changes: Any) -> OpticalSystem:
         """The same system with other numerical settings, such as ``npix=256``.
 
         Parameters
         ----------
         **changes
-            Arguments of the function that made this system.
-        """
-        if self._remake is None:
-            raise TypeError(
-                "this system was put together from planes and has no recipe to change; make a "
-                "second one with the settings you want"
-            )
-        return self._remake(**{**self.recipe, **changes})
+            Settings by name, out of `adjustable`. One that says the same in other words is
+            dropped: ``fov_pixels`` takes the place of ``fov_arcsec``, ``nlambda`` that of
+            ``monochromatic``. Settings that keep their value are accepted for all systems.
 
-    def at_wavelengths(self, bandpass: Bandpass) -> Self:
-        """The same system for other wavelengths, sharing what has been computed for them."""
+        Raises
+        ------
+        IncompatibleSetupError
+            For a setting that this system cannot change, or a value that it does not take.
+        """
+        refused = [
+            name
+            for name, value in changes.items()
+            if name not in self.adjustable and value is not self.recipe.get(name)
+        ]
+        if refused:
+            raise IncompatibleSetupError(
+                f"{', '.join(refused)}: {self!r} cannot change that; it can change "
+                f"{', '.join(sorted(self.adjustable)) or 'nothing'}. Make a second system with "
+                "the settings you want"
+            )
+        changes = {name: value for name, value in changes.items() if name in self.adjustable}
+        bandpass = changes.pop("bandpass", None)
+        if bandpass is None and changes.keys().isdisjoint(_BAND):
+            bandpass = self._other_bandpass
+        made = self._remade(changes) if changes else self
+        return made if bandpass is None else made.at_wavelengths(bandpass)
+
+    def at_wavelengths(self, bandpass: Bandpass) -> OpticalSystem:
+        """The same system with another bandpass.
+
+        Its planes are shared, with all that they have computed so far. Systems that
+        `with_fidelity` makes of the result have the other bandpass, too.
+
+        Parameters
+        ----------
+        bandpass : Bandpass
+            Any wavelengths if "bandpass" is in `adjustable`; otherwise some of those that the
+            system has.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For wavelengths at which the planes were not sampled.
+        """
+        if bandpass == self.bandpass:
+            return self
+        known = set(bandpass.wavelengths) <= set(self.bandpass.wavelengths)
+        if not known and self._is_sampled:
+            raise IncompatibleSetupError(
+                f"bandpass: got the wavelengths {bandpass.wavelengths} m, but planes of {self!r} "
+                f"were sampled at {self.bandpass.wavelengths} m"
+            )
         other = copy.copy(self)
-        other.bandpass = bandpass
+        other.bandpass = other._other_bandpass = bandpass
         return other
+
+    @property
+    def _is_sampled(self) -> bool:
+        """Whether planes are known at the wavelengths of the bandpass only."""
+        planes = (self.entrance, *self.planes)
+        return any(isinstance(plane, OrientedPupil | PupilOptic) for plane in planes)
+
+    def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
+        """Another system from the same recipe with some changes."""
+        assert self._remake is not None  # Otherwise its arguments are not adjustable.
+        dropped = {
+            other: None
+            for name in changes
+            for other in self._replaced.get(name, ())
+            if other in self.recipe and other not in changes
+        }
+        return self._remake(**{**self.recipe, **dropped, **changes})
 
     def opd(self, opd: Value | None) -> Tensor:
         """Check an OPD and bring it to the system's device: (..., npix, npix) in m.
 
-        None is the system's own wavefront, flat unless it came with one. Tensors pass through
-        unchanged in value, so that gradients flow; everything else goes through the unit gate.
+        Arrays, Quantities and maps that sample the pupil with another number of pixels are
+        resampled, see `grid.resample`. Tensors pass through unchanged in value, so that gradients
+        flow, and must have the system's own size. None is the system's own wavefront, flat unless
+        it came with one.
+
+        Raises
+        ------
+        ShapeError
+            For a map that is not square, or a tensor of another size.
+        UnitError, NonFiniteError
+            For a Quantity that is not a length, or values that are not finite.
 
         Warns
         -----
@@ -207,28 +301,27 @@ class OpticalSystem:
             return self.entrance.opd
         if opd is None:
             return torch.zeros(self.npix, self.npix, dtype=self.dtype, device=self.device)
-        if not isinstance(opd, Tensor):
-            array = to_metres(opd, "opd")
-            if array.ndim < 2:
-                raise ShapeError(f"opd: got shape {array.shape}, expected (..., npix, npix)")
-            require_finite(array, "opd (NaN is only allowed outside the pupil; set it to 0)")
-            self._warn_of_unit(opd, array)
-            opd = torch.from_numpy(array)
-        if opd.shape[-2:] != (self.npix, self.npix):
-            require_shape(
-                np.empty(opd.shape[-2:]),
-                (self.npix, self.npix),
-                "opd",
-                f"This system samples the pupil with {self.npix} pixels: make it with "
-                f"npix={opd.shape[-1]}, or resample the map with opd.resample",
-            )
-        return opd.to(self.device)
+        if isinstance(opd, str | os.PathLike):
+            raise TypeError(f"opd: got the path {opd!r}; read it first, with read_opd(path)")
+        if isinstance(opd, Tensor):
+            if opd.shape[-2:] != (self.npix, self.npix):
+                raise ShapeError(
+                    f"opd: got a tensor of shape {tuple(opd.shape)}, expected (..., {self.npix}, "
+                    f"{self.npix}). Tensors are not resampled, because gradients may flow through "
+                    f"them: pass opd.numpy(), or make the system with npix={opd.shape[-1]}"
+                )
+            return opd.to(self.device)
+        array = to_metres(opd, "opd")
+        require_finite(array, "opd (NaN is only allowed outside the pupil; set it to 0)")
+        array = resample(array, self.npix)
+        self._warn_of_unit(opd, array)
+        return torch.from_numpy(array).to(self.device)
 
     def _warn_of_unit(self, given: Any, array: NDArray[np.float64]) -> None:
-        """Of bare nanometres: arrays only, for tensors are what fits move, and maps know theirs."""
+        """Warn of an array in nanometres; maps know their unit, and fits move tensors."""
         lit = self.entrance.lit.cpu().numpy()
-        if isinstance(given, np.ndarray) and array.shape[-2:] == lit.shape and lit.any():
-            # Small ones are fair: what a mode of 1 pm does is a thing to ask a model.
+        if isinstance(given, np.ndarray) and lit.any():
+            # A small rms is fair: somebody may ask what a mode of 1 pm does.
             rms = float(array[..., lit].std(axis=-1).max())
             warn_of_rms(rms, "opd", stacklevel=6, small=False)
 
@@ -403,20 +496,8 @@ class OpticalSystem:
             "oversample": samples,
             "occulter_sampling": sampling,
         }
-        changes = {name: value for name, value in changes.items() if value is not None}
-        system: OpticalSystem = self
-        if changes:
-            # One way of giving a size or a band takes the place of the other.
-            for name, rival in (
-                ("fov_pixels", "fov_arcsec"),
-                ("fov_arcsec", "fov_pixels"),
-                ("nlambda", "monochromatic"),
-                ("source", "monochromatic"),
-            ):
-                if name in changes and rival not in changes:
-                    changes[rival] = None
-            system = self.with_fidelity(**changes)
-        hdus = recipe_psf(system, normalize, outfile, overwrite, opd, **parameters)
+        system = self.with_fidelity(**{k: v for k, v in changes.items() if v is not None})
+        hdus = instrument_psf(system, normalize, outfile, overwrite, opd, **parameters)
         if return_intermediates:
             return hdus, system.debug(opd, None, **parameters)
         return hdus

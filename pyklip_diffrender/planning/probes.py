@@ -15,7 +15,6 @@ from typing import Any
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.planning.choice import Choice, Economy, ModelError, Option
-from pyklip_diffrender.planning.systems import wavelengths_are_fixed
 from pyklip_diffrender.planning.trial import PROBED, START, Trial
 
 __all__ = ["PROBES"]
@@ -47,6 +46,9 @@ def _allowed(candidates: Candidates, given: dict[str, Any], trial: Trial) -> Can
             f"offers ({', '.join(pins)}) = {', '.join(map(str, dict.fromkeys(offered)))}"
         )
     return kept
+
+
+_FIXED = "the model cannot change it"
 
 
 def _measured(
@@ -134,7 +136,7 @@ def wavelengths(trial: Trial) -> Economy:
         ("wavelengths",),
         [{"wavelengths": n} for n in range(1, count)],
         lambda choice: error(replace(choice, npix=npix)),
-        fixed=fixed if count > 1 and wavelengths_are_fixed(trial.model) else "",
+        fixed=fixed if count > 1 and "bandpass" not in trial.model.adjustable else "",
         monotonic=True,
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -14,11 +13,10 @@ from torch import Tensor
 from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.planes import Values
-from pyklip_diffrender.optics.sampled_planes import OrientedPupil, PupilOptic
 from pyklip_diffrender.optics.system import OpticalSystem, Value
 from pyklip_diffrender.planning.choice import Choice
 
-__all__ = ["CheapSystem", "build", "coarse_steps", "quadrature", "wavelengths_are_fixed"]
+__all__ = ["CheapSystem", "build", "coarse_steps", "quadrature"]
 
 
 class CheapSystem(OpticalSystem):
@@ -39,11 +37,25 @@ class CheapSystem(OpticalSystem):
             made.detector,
             band,
             recipe=made.recipe,
-            remake=partial(_remade, made, band) if made.adjustable else None,
             route=made.route,
             defaults=made.defaults,
         )
+        self._made = made if band == made.bandpass else made.at_wavelengths(band)
         self._constants: dict[float, Tensor] = {}
+
+    @property
+    def setup(self) -> dict[str, str]:
+        """As of the other system."""
+        return self._made.setup
+
+    @property
+    def adjustable(self) -> frozenset[str]:
+        """As of the other system."""
+        return self._made.adjustable
+
+    def with_fidelity(self, **changes: Any) -> OpticalSystem:
+        """See `OpticalSystem.with_fidelity`."""
+        return CheapSystem(self._made.with_fidelity(**changes))
 
     def stepping_from(self, fields: Sequence[Tensor], opd: Tensor, values: Values) -> Self:
         """The same system, with a constant added to its fields that makes them right at one OPD.
@@ -63,10 +75,6 @@ class CheapSystem(OpticalSystem):
         field = super()._field(opd, wavelength, values)
         constant = self._constants.get(wavelength)
         return field if constant is None else field + constant
-
-
-def _remade(made: OpticalSystem, band: Bandpass, **recipe: Any) -> OpticalSystem:
-    return CheapSystem(made.with_fidelity(**recipe), band)
 
 
 def coarse_steps(
@@ -92,11 +100,6 @@ def coarse_steps(
     with torch.no_grad():
         opd = model.opd(opd0)
         return coarse.stepping_from(model.fields(opd), downsample(opd, npix), {})
-
-
-def wavelengths_are_fixed(model: OpticalSystem) -> bool:
-    """Whether some plane holds samples for the model's own wavelengths only."""
-    return any(isinstance(p, OrientedPupil | PupilOptic) for p in (model.entrance, *model.planes))
 
 
 def quadrature(bandpass: Bandpass, count: int) -> Bandpass:

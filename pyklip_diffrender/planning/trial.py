@@ -23,7 +23,7 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.planning.choice import Choice, Economy, ModelError
 from pyklip_diffrender.planning.noise_model import Drift, NoiseModel, RidgeResidual, least_squares
-from pyklip_diffrender.planning.systems import CheapSystem, build, wavelengths_are_fixed
+from pyklip_diffrender.planning.systems import CheapSystem, build
 from pyklip_diffrender.scene.objects import Scene
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import default_basis
@@ -97,7 +97,9 @@ class Trial:
         self.rough = replace(
             self.finest,
             npix=next((npix for npix in self.grids if npix >= _ROUGH_NPIX), model.npix),
-            wavelengths=waves if wavelengths_are_fixed(model) else min(_ROUGH_WAVELENGTHS, waves),
+            wavelengths=waves
+            if "bandpass" not in model.adjustable
+            else min(_ROUGH_WAVELENGTHS, waves),
         )
         self._systems: dict[Choice, OpticalSystem] = {self.finest.system: model}
         self._images: dict[tuple[Choice, int], Tensor] = {}

@@ -203,13 +203,13 @@ def _everywhere(result: Refinement, group: Observation, window: Window) -> NDArr
     inside = window.y <= box.y and window.x <= box.x
     inside &= window.y + window.shape[0] >= box.y + box.shape[0]
     inside &= window.x + window.shape[1] >= box.x + box.shape[1]
-    if not inside and result.model.recipe:
+    if not inside and "fov_pixels" in result.model.adjustable:
         x, y = group.center[0] - (box.x, box.y)
         return box.paste(result.frames[0].render(fov_pixels=box.shape, center=(x, y)), group.shape)
     if not inside:
         logger.warning(
-            "%s: the model was not made by nircam_coronagraph or a bridge; pixels outside its %d "
-            "x %d are NaN", group.name, window.shape[1], window.shape[0],
+            "%s: the model's field of view cannot be changed; pixels outside its %d x %d are NaN",
+            group.name, window.shape[1], window.shape[0],
         )  # fmt: skip
     return window.paste(np.asarray(result.frames[0].star), group.shape)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -111,6 +112,10 @@ def refine(
     if not observations:
         raise NoValidPixelsError("observation: got an empty sequence, expected at least one")
     chosen = settings_for(observations[0]) if settings is None else settings
+    if isinstance(chosen, GaussNewton) and chosen.free == GaussNewton().free:
+        # A system without a Lyot stop has no parameters of one.
+        known = (*model.parameters, "flux", "background")
+        chosen = replace(chosen, free=tuple(name for name in chosen.free if name in known))
     if not isinstance(chosen, GaussNewton | Adam):
         raise IncompatibleSetupError(
             f"settings: got a {type(chosen).__name__}, expected GaussNewton or Adam"

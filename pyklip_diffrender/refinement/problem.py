@@ -152,20 +152,18 @@ class Problem:
 def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
     """Compare filter, masks, module and pixel scale, where both sides say what theirs are.
 
-    Of the model, only what `nircam_coronagraph` made does: other systems have no such recipe.
+    Of the model, what its `setup` says: a system that is not an instrument's says nothing.
 
     Raises
     ------
     IncompatibleSetupError
     """
-    recipe, header = model.recipe, observation.header
-    mask = recipe.get("image_mask")
+    setup, header = model.setup, observation.header
     stated = (
-        ("filter", recipe.get("filter"), observation.filter),
-        ("image mask", mask, header.get("CORONMSK")),
-        ("pupil mask", recipe.get("pupil_mask"), header.get("PUPIL")),
-        # The embedded tables are those of module A.
-        ("module", mask and "A", header.get("MODULE")),
+        ("filter", setup.get("filter"), observation.filter),
+        ("image mask", setup.get("image_mask"), header.get("CORONMSK")),
+        ("pupil mask", setup.get("pupil_mask"), header.get("PUPIL")),
+        ("module", setup.get("module"), header.get("MODULE")),
     )
     for what, made, taken in stated:
         if not isinstance(made, str) or not isinstance(taken, str):

@@ -72,6 +72,6 @@ def simulate(
         error,
         unit="photon",
         pixelscale=model.detector.pixelscale,
-        filter=model.recipe.get("filter"),
+        filter=model.setup.get("filter"),
         name=f"simulation(seed={seed})",
     )

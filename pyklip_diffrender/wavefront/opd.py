@@ -1,11 +1,11 @@
-"""Wavefront maps: read from FITS with their unit, or made from a seed where there is no file."""
+"""Wavefront maps: read from FITS files with their unit, or drawn at random from a seed."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from astropy import units as u
 from astropy.io import fits
-from astropy.time import Time
 from numpy.typing import NDArray
 
+from pyklip_diffrender.bridges.wss import EXTENSION, load_wss_opd
 from pyklip_diffrender.errors import (
     CorruptFileError,
     NonFiniteError,
@@ -26,41 +26,12 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
 from pyklip_diffrender.io.headers import header_date, header_text, merged_header
+from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.units import native_float64, to_metres, warn_of_rms
-from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import FourierModes, SegmentMotions
 
 __all__ = ["OPDMap", "as_opd_map", "drift", "random_drift", "random_opd", "read_opd", "resample"]
-
-
-@dataclass(frozen=True)
-class OPDMap:
-    """A wavefront map with what is known of it.
-
-    Attributes
-    ----------
-    data : ndarray, (npix, npix), float64
-        m, OTE entrance-pupil orientation; 0 where the file had no value.
-    date : Time or None
-        When the wavefront was sensed.
-    name : str
-        File name, or what made it.
-    sha256 : str
-        Hash of the file, or of the data.
-    """
-
-    data: NDArray[np.float64]
-    date: Time | None
-    name: str
-    sha256: str
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[np.float64]:
-        return np.array(self.data, dtype=dtype)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the map."""
-        return self.data.shape
 
 
 def read_opd(
@@ -70,41 +41,59 @@ def read_opd(
 ) -> OPDMap:
     """Read an OPD map from a FITS file.
 
+    Maps of the mission's wavefront sensing, as MAST has them, are recognised by their extension
+    RESULT_PHASE: they are in microns without saying so, and contain the aberrations of the
+    sensing camera. These are subtracted with stpsf's models if stpsf and its data are installed;
+    otherwise they are kept, with a warning. See `bridges.load_wss_opd`.
+
     Parameters
     ----------
     path : path
-        FITS, gzipped or not.
+        FITS file, gzipped or not.
     extension : str or int, optional
-        Default: the first with a two-dimensional image.
+        Which HDU to read as it is; default the first with a two-dimensional image.
     unit : str or Unit, optional
-        Where the header has no BUNIT.
+        Unit of the values where the header has no BUNIT.
+
+    Returns
+    -------
+    OPDMap
 
     Raises
     ------
     CorruptFileError
-        The file is missing, truncated, or has no two-dimensional image.
+        If the file is missing or truncated, has no two-dimensional image, or is zero everywhere.
     UnitError
-        No unit is known, or it is not a length.
+        If no unit is known, or it is not a length.
     ShapeError
-        The map is not square.
+        If the map is not square.
     NonFiniteError
-        NaN or infinity inside the pupil (outside it becomes 0).
+        For NaN or infinity inside the pupil (outside it becomes 0).
 
     Warns
     -----
     DiffrenderWarning
-        If the rms inside the pupil is not plausible for JWST, with the unit that would make it.
+        If the rms inside the pupil is not plausible for JWST, with the unit in which it would be,
+        or if a wavefront-sensing map still contains the aberrations of the sensing camera.
+
+    Examples
+    --------
+    >>> from pyklip_diffrender import read_opd
+    >>> opd = read_opd("R2022081102-NRCA3_FP1-1.fits")  # doctest: +SKIP
     """
     path = Path(path)
     with open_fits(path) as hdus:
+        if extension is None and EXTENSION in hdus:
+            return _checked(load_wss_opd(path))
         hdu = _image(hdus, extension, path)
         raw = native_float64(hdu.data)
         header = merged_header(hdus[0].header, hdu.header, path.name)
-    unit = unit or header_text(header, "BUNIT", path.name)
+        sensed = hdu.name == EXTENSION
+    unit = unit or header_text(header, "BUNIT", path.name) or ("micron" if sensed else None)
     if not unit:
         raise UnitError(
-            f"{path.name}: the header has no BUNIT. Say it: read_opd(path, unit='m') "
-            "(or 'um': WSS files are in micron)"
+            f"{path.name}: the header has no BUNIT. Give the unit: read_opd(path, unit='m') "
+            "(or 'um', 'nm')"
         )
     try:
         # STScI writes "meters", "microns".
@@ -112,12 +101,18 @@ def read_opd(
         data = raw * u.Unit(spelled).to(u.m)
     except (ValueError, u.UnitConversionError) as error:
         raise UnitError(f"{path.name}: BUNIT is {unit!r}, expected a unit of length") from error
+    if not data.any():
+        raise CorruptFileError(
+            f"{path.name}: all values of the map are zero, expected a measured wavefront. Choose "
+            f"the HDU with extension=, out of {[each.name or k for k, each in enumerate(hdus)]}, "
+            "or pass an array of zeros where a flat wavefront is meant"
+        )
     date = header_date(header, ("DATE-OBS", "DATE-BEG"), path.name)
-    return OPDMap(_check(data, path.name), date, path.name, sha256(path))
+    return _checked(OPDMap(data, date, path.name, sha256(path)))
 
 
 def as_opd_map(opd: Any, name: str = "array") -> OPDMap:
-    """Make an `OPDMap` of a path, Quantity, array (m), tensor or map.
+    """Make an `OPDMap` of a path, Quantity, array, tensor or map; bare numbers are metres.
 
     Raises
     ------
@@ -129,7 +124,7 @@ def as_opd_map(opd: Any, name: str = "array") -> OPDMap:
     if isinstance(opd, str | os.PathLike):
         return read_opd(opd)
     data = to_metres(opd, "opd")
-    return OPDMap(_check(data, name), None, name, hashlib.sha256(data.tobytes()).hexdigest())
+    return _checked(OPDMap(data, None, name, hashlib.sha256(data.tobytes()).hexdigest()))
 
 
 def _image(hdus: fits.HDUList, extension: str | int | None, path: Path) -> Any:
@@ -148,14 +143,15 @@ def _image(hdus: fits.HDUList, extension: str | int | None, path: Path) -> Any:
 
 @lru_cache(maxsize=8)
 def _inside(npix: int) -> NDArray[np.bool_]:
-    """Which samples are inside the pupil; made in as much time as a map is read in."""
+    """Samples inside the pupil; kept because making them takes as long as reading a map."""
     inside: NDArray[np.bool_] = jwst_pupil(npix).numpy() > 0.5
     inside.setflags(write=False)
     return inside
 
 
-def _check(data: NDArray[np.float64], name: str) -> NDArray[np.float64]:
-    """Square, NaN only outside the pupil, and an rms that a telescope could have."""
+def _checked(given: OPDMap) -> OPDMap:
+    """A square map with a plausible rms, and zeros where values outside the pupil are NaN."""
+    data, name = given.data, given.name
     if data.ndim != 2 or data.shape[0] != data.shape[1] or not data.size:
         raise ShapeError(f"{name}: got shape {data.shape}, expected a square map")
     pupil = _inside(data.shape[0])
@@ -168,30 +164,11 @@ def _check(data: NDArray[np.float64], name: str) -> NDArray[np.float64]:
         )
     data = np.where(bad, 0.0, data)
     warn_of_rms(float(data[pupil].std()), name, stacklevel=4)
-    return data
-
-
-def resample(opd: NDArray[np.float64], npix: int) -> NDArray[np.float64]:
-    """Resample a square map to `npix` pixels over the same pupil: means, or bilinear if finer.
-
-    Parameters
-    ----------
-    opd : ndarray, (n, n)
-    npix : int
-    """
-    count = opd.shape[-1]
-    if npix == count:
-        return opd
-    tensor = torch.from_numpy(native_float64(opd))[None, None]
-    if count % npix == 0:
-        return torch.nn.functional.avg_pool2d(tensor, count // npix)[0, 0].numpy()
-    return torch.nn.functional.interpolate(
-        tensor, size=(npix, npix), mode="bilinear", align_corners=False, antialias=True
-    )[0, 0].numpy()
+    return replace(given, data=data)
 
 
 def drift(before: Any, after: Any, hours: float, interval: float = 86.0) -> NDArray[np.float64]:
-    """A wavefront between (or beyond) two measured ones, linear in time.
+    """Interpolate between two measured wavefronts, or extrapolate, linearly in time.
 
     Parameters
     ----------
@@ -201,17 +178,22 @@ def drift(before: Any, after: Any, hours: float, interval: float = 86.0) -> NDAr
         Time since `before`.
     interval : float
         Hours from `before` to `after`.
+
+    Returns
+    -------
+    ndarray, (npix, npix)
+        m.
     """
     first, second = native_float64(before), native_float64(after)
     return first + hours / interval * (second - first)
 
 
 def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
-    """A seeded wavefront like those measured in flight.
+    """Draw a wavefront like those measured in flight.
 
     Segment piston, tip and tilt carry 24 % of the variance (as in the maps of 2022-08-11 and
-    2022-08-14), the rest is texture whose amplitude is flat to 8 cycles per pupil and falls as
-    the square of the frequency beyond: errors inside the segments.
+    2022-08-14). The rest is texture inside the segments, whose amplitude is constant up to 8
+    cycles per pupil and falls as the square of the frequency beyond.
 
     Parameters
     ----------
@@ -220,12 +202,16 @@ def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
         Samples across the pupil. The same seed gives the same wavefront at any sampling.
     rms : float
         Over the pupil, m.
+
+    Returns
+    -------
+    OPDMap
     """
     return _random(seed, npix, rms, segment_variance=0.24, knee=8.0, slope=2.0, name="random_opd")
 
 
 def random_drift(seed: int, hours: float, npix: int = 1024, rms_per_86h: float = 9e-9) -> OPDMap:
-    """A seeded change of the wavefront that grows linearly in time.
+    """Draw a change of the wavefront that grows linearly in time.
 
     Segment motions carry 62 % of the variance (as in the change from 2022-08-11 to 08-14), low
     and mid frequencies the rest.
@@ -235,8 +221,13 @@ def random_drift(seed: int, hours: float, npix: int = 1024, rms_per_86h: float =
     seed : int
     hours : float
     npix : int
+        Samples across the pupil.
     rms_per_86h : float
         m; the published pair of maps differs by 9.06 nm.
+
+    Returns
+    -------
+    OPDMap
     """
     unit = _random(
         seed, npix, 1e-8, segment_variance=0.62, knee=8.0, slope=2.0, name="random_drift"

@@ -1,4 +1,4 @@
-"""Wavefront maps that cannot be what they are said to be."""
+"""Wavefront maps on their way in and out: plausibility checks, and HDULists for poppy and stpsf."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import warnings
 from typing import Any
 
 import numpy as np
+from astropy.io import fits
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import DiffrenderWarning, UnitError
-from pyklip_diffrender.io.units import require_finite
+from pyklip_diffrender.io.opd_map import OPDMap
+from pyklip_diffrender.io.units import require_finite, to_metres
+from pyklip_diffrender.optics.grid import JWST_DIAMETER
 
-__all__ = ["check_opd"]
+__all__ = ["check_opd", "opd_to_hdus"]
 
 Array = NDArray[np.float64]
 
@@ -27,7 +30,7 @@ _TURNS: dict[str, Any] = {
 
 
 def check_opd(opd: Array, amplitude: Array, name: str) -> None:
-    """Look at a map's size, and at where it is blank.
+    """Check the size of a map's values, and where its blank samples are.
 
     Parameters
     ----------
@@ -36,19 +39,19 @@ def check_opd(opd: Array, amplitude: Array, name: str) -> None:
     amplitude : ndarray, (npix, npix)
         Transmission of the pupil in the orientation that the map should have.
     name : str
-        What it is, for the message.
+        What the map is, for the message.
 
     Raises
     ------
     NonFiniteError
         If a value inside the pupil is not finite.
     UnitError
-        If it is too large to be in metres.
+        If the values are too large to be in metres.
 
     Warns
     -----
     DiffrenderWarning
-        If its blank samples match the pupil better turned than as it is.
+        If the blank samples match the pupil better after a flip or a rotation by 180 degrees.
     """
     inside = amplitude > 0
     require_finite(opd, name, inside)
@@ -67,8 +70,40 @@ def check_opd(opd: Array, amplitude: Array, name: str) -> None:
     if mismatch[best] < 0.5 * mismatch["as it is"]:
         warnings.warn(
             f"{name}: its blank samples match the pupil {best} ({mismatch[best]:.1%} of the "
-            f"samples differ, as it is {mismatch['as it is']:.1%}). Maps must have the "
+            f"samples differ, against {mismatch['as it is']:.1%} as it is). Maps must have the "
             "orientation of the entrance pupil, row 0 at the bottom (-V3)",
             DiffrenderWarning,
             stacklevel=3,
         )
+
+
+def opd_to_hdus(opd: Any, diameter: float = JWST_DIAMETER) -> fits.HDUList:
+    """An OPD in the form that poppy's and stpsf's readers take, for ``nircam.pupilopd`` or a file.
+
+    Parameters
+    ----------
+    opd : OPDMap, Tensor, Quantity or array, (npix, npix)
+        Bare numbers are metres. The origin of an `OPDMap` goes into the header.
+    diameter : float
+        Side of the array, m.
+
+    Returns
+    -------
+    HDUList
+        One image in metres, with BUNIT and PUPLSCAL.
+    """
+    values = to_metres(opd, "opd")
+    header = fits.Header()
+    header["BUNIT"] = "m"
+    header["PUPLDIAM"] = (diameter, "[m] side of the array")
+    header["PUPLSCAL"] = (diameter / values.shape[-1], "[m / pixel]")
+    header["CONTENTS"] = "OTE OPD, entrance pupil orientation"
+    if isinstance(opd, OPDMap):
+        header["OPDFILE"] = (opd.name, "Origin of the map")
+        if opd.aperture:
+            header["APERNAME"] = (opd.aperture, "Sensing field point")
+        if opd.date is not None:
+            header["DATE-OBS"], header["TIME-OBS"] = opd.date.isot.split("T")
+        for line in opd.history:
+            header.add_history(line)
+    return fits.HDUList([fits.PrimaryHDU(values, header)])

@@ -1,0 +1,48 @@
+"""`OPDMap`: a wavefront map together with its origin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from astropy.time import Time
+from numpy.typing import NDArray
+
+__all__ = ["OPDMap"]
+
+
+@dataclass(frozen=True)
+class OPDMap:
+    """A wavefront map together with its origin.
+
+    Attributes
+    ----------
+    data : ndarray, (npix, npix), float64
+        m, OTE entrance-pupil orientation; 0 where the file had no value.
+    date : Time or None
+        When the wavefront was sensed.
+    name : str
+        File name, or what made the map.
+    sha256 : str
+        Hash of the file, or of the data.
+    aperture : str
+        Field point at which the wavefront was sensed, empty if not known.
+    history : tuple of str
+        What was done to the map on reading.
+    """
+
+    data: NDArray[np.float64] = field(repr=False)
+    date: Time | None
+    name: str
+    sha256: str = field(repr=False)
+    aperture: str = ""
+    history: tuple[str, ...] = field(default=(), repr=False)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[np.float64]:
+        return np.array(self.data, dtype=dtype)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the map."""
+        return self.data.shape
