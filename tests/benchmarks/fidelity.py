@@ -4,7 +4,7 @@
 
 Every frame (embedded generator, the wavefront map 40 h old) is fitted with the model as given, with
 a plan of its own, and with that plan once more, on one core; the star that is found and the planet
-that is measured are compared. Prints the table of docs/fidelity.md.
+that is measured are compared. Prints the table of docs/planning.md.
 """
 
 from __future__ import annotations
