@@ -6,9 +6,10 @@ from pathlib import Path
 
 import latex2mathml.converter
 from docutils.nodes import SkipNode
+from numpydoc.xref import DEFAULT_LINKS
 
 import pyklip_diffrender
-from pyklip_diffrender import cli
+from pyklip_diffrender import cli, errors
 from pyklip_diffrender.parameters import FLUX_AND_BACKGROUND, OPTICAL_PARAMETERS
 
 project = "pyklip_diffrender"
@@ -37,13 +38,16 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = True
+numpydoc_xref_aliases = {name: f"pyklip_diffrender.errors.{name}" for name in errors.__all__}
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 
 # Links to other projects need their inventories, so they are made only where that is asked for:
 # an inventory that cannot be fetched is a warning, and warnings are errors in the build.
 intersphinx_mapping = {}
-if os.environ.get("READTHEDOCS") or os.environ.get("DOCS_INTERSPHINX"):
+if not (os.environ.get("READTHEDOCS") or os.environ.get("DOCS_INTERSPHINX")):
+    numpydoc_xref_aliases |= {name: name for name in DEFAULT_LINKS}
+else:
     intersphinx_mapping = {
         "python": ("https://docs.python.org/3", None),
         "numpy": ("https://numpy.org/doc/stable", None),
@@ -75,7 +79,7 @@ def _write_tables(app):
         for each in (*OPTICAL_PARAMETERS, *FLUX_AND_BACKGROUND):
             size = f"{each.name} ({each.size})" if each.size > 1 else each.name
             rows.writerow(
-                [size, each.unit or "-", f"{each.start:g}", f"{each.lower:g} to {each.upper:g}",
+                [size, each.unit, f"{each.start:g}", f"{each.lower:g} to {each.upper:g}",
                  f"{each.prior:g}", each.description]
             )  # fmt: skip
     os.environ["COLUMNS"] = "88"
