@@ -1,24 +1,96 @@
-from importlib.metadata import version as _version
+"""Configuration of the documentation. It builds without a network."""
+
+import csv
+import os
+from pathlib import Path
+
+import latex2mathml.converter
+from docutils.nodes import SkipNode
+from numpydoc.xref import DEFAULT_LINKS
+
+import pyklip_diffrender
+from pyklip_diffrender import cli, errors
+from pyklip_diffrender.parameters import FLUX_AND_BACKGROUND, OPTICAL_PARAMETERS
 
 project = "pyklip_diffrender"
 author = "pyklip_diffrender developers"
 copyright = "2025, pyklip_diffrender developers"
-release = version = _version("pyklip-diffrender")
+release = version = pyklip_diffrender.__version__
 
 extensions = [
     "myst_parser",
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
+    "sphinx.ext.intersphinx",
     "sphinx.ext.viewcode",
+    "sphinx_design",
 ]
 exclude_patterns = ["_build", "results"]
+templates_path = ["_templates"]
 html_theme = "furo"
+html_title = f"pyklip_diffrender {release}"
 
+# Docstrings name things in single backticks; what the documentation has becomes a link.
+default_role = "py:obj"
 autosummary_generate = True
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 numpydoc_show_class_members = False
-myst_enable_extensions = ["dollarmath"]
+numpydoc_xref_param_type = True
+numpydoc_xref_aliases = {name: f"pyklip_diffrender.errors.{name}" for name in errors.__all__}
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
+
+# Links to other projects need their inventories, so they are made only where that is asked for:
+# an inventory that cannot be fetched is a warning, and warnings are errors in the build.
+intersphinx_mapping = {}
+if not (os.environ.get("READTHEDOCS") or os.environ.get("DOCS_INTERSPHINX")):
+    numpydoc_xref_aliases |= {name: name for name in DEFAULT_LINKS}
+else:
+    intersphinx_mapping = {
+        "python": ("https://docs.python.org/3", None),
+        "numpy": ("https://numpy.org/doc/stable", None),
+        "astropy": ("https://docs.astropy.org/en/stable", None),
+        "torch": ("https://docs.pytorch.org/docs/stable", None),
+        "pyklip": ("https://pyklip.readthedocs.io/en/latest", None),
+    }
+
+# Equations become MathML, which browsers render by themselves: no script, no download.
+html_math_renderer = "mathml"
+
+
+def _inline_math(self, node):
+    self.body.append(latex2mathml.converter.convert(node.astext()))
+    raise SkipNode
+
+
+def _display_math(self, node):
+    self.body.append(latex2mathml.converter.convert(node.astext(), display="block"))
+    raise SkipNode
+
+
+def _write_tables(app):
+    """Write what the pages take from the code: the free parameters and the commands' options."""
+    folder = Path(app.srcdir) / "generated"
+    folder.mkdir(exist_ok=True)
+    with open(folder / "parameters.csv", "w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file)
+        for each in (*OPTICAL_PARAMETERS, *FLUX_AND_BACKGROUND):
+            size = f"{each.name} ({each.size})" if each.size > 1 else each.name
+            rows.writerow(
+                [size, each.unit, f"{each.start:g}", f"{each.lower:g} to {each.upper:g}",
+                 f"{each.prior:g}", each.description]
+            )  # fmt: skip
+    os.environ["COLUMNS"] = "88"
+    parser = cli._parser()
+    commands = next(a for a in parser._actions if a.dest == "command").choices
+    for name, command in {"pyklip-diffrender": parser, **commands}.items():
+        (folder / f"{name}.txt").write_text(command.format_help(), encoding="utf-8")
+
+
+def setup(app):
+    app.add_html_math_renderer(
+        "mathml", inline_renderers=(_inline_math, None), block_renderers=(_display_math, None)
+    )
+    app.connect("builder-inited", _write_tables)

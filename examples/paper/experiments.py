@@ -1,4 +1,4 @@
-"""Write docs/experiments.md and its figures from the tables of the paper's experiments.
+"""Write reports/experiments.md and its figures from the tables of the paper's experiments.
 
     python examples/paper/experiments.py
 
@@ -82,7 +82,7 @@ def said(module: Any) -> str:
 
 LIMITS = """\
 - Frames and fits come from one simulator: what neither knows of is in *Beyond the paper*, and on
-  [real frames](real_frames.md).
+  real frames.
 - The annulus SNR is no significance. Light of the planet outside its aperture counts as noise, so
   that it saturates near 30 and faint remains of the star may raise it; it knows nothing of lost
   light; a fit follows some of the noise in the annulus, and may come out above the true star. The
@@ -129,7 +129,7 @@ def write(results: Path, docs: Path) -> Path:
         *in_short(results),
         *where_others_lead(results),
         "Several measurements of one planet and several planets in one frame, the paper's other "
-        "two experiments, are on the page [Calibration](inference.md).",
+        "two experiments, are in the report on calibration.",
         "",
         *took(results),
         "## Limits",
@@ -166,7 +166,7 @@ def main() -> None:
     """Write page and figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--docs", type=Path, default=Path("docs"))
+    parser.add_argument("--docs", type=Path, default=Path("reports"))
     given = parser.parse_args()
     print(f"wrote {write(given.results, given.docs)}")
 

@@ -1,4 +1,4 @@
-"""The figure of docs/inference.md: S/N calibration, limit, fluxes."""
+"""The figure of the calibration report: S/N calibration, limit, fluxes."""
 
 from __future__ import annotations
 

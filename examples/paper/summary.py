@@ -1,4 +1,4 @@
-"""Write docs/inference.md and its figure from the tables of the studies.
+"""Write reports/inference.md and its figure from the tables of the studies.
 
     python examples/paper/summary.py
 
@@ -19,7 +19,7 @@ import fluxes
 import snapshots
 from calibration import rms
 from inference_figure import draw
-from pages import KINDS, RESULTS, markdown, origin, tables
+from pages import KINDS, markdown, origin, tables
 
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.plotting import save
@@ -363,13 +363,10 @@ def main() -> None:
         *about_failures(),
         *about_speed(),
     ]
-    notes = RESULTS / "inference_notes.md"
-    if notes.is_file():
-        lines.append(notes.read_text(encoding="utf-8"))
-    page = Path("docs/inference.md")
+    page = Path("reports/inference.md")
     with replacing(page) as temporary:
         temporary.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
-    save(draw(), Path("docs/images/inference.png"), dpi=110)
+    save(draw(), Path("reports/images/inference.png"), dpi=110)
     print(f"wrote {page}")
 
 

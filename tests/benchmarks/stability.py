@@ -4,7 +4,7 @@ Run from the root of the project, with the package installed:
 
     python tests/benchmarks/stability.py
 
-It writes docs/stability.md. ``pytest -m hard`` holds every line to its limit.
+It writes reports/stability.md. ``pytest -m hard`` holds every line to its limit.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def notes() -> dict[str, float]:
 def main() -> None:
     """Measure, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", type=Path, default=TESTS.parent / "docs" / "stability.md")
+    parser.add_argument("--output", type=Path, default=TESTS.parent / "reports" / "stability.md")
     arguments = parser.parse_args()
     star = fits.star()
     facts = {
@@ -133,6 +133,7 @@ def main() -> None:
     lines = [INTRODUCTION, *provenance("tests/benchmarks/stability.py")]
     lines += [OPTICS.format(npix=optics.NPIX), *optics_table()]
     lines += [FITS.format(**facts), *fits_table(), NOTES.format(**notes())]
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text("\n".join(lines), encoding="utf-8")
 
 
