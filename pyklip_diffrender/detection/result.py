@@ -291,7 +291,7 @@ class Detection:
 
         return {
             "software": f"pyklip_diffrender {__version__}",
-            "frames": [f.observation.name for fit in self.fits for f in fit.frames],
+            "observations": [f.observation.name for fit in self.fits for f in fit.frames],
             **{key: value for key, value in self.fits[0].summary().items()},
             "scatter": self.scatter,
             "threshold": self.threshold,

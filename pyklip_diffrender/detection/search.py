@@ -90,7 +90,7 @@ def detect(
     >>> opd = dr.random_opd(1, npix=128)
     >>> scene = dr.Scene(planets=(dr.Planet(1e-5, 0.6, 120.0),))
     >>> frames = dr.simulate(model, scene, opd, seed=3)
-    >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=8))
+    >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=6))
     >>> len(dr.detect(fit).table)
     1
     """

@@ -6,7 +6,8 @@ from functools import lru_cache
 from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.nircam import SIAF_PIXELSCALE, SIAF_SHEAR, nircam_coronagraph
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.optics.grid import samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -54,14 +55,24 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
         "pixelscale": observation.pixelscale,
     }
     if observation.is_nircam:
+        # Headers name the module with the mask: MASKA335R.
+        stated = str(observation.header.get("CORONMSK", "MASK335R")).strip().upper()
+        name = overrides.get("image_mask") or stated.replace("MASKA", "MASK")
+        if name not in ROUND_MASKS:
+            raise IncompatibleSetupError(
+                f"{observation.name}: these frames have image mask {stated}, expected one of "
+                f"{', '.join(ROUND_MASKS)}. Other masks come through from_webbpsf"
+            )
+        mask = ROUND_MASKS[name]
         shortest = float(filter_throughput(observation.filter)[0][0])
-        (ny, nx), (x, y) = observation.shape, SIAF_PIXELSCALE
+        (ny, nx), (x, y) = observation.shape, mask.siaf_pixelscale
         npix = _NPIX
         while npix < samples_for_field(max(nx * x, ny * y), shortest):
             npix *= 2
         arguments |= {
-            "pixelscale": SIAF_PIXELSCALE,
-            "shear": SIAF_SHEAR,
+            "image_mask": name,
+            "pixelscale": mask.siaf_pixelscale,
+            "shear": mask.siaf_shear,
             "nlambda": 7,
             "npix": npix,
             "occulter_sampling": 2.0,
