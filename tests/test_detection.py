@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import gc
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from astropy import units as u
 from astropy.io import fits as astropy_fits
 from astropy.table import QTable
 from astropy.units import Unit
@@ -20,10 +23,16 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Detection, small_sample_factor
 from pyklip_diffrender.detection.relinearise import with_companions
 from pyklip_diffrender.detection.scale import scale_errors
-from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.errors import (
+    IncompatibleSetupError,
+    NonFiniteError,
+    ShapeError,
+    UnitError,
+)
+from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement import Refinement, Status, refine
+from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, refine
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
@@ -36,16 +45,20 @@ READ_NOISE = 42.0
 BASIS = JointBasis([SegmentMotions(), FourierModes(8)])
 WHERE = Planet(0.0, 0.7, 60.0)
 
+NOT_LOOKING = {"min_model_error": 1e-6}
+"""With a model error that is allowed for, fits do not look for companions by themselves."""
+
 Image = NDArray[np.float64]
 
 
 @dataclass
 class World:
-    """A model, an old wavefront and a later one."""
+    """A model, an old wavefront and a later one; fits and detections are made once."""
 
     model: OpticalSystem
     opd: Image
     later: Image
+    _made: dict[object, Refinement | Detection] = field(default_factory=dict, init=False)
 
     def expected(self, *planets: Planet, offset: tuple[float, float] = (0.0, 0.0)) -> Image:
         """Expected photons of star and planets."""
@@ -62,11 +75,24 @@ class World:
         scale = self.model.detector.pixelscale
         return Observation.from_arrays(counts, error, pixelscale=scale, **details)
 
-    def fitted(self, seed: int, *planets: Planet, **options: object) -> Refinement:
-        return self.refined(self.observed(self.expected(*planets), seed), **options)
+    def fitted(self, seed: int, *planets: Planet, **changes: object) -> Refinement:
+        key = ("fit", seed, planets, tuple(sorted(changes.items())))
+        if key not in self._made:
+            observation = self.observed(self.expected(*planets), seed)
+            self._made[key] = self.refined(observation, **changes)
+        return self._made[key]  # type: ignore[return-value]
 
-    def refined(self, observation: Observation, **options: object) -> Refinement:
-        return refine(self.model, observation, self.opd, basis=BASIS, response_npix=NPIX, **options)  # type: ignore[call-overload, no-any-return]
+    def detected(self, seed: int, *planets: Planet, **changes: object) -> Detection:
+        key = ("detection", seed, planets, tuple(sorted(changes.items())))
+        if key not in self._made:
+            self._made[key] = dr.detect(self.fitted(seed, *planets, **changes))
+        return self._made[key]  # type: ignore[return-value]
+
+    def refined(
+        self, observation: Observation | Sequence[Observation], **changes: object
+    ) -> Refinement:
+        settings = GaussNewton(**{"basis": BASIS, "response_npix": NPIX, **changes})  # type: ignore[arg-type]
+        return refine(self.model, observation, self.opd, settings=settings)
 
 
 @pytest.fixture(scope="module")
@@ -82,13 +108,13 @@ def world() -> World:
 @pytest.fixture(scope="module")
 def empty(world: World) -> list[Detection]:
     """Six frames without a planet."""
-    return [dr.detect(world.fitted(seed)) for seed in range(6)]
+    return [world.detected(seed) for seed in range(6)]
 
 
 @pytest.fixture(scope="module")
 def one(world: World) -> Detection:
     """A planet of S/N 44 or so."""
-    return dr.detect(world.fitted(11, replace(WHERE, contrast=1e-5)))
+    return world.detected(11, replace(WHERE, contrast=1e-5))
 
 
 def radius(found: Detection) -> Image:
@@ -122,24 +148,67 @@ def test_ignoring_the_wavefront_would_be_noticed(world: World) -> None:
     assert fit.linear is not None
     frozen = replace(fit.linear, deviation=1e-6 * torch.ones_like(fit.linear.deviation))
     outdated = FLUX * world.model(world.opd).numpy()
-    residual = torch.from_numpy(fit.observation.data[0] - outdated)
+    residual = torch.from_numpy(fit.frames[0].observation.data[0] - outdated)
     part = replace(frozen.frames[0], residual=residual)
     frozen = replace(frozen, frames=(part,), vector=frozen.mean)
     found = dr.detect(replace(fit, linear=frozen), threshold=math.inf)
     assert found.snr[radius(found) > 0.25].std() > 1.5
 
 
-def test_flux_of_planets_is_unbiased_and_its_error_right(world: World) -> None:
-    pulls, ratios = [], []
-    for seed in range(8):
-        planet = Planet(2e-5, 0.5 + 0.06 * seed, 47.0 * seed)
-        table = dr.measure(world.fitted(100 + seed, planet), [planet.offset])
-        pulls.append(float((table["contrast"][0] - 2e-5) / table["contrast_error"][0]))
-        ratios.append(float(table["contrast"][0] / 2e-5))
-    # Standard errors of 8 pulls: 0.35 in the mean, 0.25 in the deviation.
-    assert abs(np.mean(pulls)) < 0.9
-    assert 0.4 < np.std(pulls) < 1.7
-    assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)
+FEW = JointBasis([SegmentMotions(), FourierModes(4)])
+
+
+@cache
+def small() -> tuple[OpticalSystem, Image]:
+    """A system whose fits take less than a second, and an old wavefront."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=64, fov_pixels=32)
+    return model, random_opd(3, npix=64).data
+
+
+@cache
+def pulls(seed: int) -> tuple[float, float | None, float | None]:
+    """Errors of a planet's contrast, x and y over those stated; new wavefront, place and noise.
+
+    None for the position of a planet that is not above the threshold.
+    """
+    model, opd = small()
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.where(FEW.frequencies == 0, 1.0, 0.15)
+    change = torch.randn(len(FEW), dtype=torch.float64, generator=generator) * size * 1e-9
+    later = opd + FEW.opd(change, PupilGrid.full(64)).numpy()
+    flux, planet = 3e10, Planet(1.2e-5, 0.5 + 0.1 * (seed % 4), 47.0 * seed)
+    world = World(model, opd, later)
+    frame = world.observed(flux / FLUX * world.expected(planet), seed)
+    fit = refine(model, frame, opd, settings=GaussNewton(basis=FEW, response_npix=64))
+    found = dr.detect(fit)
+    row = found.measure([planet.offset])[0]
+    contrast = float((row["contrast"] - planet.contrast) / row["contrast_error"])
+    if len(found.table) != 1:
+        return contrast, None, None
+    there = found.table[0]
+    x, y = (
+        float((there[axis].value - true) / there[f"{axis}_error"].value)
+        for axis, true in zip("xy", planet.offset, strict=True)
+    )
+    return contrast, x, y
+
+
+@pytest.mark.parametrize(
+    ("count", "within"), [(12, 1.6), pytest.param(72, 1.25**0.5, marks=pytest.mark.slow)]
+)
+def test_contrast_and_place_of_planets_are_unbiased_and_their_errors_right(
+    count: int, within: float
+) -> None:
+    """Errors that are wrong by a factor of 1.25 do not pass the second bound.
+
+    The deviation of 72 pulls is known to 8 %, of 144 to 6 %; of 12 to 20 %.
+    """
+    contrast, x, y = zip(*(pulls(seed) for seed in range(count)), strict=True)
+    places = np.array([pull for pull in (*x, *y) if pull is not None])
+    assert len(places) > 1.7 * count
+    for drawn in (np.array(contrast), places):
+        assert abs(drawn.mean()) < 3 / len(drawn) ** 0.5
+        assert 1 / within < drawn.std() < within
 
 
 def test_the_subtracted_frame_has_lost_light_that_the_measurement_has_not(world: World) -> None:
@@ -148,14 +217,14 @@ def test_the_subtracted_frame_has_lost_light_that_the_measurement_has_not(world:
     fit = world.fitted(7, planet)
     assert not len(fit.companions)
     light = world.expected(planet) - world.expected()
-    weight = light / fit.observation.error[0] ** 2
-    kept = float((weight * fit.residual[0]).sum() / (weight * light).sum())
+    weight = light / fit.frames[0].observation.error[0] ** 2
+    kept = float((weight * fit.frames[0].residual[0]).sum() / (weight * light).sum())
     measured = float(dr.measure(fit, [planet.offset])["contrast"][0]) / 2e-5
     assert kept < 0.9
     assert measured == pytest.approx(1.0, abs=0.2)
 
 
-@pytest.mark.parametrize("contrast", [3e-5, 1e-3])
+@pytest.mark.parametrize("contrast", [2e-5, 1e-3])
 def test_a_bright_companion_gets_parameters_of_its_own(world: World, contrast: float) -> None:
     """Without them the wavefront bends to it, and nothing converges."""
     planet = replace(WHERE, contrast=contrast)
@@ -165,14 +234,14 @@ def test_a_bright_companion_gets_parameters_of_its_own(world: World, contrast: f
     measured, error = fit.companions[0], fit.companion_errors[0]
     assert measured[0] == pytest.approx(contrast, rel=0.02, abs=4 * error[0])
     assert measured[1:] == pytest.approx(planet.offset, abs=0.005)
-    assert fit.star_image == pytest.approx(world.expected(), rel=0.02, abs=100)
+    assert fit.frames[0].star == pytest.approx(world.expected(), rel=0.02, abs=100)
 
 
-@pytest.mark.parametrize(("contrast", "again"), [(5e-6, False), (1e-5, True)])
+@pytest.mark.parametrize(("contrast", "seed", "again"), [(5e-6, 7, False), (1e-5, 11, True)])
 def test_only_what_bends_the_wavefront_far_has_it_fitted_anew(
-    world: World, contrast: float, again: bool
+    world: World, contrast: float, seed: int, again: bool
 ) -> None:
-    fit = world.fitted(7, replace(WHERE, contrast=contrast))
+    fit = world.fitted(seed, replace(WHERE, contrast=contrast))
     assert len(fit.companions) == 1
     began = [record["wavefront"] for record in fit.history]
     assert (began != sorted(began)) == again
@@ -180,14 +249,14 @@ def test_only_what_bends_the_wavefront_far_has_it_fitted_anew(
 
 def test_what_a_fit_took_for_a_companion_need_not_be_one(world: World) -> None:
     observation = world.observed(world.expected(), 4)
-    fit = world.refined(observation, planets=(replace(WHERE, contrast=1e-6),))
+    fit = world.refined(observation, companions=(replace(WHERE, contrast=1e-6),))
     assert len(fit.companions) == 1
     assert len(dr.detect(fit).table) == 0
 
 
 def test_a_prior_that_is_held_too_narrow_is_noticed(world: World) -> None:
     observation = world.observed(world.expected(), 4)
-    scales = world.refined(observation).scales
+    scales = world.fitted(4).scales
     for factor, status in ((1.0, Status.CONVERGED), (1 / 3, Status.PRIOR_MISMATCH)):
         held = WavefrontPrior({k: factor * v for k, v in scales.items()}, fit_scales=False)
         fit = world.refined(observation, prior=held)
@@ -198,7 +267,7 @@ def test_a_prior_that_is_held_too_narrow_is_noticed(world: World) -> None:
 def test_a_planet_does_not_make_the_noise_larger(world: World) -> None:
     planet = replace(WHERE, contrast=3e-6)
     quiet, fit = world.fitted(5), world.fitted(5, planet)
-    noise, found = dr.detect(quiet), dr.detect(fit)
+    noise, found = world.detected(5), world.detected(5, planet)
     assert len(found.candidates) == 1
     assert len(fit.companions) == 0
     # Its light would be structure that no mode explains.
@@ -216,6 +285,7 @@ def test_weights_for_outliers_do_not_hide_structure(world: World) -> None:
     assert dr.detect(fit).scatter == pytest.approx(math.sqrt(fit.reduced_chi2), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_model_that_is_wrong_inflates_the_errors(world: World) -> None:
     """A wavefront that moved more than the prior allows at frequencies that are not fitted."""
     rough = FourierModes(24.0, 14.0)
@@ -261,9 +331,9 @@ def test_measuring_at_a_pixel_gives_the_maps_value(one: Detection) -> None:
 
 def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world: World) -> None:
     """A contrast is relative to the star's light; whether there is a source at all is not."""
-    fit = world.fitted(14, Planet(4e-6, 0.7, 60.0))  # Too faint to be refined again.
+    fit = world.fitted(5, replace(WHERE, contrast=3e-6))  # Too faint to be refined again.
     row, scaled = (dr.measure(fit, [WHERE.offset], scatter=factor)[0] for factor in (1.0, 2.0))
-    relative = fit.errors["flux"][0] / fit.values["flux"][0]
+    relative = fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
     assert 1e-4 < relative < 0.05
     expected = row["contrast"] * math.hypot(relative, 1 / row["snr"])
     # At this S/N the flux's share is small, but far above rounding.
@@ -275,16 +345,16 @@ def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world: World) -> N
 
 def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(world: World) -> None:
     """As far as wavefronts that are as probable as the one that was found change its light."""
-    found = dr.detect(world.fitted(13, replace(WHERE, contrast=1e-3)))
+    found = world.detected(7, replace(WHERE, contrast=1e-3))
     (linear, templates), fit = found.groups[0], found.fits[0]
     row = found.table[0]
     own = row["contrast"] / row["snr"]
     stated = math.sqrt((row["contrast_error"] ** 2 - own**2).item()) / row["contrast"]
-    assert fit.coefficients is not None
+    assert fit.frames[0].coefficients is not None
     deviation = linear.covariance.diagonal().sqrt()
     factor = torch.linalg.cholesky(linear.covariance / deviation[:, None] / deviation)
     generator = torch.Generator().manual_seed(2)
-    offset, flux = found.candidates.offsets[0], linear.names.index("flux[0]")
+    offset, flux = found.candidates.offsets[0], linear.unknowns.index(Unknown("flux", 0))
     image = templates.image(0, offset)
     seen = image * linear.frames[0].weight ** 2
     changes = []
@@ -293,17 +363,17 @@ def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(world: W
         drawn *= deviation
         opd = BASIS.opd(1e-9 * drawn[-len(BASIS) :], PupilGrid.full(NPIX))
         light = float((seen * templates.image(0, offset, opd)).sum() / (seen * image).sum())
-        changes.append(light * (1 + float(drawn[flux] / fit.values["flux"][0])))
+        changes.append(light * (1 + float(drawn[flux] / fit.frames[0].values["flux"][0])))
     assert stated == pytest.approx(float(np.std(changes)), rel=0.12)
     # The star's flux alone would not do.
-    assert stated > 1.15 * fit.errors["flux"][0] / fit.values["flux"][0]
+    assert stated > 1.15 * fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
 
 
 def test_a_wavefront_that_is_known_adds_nothing_to_a_bright_contrasts_error(world: World) -> None:
     known = replace(world, opd=world.later)
     found = dr.detect(known.fitted(14, replace(WHERE, contrast=1e-3), wavefront=False))
     fit, row = found.fits[0], found.table[0]
-    relative = found.scatter * fit.errors["flux"][0] / fit.values["flux"][0]
+    relative = found.scatter * fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
     expected = row["contrast"] * math.hypot(relative, 1 / row["snr"])
     assert row["snr"] > 100
     # The fit's own error of the flux knows of the companion beside it, the map's does not.
@@ -314,13 +384,16 @@ def test_a_wavefront_that_is_known_adds_nothing_to_a_bright_contrasts_error(worl
 
 def test_what_flux_and_image_do_to_a_contrast_may_cancel(one: Detection) -> None:
     (linear, templates), offset = one.groups[0], torch.tensor([WHERE.offset], dtype=torch.float64)
-    flux, mode = linear.names.index("flux[0]"), linear.names.index("modes[40]")
+    flux, mode = (
+        linear.unknowns.index(Unknown("flux", 0)),
+        linear.unknowns.index(Unknown("modes", 40)),
+    )
     seen = templates.image(0, offset[0]) * linear.frames[0].weight ** 2
     nanometre = BASIS.opd(1e-9 * torch.eye(len(BASIS)).double()[40], PupilGrid.full(NPIX))
     more, less = (templates.image(0, offset[0], step * nanometre) for step in (0.5, -0.5))
     slope = (seen * (more - less)).sum() / (seen * templates.image(0, offset[0])).sum()
-    changes = torch.zeros(len(linear.names), dtype=torch.float64)
-    changes[flux], changes[mode] = 1 / one.fits[0].values["flux"][0], slope
+    changes = torch.zeros(len(linear.unknowns), dtype=torch.float64)
+    changes[flux], changes[mode] = 1 / one.fits[0].frames[0].values["flux"][0], slope
     deviation = torch.full_like(linear.deviation, 1e-12)
     deviation[[flux, mode]] = 1e-3 / changes[[flux, mode]].abs()
 
@@ -347,10 +420,10 @@ def test_two_planets_closer_than_a_beam_are_fitted_together(world: World) -> Non
         assert contrast == pytest.approx(planet.contrast, rel=0.3)
 
 
+@pytest.mark.slow
 def test_a_bright_planet_is_measured_right_after_the_star_is_refined_again(world: World) -> None:
     planet = replace(WHERE, contrast=1e-3)
-    # With a model error that is allowed for, a fit does not look for companions by itself.
-    fit = world.refined(world.observed(world.expected(planet), 13), kappa_floor=1e-6)
+    fit = world.fitted(13, planet, **NOT_LOOKING)
     assert not len(fit.companions)
     found = dr.detect(fit)
     assert found.fits[0] is not fit
@@ -372,7 +445,7 @@ def test_a_bright_ring_keeps_its_light(world: World) -> None:
     assert abs(amplitude - 1) < max(0.02, 4 * error)
     assert error < 0.05
     weight = light / observation.error[0] ** 2
-    assert (weight * fit.residual[0]).sum() / (weight * 1e-4 * light).sum() < 0.95
+    assert (weight * fit.frames[0].residual[0]).sum() / (weight * 1e-4 * light).sum() < 0.95
 
 
 def test_a_planet_on_the_edge_of_the_field_is_measured(world: World) -> None:
@@ -383,12 +456,14 @@ def test_a_planet_on_the_edge_of_the_field_is_measured(world: World) -> None:
 
 def test_a_fit_that_is_gone_holds_no_memory(world: World) -> None:
     """Its responses are its largest part; the collector would come for them much too late."""
-    dr.detect(world.fitted(14))  # torch keeps some of its first derivative.
+    shot = world.observed(world.expected(replace(WHERE, contrast=1e-4)), 15)
+    short = {"max_iterations": 6, "max_companions": 1}
+    dr.detect(world.refined(shot, **short))  # torch keeps some of its first derivative.
     gc.collect()
     gc.disable()
     gc.set_debug(gc.DEBUG_SAVEALL)
     try:
-        dr.detect(world.fitted(15, Planet(1e-4, 0.7, 60.0)))
+        dr.detect(world.refined(shot, **short))
         gc.collect()
         left = [each for each in gc.garbage if isinstance(each, torch.Tensor)]
     finally:
@@ -402,11 +477,14 @@ def test_a_fit_that_is_gone_holds_no_memory(world: World) -> None:
 
 
 def test_independent_looks_add_their_information(world: World) -> None:
-    fits = [world.fitted(20 + k, replace(WHERE, contrast=1e-5)) for k in range(4)]
-    single = dr.measure(fits[0], [WHERE.offset])
-    joint = dr.measure(fits, [WHERE.offset])
-    gain = float(single["contrast_error"][0] / joint["contrast_error"][0])
-    assert gain == pytest.approx(2.0, rel=0.1)
+    # Below the S/N at which the star is refined again.
+    fits = [world.fitted(20 + k, replace(WHERE, contrast=4e-6)) for k in range(4)]
+    single = [float(dr.measure(fit, [WHERE.offset])["contrast_error"][0]) for fit in fits]
+    (joint,) = dr.measure(fits, [WHERE.offset])
+    # Of the errors' excess over the noise, which is taken from all together, 4 % are known.
+    expected = np.sum(np.array(single) ** -2.0) ** -0.5
+    assert joint["contrast_error"] == pytest.approx(expected, rel=0.04)
+    assert abs(joint["contrast"] - 4e-6) < 4 * joint["contrast_error"]
 
 
 def test_rolled_frames_share_the_star_and_turn_the_planet(world: World) -> None:
@@ -421,7 +499,7 @@ def test_rolled_frames_share_the_star_and_turn_the_planet(world: World) -> None:
         )
         for k, turned in enumerate((0.0, 10.0))
     ]
-    together = world.refined(frames)  # type: ignore[arg-type]
+    together = world.refined(frames)
     apart = [world.refined(each) for each in frames]
     joint, separate = (dr.measure(fits, [planet.offset]) for fits in (together, apart))
     for table in (joint, separate):
@@ -435,15 +513,13 @@ def test_a_reference_star_helps_and_shows_no_planet(world: World) -> None:
     planet = replace(WHERE, contrast=1e-5)
     target = world.observed(world.expected(planet), 40)
     reference = replace(world.observed(4 * world.expected(), 41), reference=True)
-    fits = world.refined([target, reference])  # type: ignore[arg-type]
+    fit = world.refined([target, reference])
     alone = dr.measure(world.refined(target), [planet.offset])
-    both = dr.measure(fits, [planet.offset])
+    both = dr.measure(fit, [planet.offset])
     assert abs(float(both["contrast"][0]) - 1e-5) < 4 * float(both["contrast_error"][0])
     assert both["contrast_error"][0] < 0.99 * alone["contrast_error"][0]
-    with pytest.raises(IncompatibleSetupError, match="1 of 2 frames"):
-        dr.detect(fits[0])
     with pytest.raises(IncompatibleSetupError, match="reference star"):
-        dr.detect([fits[1], fits[0]])
+        dr.detect(replace(fit, frames=fit.frames[::-1]))
 
 
 def test_dithered_frames_have_star_positions_of_their_own(world: World) -> None:
@@ -451,22 +527,23 @@ def test_dithered_frames_have_star_positions_of_their_own(world: World) -> None:
     frames = [
         world.observed(world.expected(offset=offset), 50 + k) for k, offset in enumerate(offsets)
     ]
-    fits = world.refined(frames)  # type: ignore[arg-type]
-    for fit, offset in zip(fits, offsets, strict=True):
-        away = np.abs(fit.values["star_offset"] - offset)
+    fit = world.refined(frames)
+    first, second = fit.frames
+    for frame, offset in zip(fit.frames, offsets, strict=True):
+        away = np.abs(frame.values["star_offset"] - offset)
         # The wavefront's own tilt, 0.16 mas here, is not to be told from the star's offset.
-        assert (away < 4 * fit.errors["star_offset"] + 1.6e-4).all()
-    apart = fits[1].values["star_offset"] - fits[0].values["star_offset"]
+        assert (away < 4 * frame.errors["star_offset"] + 1.6e-4).all()
+    apart = second.values["star_offset"] - first.values["star_offset"]
     np.testing.assert_allclose(apart, offsets[1], atol=5e-5)
-    assert fits[0].linear is fits[1].linear
-    np.testing.assert_array_equal(fits[0].values["lyot_shift"], fits[1].values["lyot_shift"])
+    np.testing.assert_array_equal(first.opd, second.opd)
+    np.testing.assert_array_equal(first.values["lyot_shift"], second.values["lyot_shift"])
 
 
 def test_the_errors_of_frames_fitted_together_are_their_own(world: World) -> None:
     first, second = (world.observed(world.expected(), 55 + k) for k in range(2))
     noisy = replace(second, error=3 * second.error)
-    fits = world.refined([first, noisy])
-    apart = {name: noisier / fits[0].errors[name] for name, noisier in fits[1].errors.items()}
+    quiet, other = world.refined([first, noisy]).frames
+    apart = {name: noisier / quiet.errors[name] for name, noisier in other.errors.items()}
     # Hardly anything else says what the background is; all say what the wavefront is, and with it
     # where the star is.
     assert apart["background"][0] == pytest.approx(2.9, abs=0.2)
@@ -481,15 +558,15 @@ def test_snapshots_may_drift_apart_by_what_the_prior_allows(world: World) -> Non
     moved = replace(world, later=world.later + BASIS.opd(change, PupilGrid.full(NPIX)).numpy())
     frames = [world.observed(world.expected(), 60), moved.observed(moved.expected(), 61)]
     linked = world.refined(
-        frames,  # type: ignore[arg-type]
+        frames,
         drift=WavefrontPrior(scales={"segment": 0.5, "texture": 0.02}),
         drift_cycles=2.0,
     )
-    shared = world.refined(frames)  # type: ignore[arg-type]
-    assert linked[0].chi2_per_pixel < 0.8 * shared[0].chi2_per_pixel
-    assert linked[0].chi2_per_pixel < 1.2
-    assert linked[0].scales["segment drift"] == pytest.approx(0.7, abs=0.35)
-    apart = linked[1].opd - linked[0].opd
+    shared = world.refined(frames)
+    assert linked.chi2_per_pixel < 0.8 * shared.chi2_per_pixel
+    assert linked.chi2_per_pixel < 1.2
+    assert linked.scales["segment drift"] == pytest.approx(0.7, abs=0.35)
+    apart = linked.frames[1].opd - linked.frames[0].opd
     assert np.std(apart) > 0.2e-9
 
 
@@ -550,10 +627,6 @@ def test_products_can_be_read_by_others(one: Detection, tmp_path: Path) -> None:
     assert len(curve) == len(one.contrast_curve)
 
 
-NOT_LOOKING = {"kappa_floor": 1e-6}
-"""With this option fits do not look for companions by themselves."""
-
-
 def kept(image: Image, star: Image, light: Image, error: Image) -> float:
     """Share of a planet's light that is in a subtracted frame, and not its noise's or star's."""
     good = np.isfinite(image)
@@ -562,41 +635,43 @@ def kept(image: Image, star: Image, light: Image, error: Image) -> float:
 
 
 def test_a_frame_keeps_the_light_of_candidates(world: World) -> None:
-    planet = replace(WHERE, contrast=2.5e-6)  # Too faint for the star to be refined again.
+    planet = replace(WHERE, contrast=3e-6)  # Too faint for the star to be refined again.
     light = world.expected(planet) - world.expected()
-    found = dr.detect(world.fitted(14, planet))
+    found = world.detected(5, planet)
     assert len(found.candidates) == 1
     fit = found.fits[0]
     assert not len(fit.companions)
     # What is left of the star and its noise, were it known.
-    noise = fit.observation.data[0] - world.expected() - light
-    error = fit.observation.error[0]
-    assert kept(fit.residual[0], noise, light, error) < 0.9
+    noise = fit.frames[0].observation.data[0] - world.expected() - light
+    error = fit.frames[0].observation.error[0]
+    assert kept(fit.frames[0].residual[0], noise, light, error) < 0.9
     (image,) = found.subtracted
     assert kept(image, noise, light, error) == pytest.approx(1.0, abs=0.06)
     # A fit that has the planet from the start leaves the same.
     (renewed,) = with_companions(found.fits, found.candidates)
     away = radius(found) > 0.25
-    difference = ((image - renewed.residual[0]) / error)[away]
-    closed = ((fit.residual[0] - renewed.residual[0]) / error)[away]
+    difference = ((image - renewed.frames[0].residual[0]) / error)[away]
+    closed = ((fit.frames[0].residual[0] - renewed.frames[0].residual[0]) / error)[away]
     assert difference.std() < 0.05
     assert difference.std() < 0.2 * closed.std()
 
 
 def test_a_bright_companions_frame_is_what_its_own_fit_leaves(world: World) -> None:
     """The star is found in single precision once more; of 1e-3 that must not show."""
-    found = dr.detect(world.fitted(7, replace(WHERE, contrast=1e-3)))
+    found = world.detected(7, replace(WHERE, contrast=1e-3))
     (fit,) = found.fits
     assert len(fit.companions) == len(found.candidates) == 1
-    difference = (found.subtracted[0] - fit.residual[0]) / fit.observation.error[0]
+    difference = (found.subtracted[0] - fit.frames[0].residual[0]) / fit.frames[
+        0
+    ].observation.error[0]
     assert difference[radius(found) > 0.25].std() < 0.05
 
 
 def test_a_companion_that_one_fit_knows_is_given_to_the_others(world: World) -> None:
-    planet = replace(WHERE, contrast=2e-5)
+    planet = replace(WHERE, contrast=7e-6)
     shots = [world.observed(world.expected(planet), 80 + k) for k in (0, 1)]
     fits = [
-        world.refined(shots[0], planets=(planet,), **NOT_LOOKING),
+        world.refined(shots[0], companions=(planet,), **NOT_LOOKING),
         world.refined(shots[1], **NOT_LOOKING),
     ]
     assert [len(fit.companions) for fit in fits] == [1, 0]
@@ -607,7 +682,7 @@ def test_a_companion_that_one_fit_knows_is_given_to_the_others(world: World) -> 
 def test_a_companion_that_is_none_is_given_to_no_fit(world: World) -> None:
     planet = replace(WHERE, contrast=2e-5)
     nothing = Planet(0.0, 0.9, 250.0)
-    fit = world.refined(world.observed(world.expected(planet), 80), planets=(planet, nothing))
+    fit = world.refined(world.observed(world.expected(planet), 80), companions=(planet, nothing))
     assert len(fit.companions) == 2
     found = dr.detect(fit)
     assert len(found.candidates) == len(found.fits[0].companions) == 1
@@ -617,8 +692,7 @@ def test_a_companion_that_is_none_is_given_to_no_fit(world: World) -> None:
 def test_a_reference_star_on_its_own_stays_as_it_was_fitted(
     world: World, options: dict[str, float]
 ) -> None:
-    shot = world.observed(world.expected(replace(WHERE, contrast=2e-5)), 7)
-    target = world.refined(shot, **options)
+    target = world.fitted(7, replace(WHERE, contrast=2e-5), **options)
     alone = replace(world.observed(4 * world.expected(), 72), reference=True)
     reference = world.refined(alone)
     found = dr.detect([target, reference])
@@ -630,10 +704,13 @@ def test_a_reference_star_on_its_own_stays_as_it_was_fitted(
 
 def test_without_candidates_a_frame_is_left_as_the_fit_left_it(empty: list[Detection]) -> None:
     fit = empty[0].fits[0]
-    difference = (empty[0].subtracted[0] - fit.residual[0]) / fit.observation.error[0]
+    difference = (empty[0].subtracted[0] - fit.frames[0].residual[0]) / fit.frames[
+        0
+    ].observation.error[0]
     assert difference.std() < 0.05
 
 
+@pytest.mark.slow
 def test_every_frame_is_subtracted_as_it_was_taken(world: World) -> None:
     """A roll, a masked pixel and a reference star, refined together."""
     planets = [Planet(2e-5, 0.7, 60.0 - turned) for turned in (0.0, 90.0)]
@@ -643,7 +720,7 @@ def test_every_frame_is_subtracted_as_it_was_taken(world: World) -> None:
     ]
     frames[1].valid[0, 3, 4] = False
     frames.append(replace(world.observed(4 * world.expected(), 72), reference=True))
-    found = dr.detect(world.refined(frames))  # type: ignore[arg-type]
+    found = dr.detect(world.refined(frames))
     assert len(found.candidates) == 1
     assert len(found.subtracted) == 3
     for frame, planet, image in zip(frames, planets, found.subtracted, strict=False):
@@ -653,20 +730,20 @@ def test_every_frame_is_subtracted_as_it_was_taken(world: World) -> None:
     assert np.argwhere(np.isnan(found.subtracted[1])).tolist() == [[3, 4]]
     assert np.abs(found.subtracted[2] / frames[2].error[0]).std() < 1.1
     apart = dr.detect([world.refined(frame) for frame in (frames[0], frames[2])])
-    np.testing.assert_allclose(apart.subtracted[1], apart.fits[1].residual[0], atol=1e-9)
+    np.testing.assert_allclose(apart.subtracted[1], apart.fits[1].frames[0].residual[0], atol=1e-9)
 
 
 def test_left_out_patches_are_larger_than_the_fits_own_residual(empty: list[Detection]) -> None:
     left, deviation = empty[0].left_out
     pull = (left / deviation)[radius(empty[0]) > 0.25]
-    assert np.nanstd(left) > 1.03 * np.nanstd(empty[0].fits[0].residual[0])
+    assert np.nanstd(left) > 1.03 * np.nanstd(empty[0].fits[0].frames[0].residual[0])
     assert np.nanstd(pull) == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_fit_without_a_linear_model_is_refused(world: World) -> None:
     observation = world.observed(world.expected(), 1)
-    fit = refine(world.model, observation, world.opd, method="adam", iterations=2)
-    with pytest.raises(IncompatibleSetupError, match="gauss-newton"):
+    fit = refine(world.model, observation, world.opd, settings=Adam(iterations=2))
+    with pytest.raises(IncompatibleSetupError, match=r"'adam'.*GaussNewton\(\)"):
         dr.detect(fit)
 
 
@@ -675,3 +752,50 @@ def test_no_fit_and_odd_positions_are_refused(one: Detection) -> None:
         dr.detect([])
     with pytest.raises(ShapeError, match=r"\(k, 2\)"):
         one.measure([0.1, 0.2, 0.3])
+    with pytest.raises(NonFiniteError, match="offsets"):
+        one.measure([[np.nan, 0.2]])
+
+
+def test_positions_may_have_a_unit(one: Detection) -> None:
+    plain = one.measure([[-0.485, 0.353]])
+    for offsets in ([[-485, 353]] * u.mas, [[-0.485, 0.353]] * u.arcsec):
+        for table in (one.measure(offsets), dr.measure(one.fits, offsets, scatter=one.scatter)):
+            for name in plain.colnames:
+                np.testing.assert_allclose(table[name], plain[name], rtol=1e-12)
+    with pytest.raises(UnitError, match="offsets"):
+        one.measure([[1.0, 2.0]] * u.m)
+
+
+def test_a_position_outside_the_field_is_refused(one: Detection) -> None:
+    """Such as one that somebody else calls arcsec, and means degrees or pixels."""
+    corner = one.grid[0, 0]
+    assert np.isfinite(one.measure([corner])["contrast"][0])
+    for far in (1.1 * corner, [[0.7, 0.35]] * u.deg, [0.0, -2.5], [-30.0, 5.0]):
+        with pytest.raises(IncompatibleSetupError, match=r"offsets: got .*from the star; .*u\.mas"):
+            one.measure(far)
+        with pytest.raises(IncompatibleSetupError, match="offsets"):
+            dr.measure(one.fits, far)
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, math.nan])
+def test_numbers_that_cannot_be_are_refused(one: Detection, value: float) -> None:
+    fit = one.fits[0]
+    for name in ("threshold", "inner", "scatter"):
+        with pytest.raises(IncompatibleSetupError, match=f"{name}: got .*positive"):
+            dr.detect(fit, **{name: value})
+    with pytest.raises(IncompatibleSetupError, match=r"separations: got .*positive"):
+        dr.detect(fit, separations=[0.5, value])
+    with pytest.raises(IncompatibleSetupError, match=r"separations: got .*positive"):
+        dr.contrast_curve(fit, [value])
+    for call in (dr.contrast_curve, dr.measure):
+        with pytest.raises(IncompatibleSetupError, match=r"scatter: got .*positive"):
+            call(fit, [[0.5, 0.5]], scatter=value)
+
+
+def test_a_contrast_curve_outside_the_field_is_refused(one: Detection) -> None:
+    fit = one.fits[0]
+    with pytest.raises(IncompatibleSetupError, match=r"separations: got \[5\.0, 6\.0\].*corners"):
+        dr.contrast_curve(fit, [5.0, 6.0])
+    # What is partly inside has rows for that part.
+    curve = dr.contrast_curve(fit, [500.0, 5000.0] * u.mas)
+    assert curve["separation"].to_value("arcsec").tolist() == [0.5]

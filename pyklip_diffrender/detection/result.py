@@ -19,9 +19,9 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.relinearise import has_only_reference_stars, without_light
 from pyklip_diffrender.detection.scale import scale_errors
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.io.files import replacing, write_fits
-from pyklip_diffrender.io.units import to_arcsec
+from pyklip_diffrender.io.units import require_finite, to_arcsec
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
@@ -43,6 +43,7 @@ def amplitudes(
     places = torch.from_numpy(np.atleast_2d(to_arcsec(offsets, "offsets")))
     if places.ndim != 2 or places.shape[1] != 2:
         raise ShapeError(f"offsets: got shape {tuple(places.shape)}, expected (k, 2)")
+    _require_inside(places.numpy(), groups[0][1].grid)
     numerator = torch.zeros(len(places), dtype=torch.float64)
     information = torch.zeros_like(numerator)
     for linear, templates in groups:
@@ -62,6 +63,22 @@ def amplitudes(
             "snr": snr,
         }
     )
+
+
+def _require_inside(places: Image, grid: Image) -> None:
+    """Refuse positions (k, 2) farther from the star than any pixel of a grid (ny, nx, 2)."""
+    require_finite(places, "offsets")
+    # Pixels have an extent; half a diagonal beyond their centres is still on the detector.
+    pixel = np.hypot(*(grid[1, 1] - grid[0, 0])) if min(grid.shape[:2]) > 1 else 0.0
+    reach = np.hypot(grid[..., 0], grid[..., 1]).max() + pixel / 2
+    distance = np.hypot(places[:, 0], places[:, 1])
+    if (distance > reach).any():
+        x, y = places[np.argmax(distance)]
+        raise IncompatibleSetupError(
+            f"offsets: got ({x:.4g}, {y:.4g}) arcsec, {distance.max():.4g} arcsec from the star; "
+            f"the corners of the field are within {reach:.3g} arcsec. Give x and y from the star "
+            "in arcsec, or with their unit, such as [[-485, 353]] * u.mas"
+        )
 
 
 def _amplitude(linear: LinearModel, frame: int, shape: torch.Tensor) -> tuple[float, float]:
@@ -215,6 +232,12 @@ class Detection:
         QTable
             x, y, contrast, contrast_error, snr; errors as in `table`. The other candidates stay
             in the data.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For a position outside the field.
+        NonFiniteError, ShapeError, UnitError
         """
         return amplitudes(self.groups, offsets, self.scatter)
 

@@ -96,9 +96,7 @@ def detect(
     """
     fits = _checked(fits)
     inner = float(to_arcsec(inner, "inner"))
-    for name, value in (("threshold", threshold), ("inner", inner)):
-        if not value > 0:
-            raise IncompatibleSetupError(f"{name}: got {value}, expected a positive number")
+    _require_positive(threshold=threshold, inner=inner, scatter=scatter)
     groups = _groups(fits)
     maps = Maps(groups, progress)
     candidates, factor = _search(maps, fits, threshold, inner, scatter, Candidates.of_fit(fits[0]))
@@ -155,9 +153,12 @@ def measure(
 
     Raises
     ------
-    IncompatibleSetupError, ShapeError
+    IncompatibleSetupError
+        See `detect`; also for a position outside the field.
+    NonFiniteError, ShapeError, UnitError
     """
     fits = _checked(fits)
+    _require_positive(scatter=scatter)
     table = _measured(fits, offsets, scatter)
     bright = table[table["snr"] > relinearise]
     if len(bright):
@@ -193,7 +194,7 @@ def contrast_curve(
     Parameters
     ----------
     fits : Refinement or sequence of Refinement
-    separations : array, optional
+    separations : array or Quantity, optional
         arcsec; as for `detect`.
     angles : int
         Positions per separation, at most.
@@ -205,12 +206,24 @@ def contrast_curve(
     -------
     QTable
         See `contrast.contrast_table`.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        See `detect`; also if no pixel of the field is at any of the separations.
     """
     fits = _checked(fits)
+    _require_positive(scatter=scatter)
     groups = _groups(fits)
     grid = groups[0][1].grid
     wanted = _separations(grid, separations)
     rings = ring_pixels(grid, wanted, angles)
+    if not any(len(ring[0]) for ring in rings):
+        raise IncompatibleSetupError(
+            f"separations: got {wanted.tolist()} arcsec, where the frames have no pixel; the "
+            f"corners of the field are {np.hypot(grid[..., 0], grid[..., 1]).max():.3g} arcsec "
+            "from the star"
+        )
     rows = np.concatenate([ring[0] for ring in rings])
     columns = np.concatenate([ring[1] for ring in rings])
     information = torch.zeros(len(rows), dtype=torch.float64)
@@ -238,6 +251,13 @@ def _checked(fits: Fits) -> list[Refinement]:
         if not fit.status.usable:
             raise IncompatibleSetupError(f"detect: the fit {fit.status.message}")
     return several
+
+
+def _require_positive(**values: float | None) -> None:
+    """Refuse numbers that are not positive; None stands for a default."""
+    for name, value in values.items():
+        if value is not None and not value > 0:
+            raise IncompatibleSetupError(f"{name}: got {value}, expected a positive number")
 
 
 def _groups(fits: Sequence[Refinement]) -> list[Group]:
@@ -313,7 +333,12 @@ def _scatter(
 
 def _separations(grid: NDArray[np.float64], separations: ArrayLike | None) -> NDArray[np.float64]:
     if separations is not None:
-        return np.atleast_1d(to_arcsec(separations, "separations"))
+        wanted = np.atleast_1d(to_arcsec(separations, "separations"))
+        if not (wanted > 0).all():
+            raise IncompatibleSetupError(
+                f"separations: got {wanted.tolist()} arcsec, expected positive numbers"
+            )
+        return wanted
     edge = min(np.abs(grid[:, 0, 0]).min(), np.abs(grid[:, -1, 0]).min(),
                np.abs(grid[0, :, 1]).min(), np.abs(grid[-1, :, 1]).min())  # fmt: skip
     return np.arange(0.2, edge + 1e-9, 0.1)

@@ -14,6 +14,7 @@ from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.wavefront.bases import default_basis
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = ["continued", "fit_with_growing_basis", "warm_start"]
 
@@ -54,16 +55,19 @@ def continued(fit: Refinement, **changes: Any) -> GaussNewton:
         raise IncompatibleSetupError(
             f"only a fit by Gauss-Newton can be continued, this one is by {fit.method!r}"
         )
-    scales = {name: fit.scales[name] for name in settings.prior.scales}
-    drift = settings.drift
-    if drift is not None and len(fit.frames) > 1:
-        drift = replace(drift, scales={n: fit.scales[f"{n} drift"] for n in drift.scales})
     reached = {
-        "prior": replace(settings.prior, scales=scales),
-        "drift": drift,
+        "prior": _with_scales(settings.prior, fit.scales, "{}"),
+        "drift": settings.drift and _with_scales(settings.drift, fit.scales, "{} drift"),
         "companions": fit.planets,
     }
     return replace(settings, **{**reached, **changes})
+
+
+def _with_scales(prior: WavefrontPrior, scales: Mapping[str, float], label: str) -> WavefrontPrior:
+    """The prior with the scales of a fit; groups that its basis lacks keep their own."""
+    return replace(
+        prior, scales={n: scales.get(label.format(n), own) for n, own in prior.scales.items()}
+    )
 
 
 def fit_with_growing_basis(

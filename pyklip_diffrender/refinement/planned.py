@@ -120,11 +120,9 @@ def fit_problems(
     if settings.basis is None and warm is None:
         chosen = replace(settings, cycles=planned.refine_options["cycles"])
     fit = fit_with_growing_basis(cheap, chosen, warm, seed=seed, progress=progress)
-    if not fit.status.usable:
-        return replace(fit, plan=planned)
     finished = [_on_full_model(fit, k, each, settings.free) for k, each in enumerate(problems)]
     error = ModelError.largest(change for _, change in finished)
-    if planned.allows(error):
+    if planned.allows(error) or not fit.status.usable:
         return replace(
             fit,
             frames=tuple(frame for frame, _ in finished),

@@ -106,7 +106,13 @@ class GaussNewton:
     robust: float = math.inf
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "cycles", tuple(np.atleast_1d(self.cycles).astype(float).tolist()))
+        try:
+            cycles = np.atleast_1d(np.asarray(self.cycles, dtype=float))
+        except (TypeError, ValueError) as reason:
+            raise IncompatibleSetupError(
+                f"cycles: got {self.cycles!r}, expected a number or several, such as (24, 32)"
+            ) from reason
+        object.__setattr__(self, "cycles", tuple(cycles.tolist()))
         for name in ("free", "own"):
             value = getattr(self, name)
             if isinstance(value, str):
@@ -116,24 +122,28 @@ class GaussNewton:
                 )
             object.__setattr__(self, name, tuple(value))
         object.__setattr__(self, "companions", tuple(self.companions))
+        if not all(isinstance(each, Planet) for each in self.companions):
+            raise IncompatibleSetupError(
+                f"companions: got {self.companions}, expected Planets, such as "
+                "(Planet.from_offset(contrast, x, y),)"
+            )
         if not self.cycles and self.basis is None and self.wavefront:
             raise IncompatibleSetupError("cycles: got none, expected at least one, such as 24")
-        if any(each <= 0 for each in self.cycles):
+        if not all(each > 0 for each in self.cycles):
             raise IncompatibleSetupError(f"cycles: got {self.cycles}, expected positive numbers")
-        for name in (
+        _require_positive(
+            self,
             "max_iterations",
             "tolerance",
             "robust",
             "relinearise",
             "response_npix",
             "response_wavelengths",
-        ):
-            if not getattr(self, name) > 0:
-                raise IncompatibleSetupError(
-                    f"{name}: got {getattr(self, name)}, expected a positive number"
-                )
+            "companion_threshold",
+            "drift_cycles",
+        )
         for name in ("min_model_error", "max_companions"):
-            if getattr(self, name) < 0:
+            if not getattr(self, name) >= 0:
                 raise IncompatibleSetupError(
                     f"{name}: got {getattr(self, name)}, expected 0 or more"
                 )
@@ -144,7 +154,10 @@ class GaussNewton:
                     f"of the free parameters {self.free}"
                 )
         if not self.free and not self.wavefront:
-            raise IncompatibleSetupError("free is empty and wavefront is False: nothing to fit")
+            raise IncompatibleSetupError(
+                "free is empty and wavefront is False: nothing to fit. Name parameters in free, "
+                "such as ('flux', 'background'), or set wavefront=True"
+            )
 
     @classmethod
     def nircam(cls, **changes: Any) -> GaussNewton:
@@ -207,6 +220,18 @@ class Adam:
 
     iterations: int = 1000
     learning_rate: float = 1e-11
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "iterations", "learning_rate")
+
+
+def _require_positive(settings: GaussNewton | Adam, *names: str) -> None:
+    """Refuse fields that are not positive numbers."""
+    for name in names:
+        if not getattr(settings, name) > 0:
+            raise IncompatibleSetupError(
+                f"{name}: got {getattr(settings, name)}, expected a positive number"
+            )
 
 
 def settings_for(observation: Observation) -> GaussNewton:
