@@ -7,13 +7,15 @@ from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.masks import ROUND_MASKS
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.optics.grid import samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["model_for"]
+
+Items = tuple[tuple[str, Any], ...]
 
 _NPIX = 256
 """Samples across the pupil. The error of so coarse a grid, 2 % of the image, is static, and the
@@ -23,8 +25,9 @@ fit absorbs it: with 256 and 512 samples the residual of real frames was the sam
 def model_for(observation: Observation, size: int | None = None, **overrides: Any) -> OpticalSystem:
     """Make the model of the coronagraph for an observation.
 
-    Frames whose header says NIRCam get the detector's scale and shear from the SIAF. A model that
-    was made before is used again.
+    Frames whose header says NIRCam get the detector's scale and shear from the SIAF and the Lyot
+    stop where it is in flight, which is where a fit starts. A model that was made before is used
+    again.
 
     Parameters
     ----------
@@ -76,16 +79,19 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
             "nlambda": 7,
             "npix": npix,
             "occulter_sampling": 2.0,
+            "defaults": FLIGHT_ALIGNMENT,
         }
-    items = tuple(sorted({**arguments, **overrides}.items()))
+    arguments |= overrides
+    defaults = arguments.pop("defaults", None)
+    items = tuple(sorted(arguments.items()))
     try:
-        return _made_once(observation.filter, items)
+        return _made_once(observation.filter, items, tuple(sorted((defaults or {}).items())))
     except TypeError:  # An argument that cannot be a key, such as a spectrum in arrays.
-        return _made(observation.filter, items)
+        return _made(observation.filter, items, tuple((defaults or {}).items()))
 
 
-def _made(name: str, items: tuple[tuple[str, Any], ...]) -> OpticalSystem:
-    return nircam_coronagraph(name, **dict(items))
+def _made(name: str, items: Items, defaults: Items) -> OpticalSystem:
+    return nircam_coronagraph(name, **dict(items), defaults=dict(defaults))
 
 
 _made_once = lru_cache(maxsize=4)(_made)
