@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
-__all__ = ["Position", "has_memory", "is_plain", "position_of"]
+__all__ = ["Position", "has_memory", "is_plain", "kept", "position_of"]
+
+Key = TypeVar("Key", bound=Hashable)
+Made = TypeVar("Made")
 
 Position = tuple[tuple[str, float], ...]
 """Named values as plain numbers, for the key of what is computed from them."""
@@ -42,3 +46,33 @@ def position_of(values: Mapping[str, Tensor], names: Iterable[str]) -> Position 
             return None
         found += [(name, number) for number in values[name].flatten().tolist()]
     return tuple(found)
+
+
+def kept(
+    store: dict[Key, tuple[Position, Made]],
+    key: Key,
+    position: Position | None,
+    make: Callable[[], Made],
+) -> Made:
+    """What was made last for a key, if it was made for the same position, else a new one.
+
+    Parameters
+    ----------
+    store : dict
+        Of the latest for each key. Nothing is stored of what is being differentiated (position
+        None), nor within a transform of `torch.func`, which wraps all results: wrapped tensors
+        cannot be copied when it is over.
+    key : hashable
+    position : Position or None
+        See `position_of`.
+    make : callable
+        Makes a new one.
+    """
+    if position is None:
+        return make()
+    latest = store.get(key)
+    if latest is None or latest[0] != position:
+        latest = (position, make())
+        if has_memory(torch.zeros(()) + 0):
+            store[key] = latest
+    return latest[1]

@@ -36,7 +36,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.differentiation import Position, position_of
+from pyklip_diffrender.optics.differentiation import Position, kept, position_of
 from pyklip_diffrender.optics.fourier import MatrixFourier, centred, tilt_phases
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, transform_polygons
 from pyklip_diffrender.optics.zernike import zernike_basis
@@ -220,7 +220,7 @@ class LyotStop:
         # two, for whatever else is kept is kept for each.
         self._tight = centred(full.around(polygon_coverage(openings, full)))
         self._wide = self._tight.widened(self.margin * diameter)
-        self._kept: dict[PupilGrid, tuple[Position, Tensor]] = {}
+        self._latest: dict[PupilGrid, tuple[Position, Tensor]] = {}
 
     def window(self, values: Values) -> PupilGrid:
         return self._tight if set(self.parameters).isdisjoint(values) else self._wide
@@ -228,12 +228,7 @@ class LyotStop:
     def amplitude(self, values: Values) -> Tensor:
         """Transmission on the window, (rows, columns)."""
         position, grid = position_of(values, self.parameters), self.window(values)
-        if position is None:
-            return self._coverage(values, grid)
-        kept = self._kept.get(grid)
-        if kept is None or kept[0] != position:
-            kept = self._kept[grid] = (position, self._coverage(values, grid))
-        return kept[1]
+        return kept(self._latest, grid, position, lambda: self._coverage(values, grid))
 
     def _coverage(self, values: Values, grid: PupilGrid) -> Tensor:
         zero = torch.zeros(2, dtype=torch.float64)

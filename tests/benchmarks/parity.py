@@ -285,13 +285,14 @@ def main() -> None:
         ]
     official = []
     if arguments.official:
-        os.environ["STPSF_PATH"] = str(arguments.official)
+        path = arguments.official.resolve()
+        os.environ["STPSF_PATH"] = str(path)
         official = [
             "## STScI's files",
             "",
             OFFICIAL,
             "",
-            *on_official_files(arguments.official),
+            *on_official_files(path),
             "",
         ]
     page = arguments.output.read_text(encoding="utf-8") if arguments.output.exists() else ""
@@ -301,7 +302,8 @@ def main() -> None:
             [
                 "# Parity with poppy and stpsf",
                 "",
-                "Written by a script; do not edit.",
+                "Written by a script, but for the section on speed, which stays as it is unless "
+                "the script is run with --speed.",
                 "",
                 *provenance("tests/benchmarks/parity.py", ("poppy", "stpsf", "pysiaf")),
                 "",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from pyklip_diffrender.optics.differentiation import (
     Position,
     has_memory,
     is_plain,
+    kept,
     position_of,
 )
 from pyklip_diffrender.optics.fast.occulter import DEFAULT_SAMPLING, OcculterLattice, finest_spacing
@@ -38,8 +39,6 @@ from pyklip_diffrender.optics.planes import (
 from pyklip_diffrender.optics.sampled_planes import Gain, PupilOptic
 
 __all__ = ["LatticeRoute", "is_pointwise"]
-
-T = TypeVar("T")
 
 _POINTWISE = (Gain, InternalAberration, LyotStop, PupilOptic, PupilStop)
 
@@ -118,7 +117,7 @@ class LatticeRoute:
 
         A shift of the detector is a tilt there, so that the rest does not see it.
         """
-        return _kept(
+        return kept(
             self._stops,
             wavelength,
             position_of(values, self._moving),
@@ -146,7 +145,7 @@ class LatticeRoute:
         return replace(stop, field=stop.field * factors[0][None, :] * factors[1][:, None])
 
     def _kernel(self, stop: Wavefront, values: Values) -> Tensor:
-        return _kept(
+        return kept(
             self._kernels,
             stop.wavelength,
             position_of(values, self._moving),
@@ -222,7 +221,7 @@ class LatticeRoute:
         values: Values,
         onto: Sequence[PupilGrid],
     ) -> _StreamedStar:
-        return _kept(
+        return kept(
             self._stars,
             wavelength,
             position_of(values, self._moving),
@@ -251,24 +250,6 @@ class LatticeRoute:
         return _StreamedStar(
             self._stream, branches, lattice, self._kernel(stop, values), self.detector.per_sample
         )
-
-
-def _kept(
-    store: dict[float, tuple[Position, T]],
-    wavelength: float,
-    position: Position | None,
-    make: Callable[[], T],
-) -> T:
-    """What was made last for a wavelength, if it was made at this position, else a new one.
-
-    Nothing is kept of what is being differentiated (position None).
-    """
-    if position is None:
-        return make()
-    kept = store.get(wavelength)
-    if kept is None or kept[0] != position:
-        kept = store[wavelength] = (position, make())
-    return kept[1]
 
 
 @dataclass(frozen=True)
