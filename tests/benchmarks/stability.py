@@ -4,7 +4,7 @@ Run from the root of the project, with the package installed:
 
     python tests/benchmarks/stability.py
 
-It writes docs/stability.md. ``pytest -m hard`` holds every line to its limit.
+It writes docs/stability.md. ``pytest --full -m hard`` holds every line to its limit.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ INTRODUCTION = """# Numerical stability
 
 Written by a script; do not edit.
 
-What has broken codes of this kind, measured on small grids. `pytest -m hard` holds every line to
-its limit, and tests what has no number: gradients at exact zeros, masked pixels, damaged files,
-processes that are killed. The cases are defined in `tests/hard`.
+What has broken codes of this kind, measured on small grids. `pytest --full -m hard` holds every
+line to its limit, and tests what has no number: gradients at exact zeros, masked pixels, damaged
+files, processes that are killed. The cases are defined in `tests/hard`.
 """
 
 OPTICS = """
