@@ -114,6 +114,7 @@ def test_a_missing_library_is_said(here: Setting, monkeypatch: pytest.MonkeyPatc
     assert "No module named 'hcipy'" in notes["hcipy"]
 
 
+@pytest.mark.slow
 def test_stpsf_is_one_of_the_ways(stpsf_path: Path) -> None:
     with_data = Setting(quick=True, stpsf_path=str(stpsf_path))
     cases = {case.column: case for case in forward(with_data) if "stpsf" in case.column}
@@ -125,6 +126,7 @@ def test_stpsf_is_one_of_the_ways(stpsf_path: Path) -> None:
         plain_stpsf(stpsf_path, 512)
 
 
+@pytest.mark.slow
 def test_the_other_rows_run(here: Setting) -> None:
     table = run_bench(here, ["Jacobian"], budget=0.01, memory=False)
     fine = line(table, "Jacobian", "this package, 166 modes on 64", "float32")
@@ -140,6 +142,7 @@ def test_the_other_rows_run(here: Setting) -> None:
     assert fine["error"] < differences["error"] < 0.05
 
 
+@pytest.mark.slow
 def test_refinement_and_detection_run(here: Setting) -> None:
     table = run_bench(here, ["refinement", "S/N", "contrast"], budget=0.01, memory=False)
     ours = line(table, "refinement", "this package, the wavefront alone free")
@@ -192,6 +195,7 @@ def test_memory_is_that_of_the_arrays(here: Setting) -> None:
     assert 30e6 < memory_of(Case("row", "column", make), here) < 90e6
 
 
+@pytest.mark.slow
 def test_memory_in_a_process_of_its_own(here: Setting) -> None:
     (case,) = (
         c for c in forward(here) if c.column == "this package, 128" and c.precision == "float64"
@@ -200,6 +204,7 @@ def test_memory_in_a_process_of_its_own(here: Setting) -> None:
     assert math.isnan(peak_memory(case, here, timeout=0.01))
 
 
+@pytest.mark.slow
 def test_page_and_figure_from_the_table_alone(measured: Table, tmp_path: Path) -> None:
     table = run_bench(
         Setting(quick=True), ["scaling"], budget=0.01, memory=False, command="bench --quick"
@@ -284,6 +289,7 @@ def test_a_gpu_that_is_not_there_is_a_usage_error(
     assert "finds no GPU" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_it_runs_as_a_script(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tests.benchmarks.speed", "--help"],
