@@ -26,6 +26,8 @@ import pytest
 import torch
 from hypothesis import settings
 
+from pyklip_diffrender.linear.forward_mode import jacfwd
+
 ROOT = Path(__file__).resolve().parents[1]
 # For the scripts in tests/benchmarks; last, so that an installed package comes before its source.
 sys.path.append(str(ROOT))
@@ -68,6 +70,15 @@ def _torch_threads() -> Iterator[None]:
         torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _forward_mode() -> None:
+    """Torch's own deprecation warning, at its first forward-mode derivative, is behind us.
+
+    Tests call `torch.func` directly, and the package's way past that warning is in its `jacfwd`.
+    """
+    jacfwd(torch.sin)(torch.ones(1))
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
-from pyklip_diffrender.planning.build import CheapSystem
+from pyklip_diffrender.planning.systems import CheapSystem
 from pyklip_diffrender.wavefront.opd import random_opd
 
 WAVELENGTH = 4.5e-6

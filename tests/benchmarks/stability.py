@@ -92,7 +92,7 @@ def fits_table() -> list[str]:
     for row in fits.FITS:
         fit, error = row.run(torch.float64)
         single, _ = row.run(torch.float32)
-        apart = abs((single.star_image - fit.star_image) / fits.noise()).max()
+        apart = abs((single.frames[0].star - fit.frames[0].star) / fits.noise()).max()
         lines.append(
             f"| {row.case} | {row.trouble} | {fit.status.name} | {fit.chi2_per_pixel:.3g} | "
             f"{error:.2g} | {apart:.1e} | {row.sees} |"
@@ -104,7 +104,7 @@ def notes() -> dict[str, float]:
     """Numbers of the last paragraph."""
     pistons = fits.piston_of_segments()
     adam, start = fits.adam_on_pixels()
-    moved = 1e9 * (adam.opd - start)[fits.model().entrance.lit.numpy()]
+    moved = 1e9 * (adam.wavefront - start)[fits.model().entrance.lit.numpy()]
     return {
         "summed": optics.summed_in_float32(0.3),
         "summed_far": optics.summed_in_float32(1.0),

@@ -70,8 +70,8 @@ def test_a_fit_ends_as_the_table_says(row: FitRow) -> None:
     assert fit.status in row.ends
     # Of the fitted star: right where the fit says that it is, and a number everywhere.
     assert error <= row.limit
-    assert np.isfinite(fit.star_image).all()
-    assert np.isfinite(fit.opd).all()
+    assert np.isfinite(fit.frames[0].star).all()
+    assert np.isfinite(fit.wavefront).all()
     if "planet listed" in row.sees:
         ((contrast, *_),) = fit.companions.tolist()
         assert contrast == pytest.approx(1e-3, abs=4 * fit.companion_errors[0, 0])
@@ -80,7 +80,7 @@ def test_a_fit_ends_as_the_table_says(row: FitRow) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
-    ["nothing hard", "50 % missing", "saturated core, flagged", "the same with companions=1"],
+    ["nothing hard", "50 % missing", "saturated core, flagged", "the same with max_companions=1"],
 )
 def test_a_float32_model_fits_as_well(case: str) -> None:
     """The optics in float32, the algebra in float64."""
@@ -91,7 +91,7 @@ def test_a_float32_model_fits_as_well(case: str) -> None:
     double, _ = result(row, torch.float64)
     # In the worst pixel: 1e-6 of a star whose brightest pixel has 760 sigma, and what a fit that
     # stops at a tolerance makes of it. A 1 % brighter star is 7 sigma away there.
-    assert np.abs((single.star_image - double.star_image) / noise()).max() < 0.05
+    assert np.abs((single.frames[0].star - double.frames[0].star) / noise()).max() < 0.05
 
 
 @pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
@@ -99,10 +99,10 @@ def test_a_spoilt_star_is_no_success(spoil: object) -> None:
     """What the fits are held to, and the metrics of the reports, notice all of them."""
     wrong = spoil(star())  # type: ignore[operator]
     assert error_of(star() + BACKGROUND) < 1e-9
-    assert error_of(wrong + BACKGROUND) > 4 * SUCCESS
-    assert max(row.limit for row in FITS if row.ends == (Status.CONVERGED,)) < 4 * SUCCESS
+    assert error_of(wrong + BACKGROUND) > 3 * SUCCESS
+    assert max(row.limit for row in FITS if row.ends == (Status.CONVERGED,)) < 3 * SUCCESS
     middle = (11.5, 11.5)
-    assert star_model_error(wrong, star(), noise(), middle, 2, 10) > 4 * SUCCESS
+    assert star_model_error(wrong, star(), noise(), middle, 2, 10) > 3 * SUCCESS
     assert star_model_error(star(), star(), noise(), middle, 2, 10) == 0
     assert psnr(wrong, star(), middle) < 60 < psnr(star(), star(), middle)
     kept = throughput(wrong, star(), noise(), (5.0, 8.0))
@@ -127,13 +127,13 @@ def test_piston_of_all_segments_does_not_drift_and_is_reported_as_unknown() -> N
 def test_adam_moves_nothing_outside_the_pupil() -> None:
     """Its steps have one size for all pixels, so that piston drifts: no image shows it."""
     fit, start = adam_on_pixels()
-    moved = fit.opd - start
+    moved = fit.wavefront - start
     lit = model().entrance.lit.numpy()
     drift = moved[lit].mean()
     assert not moved[~lit].any()
     assert moved[lit].std() > 0.5e-9
     assert abs(drift) < 0.5 * moved[lit].std()
-    images = [model()(opd, OFFSET).numpy() for opd in (fit.opd, fit.opd - drift * lit)]
+    images = [model()(opd, OFFSET).numpy() for opd in (fit.wavefront, fit.wavefront - drift * lit)]
     assert worst(*images) < 1e-12
 
 
@@ -194,10 +194,10 @@ def test_masked_pixels_of_a_finished_observation_change_nothing_bitwise(
         fitted(each, dtype=dtype, max_iterations=3)
         for each in (replace(frame, valid=valid), spoilt)
     )
-    assert dirty.opd.tobytes() == clean.opd.tobytes()
-    assert dirty.star_image.tobytes() == clean.star_image.tobytes()
+    assert dirty.wavefront.tobytes() == clean.wavefront.tobytes()
+    assert dirty.frames[0].star.tobytes() == clean.frames[0].star.tobytes()
     assert dirty.chi2_per_pixel == clean.chi2_per_pixel
-    assert np.isfinite(dirty.star_image).all()
+    assert np.isfinite(dirty.frames[0].star).all()
 
 
 def test_masked_nan_of_a_finished_observation_change_nothing() -> None:
@@ -205,4 +205,4 @@ def test_masked_nan_of_a_finished_observation_change_nothing() -> None:
     valid = np.random.default_rng(4).random(frame.data.shape) > 0.05
     spoilt = replace(frame, data=np.where(valid, frame.data, np.nan), valid=valid)
     clean = fitted(replace(frame, valid=valid), max_iterations=3)
-    assert fitted(spoilt, max_iterations=3).opd.tobytes() == clean.opd.tobytes()
+    assert fitted(spoilt, max_iterations=3).wavefront.tobytes() == clean.wavefront.tobytes()

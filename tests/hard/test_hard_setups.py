@@ -64,7 +64,7 @@ def test_a_frame_of_the_same_instrument_is_taken() -> None:
     header.update({"MODULE": "A", "CORONMSK": "MASKA335R", "PUPIL": "MASKRND"})
     real = replace(frame, header=header, filter="F444W", pixelscale=(0.0620, 0.0628))
     fit = fitted(real, max_iterations=1)
-    assert fit.star_image.tobytes() == fitted(frame, max_iterations=1).star_image.tobytes()
+    assert fit.frames[0].star.tobytes() == fitted(frame, max_iterations=1).frames[0].star.tobytes()
 
 
 def test_a_frame_of_another_pixel_scale_is_refused() -> None:
