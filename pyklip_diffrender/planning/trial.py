@@ -53,7 +53,8 @@ class Trial:
     """A scene, the model of it as given, and what has been rendered so far.
 
     Parameters are those of `plan`: `opd0` on the model's grid in m, `values` the model's other
-    parameters, `cycles` the highest frequency of the finest modes, `pins` what is to be kept.
+    parameters, `cycles` the highest frequency of the finest modes, `pins` what is to be kept;
+    `response_npix` becomes what this model and field need.
 
     Attributes
     ----------

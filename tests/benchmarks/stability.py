@@ -4,7 +4,7 @@ Run from the root of the project, with the package installed:
 
     python tests/benchmarks/stability.py
 
-It writes reports/stability.md. ``pytest -m hard`` holds every line to its limit.
+It writes reports/stability.md. ``pytest --full -m hard`` holds every line to its limit.
 """
 
 from __future__ import annotations
