@@ -198,7 +198,7 @@ class GaussNewton:
                 amplitude_scale=2.0,
                 amplitude_slope=0.5,
             ),
-            deviations={"star_offset": 0.01, "lyot_shift": 0.004, "lyot_rotation": 0.2},
+            deviations={"star_offset": 0.005, "lyot_shift": 0.004, "lyot_rotation": 0.2},
             max_companions=1,
             companion_threshold=3.0,
             robust=3.0,
