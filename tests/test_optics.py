@@ -492,8 +492,11 @@ def test_impossible_settings_are_refused(changes: dict[str, object], words: str)
 
 
 def test_an_opd_of_another_size_says_what_to_do() -> None:
+    """Arrays are resampled; tensors, whose gradients may be wanted, are not."""
     with pytest.raises(ShapeError, match=r"npix=64"):
-        small()(np.zeros((64, 64)))
+        small()(torch.zeros(64, 64))
+    with pytest.raises(ShapeError, match=r"square"):
+        small()(np.zeros((64, 48)))
 
 
 @pytest.mark.hard

@@ -33,7 +33,7 @@ from pyklip_diffrender.planning import Economy, ModelError, Option, Plan, coarse
 from pyklip_diffrender.planning.noise_model import RidgeResidual
 from pyklip_diffrender.planning.systems import CheapSystem, quadrature
 from pyklip_diffrender.planning.trial import PROBED, START, Trial
-from pyklip_diffrender.refinement import refine
+from pyklip_diffrender.refinement import Adam, GaussNewton, refine
 from pyklip_diffrender.scene.objects import Planet, Scene, Star
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.simulation import simulate, star_photons
@@ -267,7 +267,7 @@ def test_a_changed_detector_has_its_own_transforms() -> None:
 def test_what_a_system_can_change() -> None:
     assert {"npix", "dtype", "occulter_sampling", "fov_pixels"} <= model().adjustable
     assert CheapSystem(model()).adjustable == model().adjustable
-    assert bare().adjustable == CheapSystem(bare()).adjustable == frozenset()
+    assert bare().adjustable == CheapSystem(bare()).adjustable == {"bandpass"}
 
 
 # -- plans ---------------------------------------------------------------------------------------
@@ -384,14 +384,18 @@ def test_a_system_without_a_recipe_can_be_planned_for() -> None:
 
 
 def test_a_system_from_poppy_can_be_planned_for_and_fitted() -> None:
-    """Its pupil cannot be made coarser, and its planes know two wavelengths only."""
+    """Its planes alone have a fixed pupil, and know two wavelengths only."""
     osys = poppy.OpticalSystem(oversample=2, npix=128, verbose=False)
     osys.pupil_diameter = 6.5 * u.m
     osys.add_pupil(poppy.CircularAperture(radius=3.2))
     osys.add_image(poppy.CircularOcculter(radius=0.3))
     osys.add_pupil(poppy.CircularAperture(radius=2.6))
     osys.add_detector(pixelscale=0.063, fov_pixels=20)
-    system = from_poppy(osys, [4.4e-6, 4.6e-6])
+    made = from_poppy(osys, [4.4e-6, 4.6e-6])
+    middle = CheapSystem(made, Bandpass((4.5e-6,), (1.0,)))
+    # poppy's optics are sampled anew at a wavelength between theirs.
+    assert torch.equal(middle(None), from_poppy(osys, 4.5e-6)(None))
+    system = OpticalSystem(made.entrance, made.planes, made.detector, made.bandpass)
     opd = downsample(torch.from_numpy(before()), 128).numpy()
     observation = simulate(system, Scene(star=Star(exposure=3.6)), opd, seed=1)
     settings = {"cycles": (4.0,), "response_npix": 64}
@@ -401,8 +405,9 @@ def test_a_system_from_poppy_can_be_planned_for_and_fitted() -> None:
     assert why["pupil grid"] == "the pupil grid of this system is fixed"
     assert why["wavelengths"] == "the wavelengths of this system are fixed"
     assert found.verified_error.inside(found.budget)
-    options = {"free": ("star_offset", "flux", "background"), "max_iterations": 3, **settings}
-    fit = refine(system, observation, opd, fidelity=found, **options)
+    free = ("star_offset", "flux", "background")
+    fast = GaussNewton(free=free, max_iterations=3, **settings)
+    fit = refine(system, observation, opd, settings=fast, plan=found)
     assert fit.plan is not None
     assert fit.plan.final_error is not None
 
@@ -436,20 +441,21 @@ def test_a_probe_that_claims_too_much_is_caught(
 
 
 def test_a_planned_fit_sees_the_same_planet_on_the_model_as_given() -> None:
-    exact = refine(model(), frame(), before(), fidelity="as given", **SETTINGS)
-    cheap = refine(model(), frame(), before(), fidelity=faint_plan(), **SETTINGS)
+    settings = GaussNewton(**SETTINGS)
+    exact = refine(model(), frame(), before(), settings=settings, plan="off")
+    cheap = refine(model(), frame(), before(), settings=settings, plan=faint_plan())
     assert exact.plan is None
     assert cheap.plan is not None
     assert not cheap.plan.abandoned
     assert cheap.plan.final_error is not None
     assert cheap.plan.final_error.inside(0.1)
-    assert cheap.coefficients is not None
-    assert exact.coefficients is not None
-    assert len(cheap.coefficients) < 0.4 * len(exact.coefficients)
+    assert cheap.frames[0].coefficients is not None
+    assert exact.frames[0].coefficients is not None
+    assert len(cheap.frames[0].coefficients) < 0.4 * len(exact.frames[0].coefficients)
     # The contract: the given model, its grid, its star.
     assert cheap.model is model()
-    assert cheap.opd.shape == (NPIX, NPIX)
-    np.testing.assert_allclose(cheap.render(), cheap.star_image, rtol=1e-9)
+    assert cheap.wavefront.shape == (NPIX, NPIX)
+    np.testing.assert_allclose(cheap.frames[0].render(), cheap.frames[0].star, rtol=1e-9)
     assert cheap.summary()["plan_npix"] == cheap.plan.choice.npix
     planet = [PLANET.offset]
     there, here = dr.measure(exact, planet)[0], dr.measure(cheap, planet)[0]
@@ -458,11 +464,20 @@ def test_a_planned_fit_sees_the_same_planet_on_the_model_as_given() -> None:
 
 
 def test_refine_plans_by_itself_and_honours_what_it_was_told() -> None:
-    settings = {**SETTINGS, "basis": default_basis(4.0), "max_iterations": 5}
-    fit = refine(model(), frame(), before(), fidelity="planned", **settings)
+    drift = WavefrontPrior({"segment": 1.0, "texture": 1.0}, fit_scales=False)
+    settings = GaussNewton(cycles=4.0, drift=drift, max_iterations=3, response_npix=64)
+    fit = refine(model(), [frame(), frame(seed=4)], before(), settings=settings)
     assert fit.plan is not None
-    assert "cycles" in fit.plan.pinned
-    assert len(fit.coefficients) == len(default_basis(4.0))  # type: ignore[arg-type]
+    # Frames that differ in their wavefronts need the modes of the settings; a correction to the
+    # field belongs to one position of the star.
+    assert fit.plan.pinned == ("cycles", "multifidelity")
+    assert fit.plan.choice.cycles == 4.0
+    assert not fit.plan.choice.multifidelity
+    # So do a basis of the caller's own, no wavefront at all, and a free amplitude.
+    amplitude = WavefrontPrior(amplitude_cycles=2.0, amplitude_scale=1.0)
+    for decided in ({"basis": default_basis(2.0)}, {"wavefront": False}, {"prior": amplitude}):
+        few = GaussNewton(**{"cycles": 2.0, "max_iterations": 1, "response_npix": 64, **decided})
+        assert refine(model(), frame(), before(), settings=few).plan is None
 
 
 def test_a_plan_that_fails_at_the_solution_is_abandoned(caplog: pytest.LogCaptureFixture) -> None:
@@ -470,23 +485,23 @@ def test_a_plan_that_fails_at_the_solution_is_abandoned(caplog: pytest.LogCaptur
     bright = frame(7200.0)
     with pytest.warns(DiffrenderWarning, match="more than the budget"):
         coarse = plan(model(), bright, before(), keep=keep, cycles=(4.0,), response_npix=64)
-    settings = {"cycles": (4.0,), "response_npix": 64, "max_iterations": 6}
-    fit = refine(model(), bright, before(), fidelity=coarse, **settings)
+    settings = GaussNewton(cycles=4.0, response_npix=64, max_iterations=6)
+    fit = refine(model(), bright, before(), settings=settings, plan=coarse)
     assert fit.plan is not None
     assert fit.plan.abandoned
     assert "goes on with the model as given" in caplog.text
     assert "as given" in str(fit.plan)
-    assert fit.opd.shape == (NPIX, NPIX)
-    np.testing.assert_allclose(fit.render(), fit.star_image, rtol=1e-6)
+    assert fit.wavefront.shape == (NPIX, NPIX)
+    np.testing.assert_allclose(fit.frames[0].render(), fit.frames[0].star, rtol=1e-6)
 
 
-def test_bad_fidelity_is_refused() -> None:
-    with pytest.raises(IncompatibleSetupError, match="'planned'"):
-        refine(model(), frame(), before(), fidelity="cheap")
+def test_bad_plans_are_refused() -> None:
+    with pytest.raises(IncompatibleSetupError, match="'auto'"):
+        refine(model(), frame(), before(), plan="cheap")
     with pytest.raises(IncompatibleSetupError, match="made for"):
-        refine(model(npix=128), frame(), before(), fidelity=faint_plan())
+        refine(model(npix=128), frame(), before(), plan=faint_plan())
     with pytest.raises(IncompatibleSetupError, match="as given"):
-        refine(model(), frame(), before(), method="adam", fidelity="planned")
+        refine(model(), frame(), before(), settings=Adam(), plan=faint_plan())
 
 
 def test_a_simulated_star_is_that_of_the_scene() -> None:

@@ -30,17 +30,18 @@ class CheapSystem(OpticalSystem):
     """
 
     def __init__(self, made: OpticalSystem, bandpass: Bandpass | None = None) -> None:
-        band = bandpass or made.bandpass
+        # Planes that were sampled at some wavelengths are others at others.
+        made = made if bandpass is None else made.at_wavelengths(bandpass)
         super().__init__(
             made.entrance,
             made.planes,
             made.detector,
-            band,
+            made.bandpass,
             recipe=made.recipe,
             route=made.route,
             defaults=made.defaults,
         )
-        self._made = made if band == made.bandpass else made.at_wavelengths(band)
+        self._made = made
         self._constants: dict[float, Tensor] = {}
 
     @property

@@ -157,4 +157,4 @@ def test_nothing_left_to_fit_is_an_error() -> None:
 
 def test_the_size_of_a_map_is_compared() -> None:
     with pytest.raises(ShapeError, match=f"npix={NPIX // 2}"):
-        small()(np.zeros((NPIX // 2, NPIX // 2)))
+        small()(torch.zeros(NPIX // 2, NPIX // 2))
