@@ -387,20 +387,20 @@ def test_block_wins_over_dataset_over_register(imgs: np.ndarray, tmp_path: Path)
     def seed(n: int) -> Any:
         def fake(observation: Any, opd: Any, settings: DiffrenderSettings) -> Subtraction:
             found = render(observation, opd, settings)
-            fit = Fit((0,), str(settings.refine_options), 1.0)
+            fit = Fit((0,), str(settings.model_options), 1.0)
             return Subtraction(found.star, str(n), n, (fit,))
 
         return fake
 
     dataset = generic(imgs, ANGLES)
-    register(opd=OPD, subtractor=seed(1), refine_options={"a": 1, "b": 1})
+    register(opd=OPD, subtractor=seed(1), model_options={"a": 1, "b": 1})
     try:
         assert reduce(dataset, tmp_path)["x-KLmodes-all.fits"][1]["DRSEED"] == 1
-        dataset.diffrender = DiffrenderSettings(subtractor=seed(2), refine_options={"b": 2})
+        dataset.diffrender = DiffrenderSettings(subtractor=seed(2), model_options={"b": 2})
         copied = copy.deepcopy(dataset)
         header = reduce(copied, tmp_path)["x-KLmodes-all.fits"][1]
         assert (header["DRSEED"], header["DRSTAT"]) == (2, "{'a': 1, 'b': 2}")
-        with backend(subtractor=seed(3)), backend(refine_options={"c": 3}):
+        with backend(subtractor=seed(3)), backend(model_options={"c": 3}):
             header = reduce(copied, tmp_path, algo="klip")["x-KLmodes-all.fits"][1]
         assert (header["DRSEED"], header["DRSTAT"]) == (3, "{'a': 1, 'b': 2, 'c': 3}")
         header = reduce(copied, tmp_path, algo="klip")["x-KLmodes-all.fits"][1]

@@ -24,6 +24,7 @@ from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
+from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
@@ -33,7 +34,7 @@ PAD = 6
 ANGLES = (0.0, 90.0)
 FLUX, CONTRAST, SEPARATION = 1e10, 4e-5, 0.8
 SKY = 100.0
-ALIGNED = {"free": ("flux", "background"), "wavefront": False}
+ALIGNED = GaussNewton(free=("flux", "background"), wavefront=False)
 NUMERICS: dict[str, Any] = {"npix": 128, "occulter_sampling": 2.0, "monochromatic": 4.44e-6}
 OLD = random_opd(1, npix=128)
 NEW = OLD.data + random_drift(2, 40.0, npix=128).data
@@ -84,8 +85,7 @@ def dataset(frames: NDArray[np.float64], model: Any, **settings: Any) -> Generic
     made.diffrender = DiffrenderSettings(
         model=model,
         error=np.sqrt(np.nan_to_num(np.abs(padded), nan=1.0)),
-        refine_options={"basis": default_basis(6.0), "response_npix": 128},
-        **settings,
+        **{"fit": GaussNewton(basis=default_basis(6.0), response_npix=128), **settings},
     )
     return made
 
@@ -107,7 +107,7 @@ def test_star_goes_companion_stays(
     with backend(opd=OLD):
         refined, outdated = copy.deepcopy(made), copy.deepcopy(made)
         image, header = reduce(refined, tmp_path)
-        outdated.diffrender = replace(made.diffrender, refine_options=ALIGNED)
+        outdated.diffrender = replace(made.diffrender, fit=ALIGNED)
         reduce(outdated, tmp_path)
     x, y = made.centers[0]
     peak = np.unravel_index(np.nanargmax(image), image.shape)
@@ -167,10 +167,10 @@ def test_companions_cannot_be_kept_by_a_method_without_their_errors(
     small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path
 ) -> None:
     made = dataset(frames, small)
-    made.diffrender = replace(made.diffrender, refine_options={"iterations": 2})
+    made.diffrender = replace(made.diffrender, fit=Adam(iterations=2))
     with (
-        backend(opd=OLD, method="adam", keep_detected=True),
-        pytest.raises(IncompatibleSetupError, match="gauss-newton"),
+        backend(opd=OLD, keep_detected=True),
+        pytest.raises(IncompatibleSetupError, match=r"'adam'.*GaussNewton"),
     ):
         reduce(made, tmp_path)
     assert not list(tmp_path.iterdir())
@@ -181,7 +181,7 @@ def test_a_model_without_recipe_is_good_for_its_own_square(
 ) -> None:
     bare = OpticalSystem(small.entrance, small.planes, small.detector, small.bandpass)
     made = dataset(frames[:1], bare, fit_pixels=32)
-    with backend(opd=OLD, refine_options=ALIGNED):
+    with backend(opd=OLD, fit=ALIGNED):
         image, _ = reduce(made, tmp_path)
     assert "pixels outside its 32 x 32 are NaN" in caplog.text
     assert 800 < np.isfinite(image).sum() <= 32**2
@@ -192,11 +192,11 @@ def test_a_fit_that_diverges_stops_the_reduction(
 ) -> None:
     made = dataset(-frames[:1], small)
     with (
-        backend(opd=OLD, refine_options=ALIGNED),
+        backend(opd=OLD, fit=ALIGNED),
         pytest.raises(RefinementError, match="roll0: failed") as caught,
     ):
         reduce(made, tmp_path)
-    assert caught.value.result.star_image.shape == (32, 32)
+    assert caught.value.result.frames[0].star.shape == (32, 32)
     assert list(tmp_path.iterdir()) == []
     assert made.output is None
 
@@ -210,12 +210,46 @@ def test_each_roll_and_dither_has_its_own_fit(
         cube, np.sqrt(cube), pixelscale=0.0624, center=center,
         position_angles=np.array([0.0, 10.0, 0.0, 0.0]), filter="F444W",
     )  # fmt: skip
-    settings = DiffrenderSettings(model=small, refine_options=ALIGNED)
+    settings = DiffrenderSettings(model=small, fit=ALIGNED)
     found = subtract_by_refinement(observation, OLD, settings)
     assert [fit.frames for fit in found.fits] == [(0, 3), (1,), (2,)]
     assert found.star.shape == cube.shape
     np.testing.assert_array_equal(found.star[0], found.star[3])
     assert np.isfinite(found.star).all()
+
+
+def test_start_plan_and_systematics_reach_the_fit(
+    small: OpticalSystem, frames: NDArray[np.float64]
+) -> None:
+    """The pattern is part of what is subtracted, inside the fitted square and beside it."""
+    drawn = 0.05 * np.random.default_rng(6).normal(size=SHAPE)
+    measured = drawn.copy()
+    measured[:, -3:] = 0.0
+    middle = ((SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2)
+    systematics = Systematics(measured, np.full(SHAPE, 1e-3), middle, 0.05)
+    camera = nircam_coronagraph("F444W", fov_pixels=SHAPE, **NUMERICS)
+    star = FLUX * camera(OLD.data, (0.02, 0.0)).numpy()
+    noise = np.sqrt(star + SKY)
+    data = star * (1 + drawn) + SKY + noise * np.random.default_rng(7).normal(size=SHAPE)
+    observation = Observation.from_arrays(
+        data, noise, pixelscale=small.detector.pixelscale, filter="F444W"
+    )
+    settings = DiffrenderSettings(
+        model=small, fit=ALIGNED, start={"star_offset": (0.02, 0.0)}, plan="off"
+    )
+    chi2 = {}
+    for known in (None, systematics):
+        found = subtract_by_refinement(observation, OLD, replace(settings, systematics=known))
+        (fit,) = found.fits
+        assert fit.result.plan is None
+        assert fit.result.frames[0].values["star_offset"].tolist() == [0.02, 0.0]
+        away = ((found.star[0] - star * (1 + measured) - SKY) / noise)[:, :-3]
+        chi2[known is None] = fit.chi2, np.sqrt(np.mean(away**2))
+    assert chi2[True][0] > 10
+    assert chi2[True][1] > 2
+    # 1024 pixels: known to 4.4 %; the star's flux, to 1e-4.
+    assert chi2[False][0] == pytest.approx(1.0, abs=0.13)
+    assert chi2[False][1] < 0.1
 
 
 def test_windows_that_stick_out_of_the_frame(rng: np.random.Generator) -> None:

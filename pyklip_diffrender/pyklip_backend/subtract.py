@@ -203,15 +203,19 @@ def _everywhere(result: Refinement, group: Observation, window: Window) -> NDArr
     inside = window.y <= box.y and window.x <= box.x
     inside &= window.y + window.shape[0] >= box.y + box.shape[0]
     inside &= window.x + window.shape[1] >= box.x + box.shape[1]
+    frame = result.frames[0]
     if not inside and "fov_pixels" in result.model.adjustable:
         x, y = group.center[0] - (box.x, box.y)
-        return box.paste(result.frames[0].render(fov_pixels=box.shape, center=(x, y)), group.shape)
+        star = frame.render(fov_pixels=box.shape, center=(x, y), background=False)
+        if result.systematics is not None:
+            star = star * (1 + result.systematics.at(box.of(group))[0])
+        return box.paste(star + float(frame.values["background"][0]), group.shape)
     if not inside:
         logger.warning(
             "%s: the model's field of view cannot be changed; pixels outside its %d x %d are NaN",
             group.name, window.shape[1], window.shape[0],
         )  # fmt: skip
-    return window.paste(np.asarray(result.frames[0].star), group.shape)
+    return window.paste(np.asarray(frame.star), group.shape)
 
 
 def model_of(observation: Observation, settings: DiffrenderSettings) -> OpticalSystem:

@@ -135,6 +135,10 @@ def refine(
             raise IncompatibleSetupError(
                 'plan: the Adam recipe uses the model as given; pass plan="off"'
             )
+        if systematics is not None:
+            raise IncompatibleSetupError(
+                "systematics: the Adam recipe has no place for them; use GaussNewton"
+            )
         return adam(problems[0], chosen, seed=seed, progress=progress)
     planned = _plan(plan, problems, chosen, seed)
     return fit_problems(problems, chosen, planned, seed=seed, progress=progress)

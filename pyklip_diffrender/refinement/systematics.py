@@ -149,10 +149,12 @@ class Systematics:
         x, y = np.round(observation.center[0] - self.center).astype(int)
         (ny, nx), (height, width) = observation.shape, self.pattern.shape
         # Overlap of the pattern, moved by (x, y), with the observation's array.
-        rows, columns = slice(max(y, 0), min(y + height, ny)), slice(max(x, 0), min(x + width, nx))
+        first_row, first_column = max(y, 0), max(x, 0)
+        rows = slice(first_row, max(min(y + height, ny), first_row))
+        columns = slice(first_column, max(min(x + width, nx), first_column))
         own = (
-            slice(rows.start - y, max(rows.stop, rows.start) - y),
-            slice(columns.start - x, max(columns.stop, columns.start) - x),
+            slice(rows.start - y, rows.stop - y),
+            slice(columns.start - x, columns.stop - x),
         )
         pattern[rows, columns] = self.pattern[own]
         error[rows, columns] = self.error[own]

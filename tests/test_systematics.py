@@ -1,0 +1,206 @@
+"""A known pattern of the star model's error: what it spoils, and that it can be taken out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, Systematics
+from pyklip_diffrender.refinement.planned import refine_again
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.wavefront.opd import random_opd
+
+NPIX, SIZE, FLUX, READ_NOISE = 64, 32, 3e10, 42.0
+BASIS = JointBasis([SegmentMotions(), FourierModes(4)])
+RMS = 0.06
+PLANET = Planet(3e-5, 0.6, 0.0)
+MIDDLE = ((SIZE - 1) / 2, (SIZE - 1) / 2)
+
+# -- where the pattern is put --------------------------------------------------------------------
+
+
+def frame(shape: tuple[int, int], center: tuple[float, float], **details: object) -> Observation:
+    ones = np.ones(shape)
+    return Observation.from_arrays(ones, ones, pixelscale=0.06, center=center, **details)
+
+
+@pytest.mark.parametrize("shape", [(9, 12), (4, 5), (20, 17)], ids=["same", "smaller", "larger"])
+@pytest.mark.parametrize("x", [-30.0, -12.0, -3.0, 0.0, 0.3, 5.0, 12.0, 40.0])
+@pytest.mark.parametrize("y", [-25.0, -9.0, -2.0, 0.0, 4.0, 9.0, 33.0])
+def test_pixels_are_matched_by_the_star(shape: tuple[int, int], x: float, y: float) -> None:
+    """Cutouts that stick out on every side, or do not meet the pattern at all."""
+    pattern = 1.0 + np.arange(9 * 12).reshape(9, 12)
+    known = Systematics(pattern, 0.01 * pattern, (6.0, 4.0), unknown=0.5)
+    got, error = known.at(frame(shape, (6.0 + x, 4.0 + y)))
+    assert got.shape == error.shape == shape
+    for row, column in np.ndindex(shape):
+        there = (row - round(y), column - round(x))
+        if 0 <= there[0] < 9 and 0 <= there[1] < 12:
+            assert got[row, column] == pattern[there]
+            assert error[row, column] == 0.01 * pattern[there]
+        else:
+            assert got[row, column] == 0
+            assert error[row, column] == 0.5
+
+
+def test_another_filter_and_unequal_arrays_are_refused() -> None:
+    zeros = np.zeros((9, 12))
+    known = Systematics(zeros, zeros, (6.0, 4.0), 0.5, filter="F444W")
+    known.at(frame((9, 12), (6.0, 4.0), filter="F444W"))
+    known.at(frame((9, 12), (6.0, 4.0)))  # Nothing says that they do not go together.
+    with pytest.raises(IncompatibleSetupError, match=r"F356W.*'systematics'.*F444W"):
+        known.at(frame((9, 12), (6.0, 4.0), filter="F356W"))
+    with pytest.raises(ShapeError, match=r"\(9, 12\) and \(9, 11\)"):
+        Systematics(zeros, zeros[:, 1:], (6.0, 4.0), 0.5)
+
+
+# -- fits ----------------------------------------------------------------------------------------
+
+
+@cache
+def model() -> OpticalSystem:
+    return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE)
+
+
+@cache
+def before() -> np.ndarray:
+    return random_opd(3, npix=NPIX).data
+
+
+@cache
+def later() -> np.ndarray:
+    generator = torch.Generator().manual_seed(3)
+    size = torch.where(BASIS.frequencies == 0, 1.0, 0.15)
+    change = size * torch.randn(len(BASIS), dtype=torch.float64, generator=generator)
+    return before() + BASIS.opd(1e-9 * change, PupilGrid.full(NPIX)).numpy()
+
+
+@cache
+def pattern(seed: int = 1) -> np.ndarray:
+    """As smooth as speckles are, rms 6 %."""
+    drawn = np.random.default_rng(seed).normal(size=(SIZE, SIZE))
+    smooth = gaussian_filter(drawn, 1.0, mode="wrap")
+    return RMS * smooth / smooth.std()
+
+
+def light(planet: Planet | None = None, shift: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """Of the star, or of a planet, moved by whole pixels."""
+    scale = model().detector.pixelscale
+    moved = {"detector_shift": (shift[0] * scale[0], shift[1] * scale[1])}
+    if planet is None:
+        return FLUX * model()(later(), **moved).numpy()
+    return planet.contrast * FLUX * model()(later(), planet.offset, **moved).numpy()
+
+
+def observed(expected: np.ndarray, seed: int, **details: object) -> Observation:
+    rng = np.random.default_rng(seed)
+    counts = rng.poisson(expected) + rng.normal(0, READ_NOISE, expected.shape)
+    error = np.sqrt(np.maximum(counts, 0) + READ_NOISE**2)
+    scale = model().detector.pixelscale
+    return Observation.from_arrays(counts, error, pixelscale=scale, **details)
+
+
+def known(error: float = 1e-3, seed: int = 1) -> Systematics:
+    return Systematics(pattern(seed), np.full((SIZE, SIZE), error), MIDDLE, RMS, name="measured")
+
+
+def fitted(observation: Observation, systematics: Systematics | None) -> Refinement:
+    settings = GaussNewton(basis=BASIS, response_npix=NPIX)
+    return dr.refine(model(), observation, before(), settings=settings, systematics=systematics)
+
+
+@pytest.mark.parametrize(("separation", "angle"), [(0.6, 300.0), (0.8, 100.0)])
+def test_a_pattern_biases_planets_and_is_taken_out_where_it_is_known(
+    separation: float, angle: float
+) -> None:
+    planet = Planet(1.5e-5, separation, angle)
+    spoilt = observed(light() * (1 + pattern()) + light(planet), 50)
+    without, with_it, wrong = (fitted(spoilt, each) for each in (None, known(), known(seed=2)))
+    assert without.status is wrong.status is Status.MODEL_MISMATCH
+    assert min(without.reduced_chi2, wrong.reduced_chi2) > 30
+    assert with_it.status is Status.CONVERGED
+    # 1024 pixels: known to 4.4 %.
+    assert with_it.reduced_chi2 == pytest.approx(1.0, abs=0.13)
+    rows = [dr.measure(fit, [planet.offset])[0] for fit in (without, with_it)]
+    bias, left = (float(row["contrast"] / planet.contrast - 1) for row in rows)
+    assert abs(bias) > 0.15
+    assert abs(left) < 0.07
+    assert abs(left) < 2.5 * float(rows[1]["contrast_error"] / planet.contrast)
+    assert rows[1]["contrast_error"] < 0.5 * rows[0]["contrast_error"]
+    # The star is the one that was observed, pattern included; what is rendered elsewhere has none.
+    frame = with_it.frames[0]
+    np.testing.assert_array_equal(frame.gain, 1 + pattern())
+    noise = np.sqrt(light() + READ_NOISE**2)
+    away = (frame.star - light() * (1 + pattern())) / noise
+    # What a planet beside it leaves uncertain, and the pattern's own 0.1 %.
+    assert np.sqrt(np.mean(away**2)) < 0.6
+    rendered = frame.values["background"][0] + frame.gain * frame.render(background=False)
+    np.testing.assert_allclose(rendered, frame.star, rtol=1e-9)
+    assert with_it.summary()["systematics"] == "measured"
+    # It is part of what goes on from the fit.
+    assert refine_again(with_it, max_iterations=2).systematics is with_it.systematics
+
+
+def test_the_error_of_a_pattern_counts_as_noise() -> None:
+    """The frames' own pattern differs from the one that was measured, by what its error says."""
+    drawn = 0.02 * np.random.default_rng(8).normal(size=(SIZE, SIZE))
+    spoilt = observed(light() * (1 + pattern() + drawn) + light(PLANET), 51)
+    honest, sure = (fitted(spoilt, known(error)) for error in (0.02, 1e-6))
+    assert honest.status is Status.CONVERGED
+    assert honest.reduced_chi2 == pytest.approx(1.0, abs=0.13)
+    assert sure.reduced_chi2 > 3
+    row = dr.measure(honest, [PLANET.offset])[0]
+    assert abs(row["contrast"] - PLANET.contrast) < 3 * row["contrast_error"]
+    plain = fitted(observed(light() + light(PLANET), 51), None)
+    exact = dr.measure(plain, [PLANET.offset])[0]
+    assert row["contrast_error"] > 1.2 * exact["contrast_error"]
+
+
+def test_the_pattern_follows_the_star_over_the_detector() -> None:
+    """Where the pattern was not measured its standard deviation counts."""
+    shift = (3, -2)
+    there = np.roll(pattern(), shift[::-1], axis=(0, 1))
+    center = (MIDDLE[0] + shift[0], MIDDLE[1] + shift[1])
+    spoilt = observed(light(shift=shift) * (1 + there) + light(PLANET, shift), 52, center=center)
+    fit = fitted(spoilt, known())
+    assert fit.status is Status.CONVERGED
+    assert fit.reduced_chi2 == pytest.approx(1.0, abs=0.13)
+    assert fitted(replace(spoilt, center=np.array([MIDDLE])), known()).reduced_chi2 > 30
+    row = dr.measure(fit, [PLANET.offset])[0]
+    assert abs(row["contrast"] - PLANET.contrast) < 3 * row["contrast_error"]
+
+
+def test_frames_fitted_together_have_the_pattern_each_at_its_star() -> None:
+    shifts = ((0, 0), (2, 1))
+    frames = [
+        observed(
+            light(shift=shift) * (1 + np.roll(pattern(), shift[::-1], axis=(0, 1))),
+            60 + k,
+            center=(MIDDLE[0] + shift[0], MIDDLE[1] + shift[1]),
+        )
+        for k, shift in enumerate(shifts)
+    ]
+    settings = GaussNewton(basis=BASIS, response_npix=NPIX)
+    fit = dr.refine(model(), frames, before(), settings=settings, systematics=known())
+    assert fit.status is Status.CONVERGED
+    assert fit.reduced_chi2 == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_array_equal(fit.frames[1].gain[1:, 2:], 1 + pattern()[:-1, :-2])
+
+
+def test_the_recipe_does_not_take_a_pattern() -> None:
+    with pytest.raises(IncompatibleSetupError, match=r"systematics: .*Adam.*GaussNewton"):
+        dr.refine(
+            model(), observed(light(), 1), before(), settings=Adam(iterations=2),
+            systematics=known(),
+        )  # fmt: skip
