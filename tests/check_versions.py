@@ -1,8 +1,8 @@
 """Run the tests with the oldest and with the newest libraries that the metadata allow.
 
     python tests/check_versions.py                     # both ends, the quick tier
-    python tests/check_versions.py oldest              # one end
-    python tests/check_versions.py newest -- tests/test_optics.py -x
+    python tests/check_versions.py --end oldest        # one end
+    python tests/check_versions.py -- tests/test_optics.py -x
 
 Each end gets a fresh virtual environment with this interpreter and is removed afterwards. The
 oldest end pins every lower bound of ``pyproject.toml`` (the dependencies and the extra
@@ -94,7 +94,7 @@ def check(end: str, folder: Path, arguments: list[str]) -> int:
 def main() -> int:
     """Run the command line; returns the exit status, 0 if all passed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("end", nargs="?", choices=ENDS, help="default: both, one after the other")
+    parser.add_argument("--end", choices=ENDS, help="default: both, one after the other")
     parser.add_argument("pytest", nargs="*", help="arguments of pytest, after --")
     options = parser.parse_args()
     failed = []

@@ -225,7 +225,8 @@ def ring(table: Table) -> None:
 
 def snapshots(table: Table) -> None:
     assert list(table["snapshots"]) == [1, 2]
-    assert_right(table["measured"], np.full(2, 1e-6), table["error"])
+    assert_right(table["measured"], np.full(2, 5e-7), table["error"])
+    assert_right(table["linked"][1], 5e-7, table["linked_error"][1])
     first, second = table["error"]
     assert second < first
     # Frames of one wavefront: two are worth sqrt(2), or more when fitted together.
