@@ -73,11 +73,12 @@ def row(case: Case, seed: int) -> str:
     true = star_photons(model, replace(scene, planets=()), opd)
     noise = np.sqrt(true + scene.background + scene.read_noise**2)
 
-    given, slow = timed(lambda: dr.refine(model, observation, measured, fidelity="as given"))
+    given, slow = timed(lambda: dr.refine(model, observation, measured, plan="off"))
     planned, fast = timed(lambda: dr.refine(model, observation, measured))
     assert planned.plan is not None
-    _, again = timed(lambda: dr.refine(model, observation, measured, fidelity=planned.plan))
-    stars = [fit.star_image - float(fit.values["background"][0]) for fit in (given, planned)]
+    _, again = timed(lambda: dr.refine(model, observation, measured, plan=planned.plan))
+    frames = [fit.frames[0] for fit in (given, planned)]
+    stars = [frame.star - float(frame.values["background"][0]) for frame in frames]
     errors = [float(np.sqrt(np.mean(((image - true) / noise) ** 2))) for image in stars]
     apart = float(np.sqrt(np.mean(((stars[1] - stars[0]) / noise) ** 2)))
     found = [dr.measure(fit, [planet.offset])[0] for fit in (given, planned)]

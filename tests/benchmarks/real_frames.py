@@ -18,25 +18,28 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
-from pyklip_diffrender.refinement import refine
-from pyklip_diffrender.refinement.presets import NIRCAM_FIT, NIRCAM_MODEL
+from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
+from pyklip_diffrender.refinement import GaussNewton, refine
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.wavefront.opd import read_opd
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from hip65426_pyklip import away_from_companions, residual_share
 
-FREE = NIRCAM_FIT["free"]
+PRESET = GaussNewton.nircam()
 VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "as published here": ({}, {}),
     "square pixels (0.0624 arcsec), no shear": (
         {"pixelscale": NIRCAM_LW_PIXELSCALE, "shear": 0.0},
         {},
     ),
-    "no amplitude modes": ({}, {"prior": replace(NIRCAM_FIT["prior"], amplitude_scale=0.0)}),
-    "internal Zernikes not free": ({}, {"free": tuple(n for n in FREE if n != "si_zernikes")}),
-    "no companion in the model": ({}, {"companions": 0}),
+    "no amplitude modes": ({}, {"prior": replace(PRESET.prior, amplitude_scale=0.0)}),
+    "internal Zernikes not free": (
+        {},
+        {"free": tuple(n for n in PRESET.free if n != "si_zernikes")},
+    ),
+    "no companion in the model": ({}, {"max_companions": 0}),
     "internal wavefront error flipped": ({"flip_si_wfe": False}, {}),
     "three wavelengths": ({"nlambda": 3}, {}),
 }
@@ -65,14 +68,14 @@ def main() -> None:
     opd = read_opd(options.opd)
     rows = []
     for name, (model_changes, fit_changes) in VARIANTS.items():
-        settings = {**NIRCAM_MODEL, **model_changes}
-        model = nircam_coronagraph("F444W", fov_pixels=80, **settings)
+        model = model_for(observation, **model_changes)
+        settings = GaussNewton.nircam(**fit_changes)
         for seen in (0, 1) if name == "as published here" else (0,):
-            fit = refine(model, one_frame(observation, seen), opd, **{**NIRCAM_FIT, **fit_changes})
+            fit = refine(model, one_frame(observation, seen), opd, settings=settings, plan="off")
             keep = away_from_companions(fit)
-            frames = observation.data - fit.companion_image
+            frames = observation.data - fit.frames[0].companion_image
             shares = [
-                100 * residual_share(frame, fit.star_image, keep)
+                100 * residual_share(frame, fit.frames[0].star, keep)
                 for frame in (frames[seen], frames[1 - seen], frames.mean(axis=0))
             ]
             rows.append((name, seen, *shares, fit.chi2_per_pixel, fit.status.name, fit.seconds))

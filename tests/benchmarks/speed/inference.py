@@ -16,7 +16,7 @@ from pyklip_diffrender.linear.response import NANOMETRE, WavefrontResponse, down
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import coarse_steps
-from pyklip_diffrender.refinement import Refinement, refine
+from pyklip_diffrender.refinement import GaussNewton, Refinement, refine
 from pyklip_diffrender.scene.objects import Planet, Scene
 from pyklip_diffrender.scene.simulation import planet_photons
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
@@ -148,12 +148,18 @@ def _along(model: OpticalSystem, opd: Tensor, basis: Basis, k: int) -> Tensor:
 # -- refinement ------------------------------------------------------------------------------------
 
 
-def _fit(here: Setting, observation: Any = None, **changes: Any) -> Refinement:
+def _fit(
+    here: Setting, observation: Any = None, start: dict[str, float] | None = None, **changes: Any
+) -> Refinement:
     options: dict[str, Any] = {"basis": basis_of(here), **changes}
     if here.quick:
         options["max_iterations"] = 10
     return refine(
-        here.model, observation or here.observation, here.measured.cpu().numpy(), **options
+        here.model,
+        observation or here.observation,
+        here.measured.cpu().numpy(),
+        settings=GaussNewton(**options),
+        start=start,
     )
 
 
@@ -164,7 +170,7 @@ def refinement(here: Setting) -> list[Case]:
 
     def judge(fit: Refinement) -> Found:
         """What the star model misses, background included."""
-        sigma = (fit.star_image - here.star) / here.noise
+        sigma = (fit.frames[0].star - here.star) / here.noise
         return Found(float(np.sqrt((sigma**2).mean())), float(np.sqrt((sigma**2).mean())))
 
     def recipe(image: Callable[[Tensor], Tensor], start: Tensor) -> Callable[[], Tensor]:

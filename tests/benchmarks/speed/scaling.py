@@ -14,7 +14,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from pyklip_diffrender.linear.response import WavefrontResponse, downsample
 from pyklip_diffrender.planning import coarse_steps
-from pyklip_diffrender.refinement import refine
+from pyklip_diffrender.refinement import GaussNewton, refine
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
 from tests.benchmarks.speed.case import Case
@@ -96,7 +96,8 @@ def _frames(here: Setting, count: int) -> Callable[[], Any]:
     )[0]
     frames = [simulate(model, here.scene, small[0], seed=k) for k in range(count)]
     basis = default_basis(4.0 if here.quick else 8.0)
-    return lambda: refine(model, frames, small[1].numpy(), basis=basis, max_iterations=6)
+    settings = GaussNewton(basis=basis, max_iterations=6)
+    return lambda: refine(model, frames, small[1].numpy(), settings=settings)
 
 
 # -- the machine's limit ---------------------------------------------------------------------------
