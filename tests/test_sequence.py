@@ -1,0 +1,232 @@
+"""Sequences from files, patterns learned from reference stars, and fits that survive a file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from pyklip_diffrender.detection import detect
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    IncompatibleSetupError,
+    NoValidPixelsError,
+)
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.refinement import (
+    GaussNewton,
+    Refinement,
+    Systematics,
+    learn_systematics,
+    refine,
+)
+from pyklip_diffrender.scene.objects import Planet, Scene, Star
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.simulation import simulate
+from pyklip_diffrender.wavefront.opd import OPDMap, random_opd
+
+SIZE = 32
+SETTINGS = GaussNewton(cycles=6)
+PLANET = Planet(2e-5, 0.6, 40.0)
+
+
+@cache
+def model() -> OpticalSystem:
+    return nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=SIZE)
+
+
+@cache
+def opd() -> OPDMap:
+    return random_opd(1, npix=128)
+
+
+def pattern() -> NDArray[np.float64]:
+    """A multiplicative error of the model, 6 % rms, smooth over two pixels or so."""
+    rough = np.random.default_rng(5).normal(size=(SIZE, SIZE))
+    smooth = rough + np.roll(rough, 1, axis=0) + np.roll(rough, 1, axis=1)
+    return 0.06 * smooth / smooth.std()
+
+
+@cache
+def frame(star: str, seed: int, *, planet: bool = False, roll: float = 0.0) -> Observation:
+    """A frame of a star whose light the pattern multiplies."""
+    turned = replace(PLANET, position_angle=PLANET.position_angle - roll)
+    scene = Scene(Star(exposure=20.0), (turned,) if planet else ())
+    clean = simulate(model(), replace(scene, planets=()), opd(), seed=seed)
+    both = simulate(model(), scene, opd(), seed=seed)
+    data = clean.data * (1 + pattern()) + (both.data - clean.data)
+    header = fits.Header({"TARGPROP": star})
+    return replace(
+        both, data=data, header=header, name=f"{star} {seed}", position_angles=np.array([roll])
+    )
+
+
+@cache
+def reference_fit() -> Refinement:
+    return refine(model(), [frame("REF", 10), frame("REF", 11)], opd(), settings=SETTINGS)
+
+
+def calints(path: Path, star: str, roll: float, date: str, **cards: object) -> Path:
+    rng = np.random.default_rng(len(star))
+    primary = fits.PrimaryHDU()
+    defaults = {
+        "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "FILTER": "F444W", "PUPIL": "MASKRND",
+        "CORONMSK": "MASKA335R", "SUBARRAY": "SUB320A335R", "DETECTOR": "NRCALONG",
+        "TARGPROP": star, "DATE-BEG": date, "IS_PSF": False,
+    }  # fmt: skip
+    for key, value in {**defaults, **cards}.items():
+        primary.header[key] = value
+    science = fits.ImageHDU(rng.normal(10, 1, (2, 24, 24)).astype("f4"), name="SCI")
+    for key, value in {
+        "BUNIT": "MJy/sr", "PIXAR_A2": 0.0039, "CRPIX1": 13.0, "CRPIX2": 12.0,
+        "ROLL_REF": roll, "V3I_YANG": 0.05, "VPARITY": -1,
+    }.items():  # fmt: skip
+        science.header[key] = value
+    error = fits.ImageHDU(np.ones((2, 24, 24), "f4"), name="ERR")
+    quality = fits.ImageHDU(np.zeros((2, 24, 24), "i4"), name="DQ")
+    fits.HDUList([primary, science, error, quality]).writeto(path)
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    calints(tmp_path / "a.fits", "AU MIC", 75.0, "2022-10-03T09:00:00")
+    calints(tmp_path / "b.fits", "AU MIC", 65.0, "2022-10-03T06:00:00")
+    calints(tmp_path / "c.fits", "HIP1", 20.0, "2022-10-03T07:00:00", IS_PSF=True)
+    return tmp_path
+
+
+def test_files_are_sorted_by_their_headers(folder: Path) -> None:
+    sequence = Sequence.from_files(folder)
+    assert sequence.target == "AU MIC"
+    assert [each.name for each in sequence.science] == ["b.fits", "a.fits"]
+    assert [each.name for each in sequence.references] == ["c.fits"]
+    assert [each.reference for each in sequence.references] == [True]
+    assert sequence.science[1].roll_from(sequence.science[0]) == pytest.approx(-10)
+    assert list(sequence.table["use"]) == ["target", "target", "reference"]
+    np.testing.assert_allclose(sequence.table["position_angle"].to_value(u.deg)[:2], [65.05, 75.05])
+    chosen = Sequence.from_files(folder, target="hip 1")
+    assert [each.name for each in chosen.science] == ["c.fits"]
+    assert len(chosen.references) == 2
+    assert sequence.cutout(10).science[0].shape == (10, 10)
+
+
+def test_what_does_not_belong_is_left_out_with_a_reason(folder: Path) -> None:
+    calints(
+        folder / "d.fits", "HIP1", 20.0, "2022-10-03T08:00:00", CORONMSK="MASKA430R", IS_PSF=True
+    )
+    calints(folder / "e.fits", "HIP1", 20.0, "2022-10-03T08:00:00", FILTER="F356W", IS_PSF=True)
+    (folder / "f.fits").write_bytes(b"not a FITS file")
+    sequence = Sequence.from_files(folder, filter="F444W")
+    reasons = dict(sequence.excluded)
+    assert set(reasons) == {"d.fits", "e.fits", "f.fits"}
+    assert "MASKA430R" in reasons["d.fits"]
+    assert "F356W" in reasons["e.fits"]
+    with pytest.raises(IncompatibleSetupError, match=r"filter: the files have .*F356W"):
+        Sequence.from_files(folder)
+
+
+def test_a_target_that_cannot_be_decided_is_an_error(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(IncompatibleSetupError, match="VEGA"):
+        Sequence.from_files(folder, target="VEGA")
+    calints(folder / "g.fits", "HIP2", 20.0, "2022-10-03T08:00:00")
+    with pytest.raises(IncompatibleSetupError, match="say which one"):
+        Sequence.from_files(folder)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(NoValidPixelsError, match="no FITS files"):
+        Sequence.from_files(empty)
+
+
+def test_the_position_of_the_mask_is_read(folder: Path) -> None:
+    with fits.open(folder / "a.fits") as hdus:
+        hdus.append(fits.ImageHDU(np.array([[0.2, -0.1], [0.4, -0.1]]), name="MASKOFFS"))
+        hdus.writeto(folder / "h.fits")
+    observation = Observation.from_fits(folder / "h.fits")
+    pixel = 0.0039**0.5
+    np.testing.assert_allclose(observation.star_offset, (-0.3 * pixel, 0.1 * pixel), rtol=1e-6)
+
+
+def test_a_pattern_is_learned_from_another_star() -> None:
+    fit = reference_fit()
+    assert fit.chi2_per_pixel > 5
+    learned = learn_systematics(fit)
+    truth = pattern()
+    y, x = np.indices(truth.shape) - (SIZE - 1) / 2
+    bright = np.hypot(x, y) < 12
+    # What looks like wavefront is not in the pattern: most of it is not, and is recovered.
+    assert np.corrcoef(learned.pattern[bright], truth[bright])[0, 1] > 0.8
+    assert learned.unknown == pytest.approx(0.05, rel=0.5)
+    assert learned.filter == "F444W"
+
+
+def test_with_the_pattern_the_planet_of_another_star_is_unbiased() -> None:
+    target = [frame("TARGET", 20, planet=True), frame("TARGET", 21, planet=True, roll=10.0)]
+    without = refine(model(), target, opd(), settings=SETTINGS)
+    learned = learn_systematics(reference_fit())
+    fit = refine(model(), target, opd(), settings=SETTINGS, systematics=learned)
+    assert without.chi2_per_pixel > 5
+    assert fit.chi2_per_pixel < 2
+    (row,) = detect(fit).table
+    away = (row["contrast"] - PLANET.contrast) / row["contrast_error"]
+    assert abs(away) < 3
+    assert row["separation"].to_value(u.arcsec) == pytest.approx(0.6, abs=0.01)
+    assert row["snr"] > 10
+
+
+def test_a_pattern_needs_two_frames_of_one_filter() -> None:
+    single = replace(reference_fit(), frames=reference_fit().frames[:1])
+    with pytest.raises(IncompatibleSetupError, match="at least two"):
+        learn_systematics(single)
+
+
+def test_systematics_survive_the_file(tmp_path: Path) -> None:
+    learned = learn_systematics(reference_fit(), name="spring")
+    back = Systematics.read(learned.write(tmp_path / "pattern.fits"))
+    np.testing.assert_array_equal(back.pattern, learned.pattern)
+    np.testing.assert_array_equal(back.error, learned.error)
+    assert (back.center, back.unknown, back.filter) == (
+        learned.center, learned.unknown, learned.filter,
+    )  # fmt: skip
+    assert (back.name, back.provenance["stars"]) == ("spring", ["REF"])
+    fits.PrimaryHDU().writeto(tmp_path / "other.fits")
+    with pytest.raises(CorruptFileError, match="systematics"):
+        Systematics.read(tmp_path / "other.fits")
+
+
+def test_a_refinement_survives_the_file(tmp_path: Path) -> None:
+    fit = refine(
+        model(),
+        [frame("TARGET", 20, planet=True), frame("TARGET", 21, planet=True, roll=10.0)],
+        opd(),
+        settings=SETTINGS,
+        systematics=learn_systematics(reference_fit()),
+    )
+    back = Refinement.read(fit.write(tmp_path / "fit.fits"))
+    assert (back.status, back.settings, back.seed) == (fit.status, fit.settings, fit.seed)
+    for ours, theirs in zip(back.frames, fit.frames, strict=True):
+        np.testing.assert_array_equal(ours.star, theirs.star)
+        np.testing.assert_array_equal(ours.opd, theirs.opd)
+        assert ours.observation.position_angle == theirs.observation.position_angle
+        assert ours.observation.target == "TARGET"
+    again, first = detect(back), detect(fit)
+    np.testing.assert_array_equal(again.snr, first.snr)
+    np.testing.assert_array_equal(again.table["contrast"], first.table["contrast"])
+    assert again.table["position_angle"][0].to_value(u.deg) == pytest.approx(40, abs=0.5)
+
+
+@pytest.mark.parametrize("percent", [25, 50, 99])
+def test_half_a_file_is_no_refinement(tmp_path: Path, percent: int) -> None:
+    path = reference_fit().write(tmp_path / "fit.fits")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) * percent // 100])
+    with pytest.raises(CorruptFileError, match=r"fit\.fits"):
+        Refinement.read(path)
