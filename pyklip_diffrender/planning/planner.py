@@ -79,7 +79,7 @@ def plan(
     response_npix : int
         Pupil samples of the copy that computes derivatives; see `refine`.
     model_error : float
-        Fraction of the star that the model may miss anyway (``kappa_floor`` of `refine`).
+        Fraction of the star that the model may miss anyway (`GaussNewton.min_model_error`).
     seed : int
         Of the wavefronts that are drawn.
 
