@@ -74,9 +74,10 @@ def candidates(fit: Refinement) -> QTable:
 
 def away_from_companions(fit: Refinement) -> np.ndarray:
     """Pixels of the fitted square that no companion reaches, (ny, nx)."""
-    ny, nx = fit.observation.shape
+    (frame,) = fit.frames
+    ny, nx = frame.observation.shape
     scale = fit.model.detector.pixelscale
-    star = fit.values["detector_shift"] + fit.values["star_offset"]
+    star = frame.values["detector_shift"] + frame.values["star_offset"]
     y, x = np.indices((ny, nx))
     keep = np.ones((ny, nx), dtype=bool)
     for _, dx, dy in fit.companions:
@@ -103,13 +104,14 @@ def main() -> None:
     fit = reduce(options.frames, options.opd, options.output)
     seconds = time.perf_counter() - began
     keep = away_from_companions(fit)
-    data = fit.observation.data
+    (fitted,) = fit.frames
+    data = fitted.observation.data
     print(f"\n{fit.status.message}; chi2/pixel {fit.chi2_per_pixel:.2f}")
     print(f"reduction {seconds:.0f} s, of which the fit {fit.seconds:.0f} s")
     for name, frame in (*((f"integration {k}", f) for k, f in enumerate(data)),
                         ("their mean", data.mean(axis=0))):  # fmt: skip
         # A companion's wings reach far beyond what is left out: they are modelled, not star.
-        share = residual_share(frame - fit.companion_image, fit.star_image, keep)
+        share = residual_share(frame - fitted.companion_image, fitted.star, keep)
         print(f"mean |residual| / star, {name}: {100 * share:.2f} %")
     print(fit.parameters["name", "value", "error", "unit"][:9])
     table = candidates(fit)

@@ -84,7 +84,7 @@ def test_the_demo_finds_the_planet_that_klip_loses(tmp_path: Path) -> None:
             "FRAME", "INITIAL", "KLIP", "REFINED", "DETECTED", "OPTIMAL", "OPD_MEASURED",
             "OPD_TRUE", "OPD_REFINED", "SNR",
         ]  # fmt: skip
-        np.testing.assert_array_equal(hdus["REFINED"].data, result.fit.residual[0])
+        np.testing.assert_array_equal(hdus["REFINED"].data, result.fit.frames[0].residual[0])
         np.testing.assert_array_equal(hdus["FRAME"].data, result.observation.data[0])
         np.testing.assert_allclose(hdus["OPD_TRUE"].data, result.true_opd, rtol=1e-6, atol=1e-16)
         assert hdus["OPD_REFINED"].header["BUNIT"] == "m"

@@ -59,7 +59,7 @@ class Case:
     ----------
     name : str
     fit : dict
-        Options of the fit.
+        Fields of `GaussNewton`.
     truth : dict
         Settings of the model that makes the frames, and not of the one that is fitted.
     both : dict
@@ -129,12 +129,12 @@ def with_ring(here: Setting, shot: Frame, seed: int) -> Frame:
 def without_ring(known: Setting, shot: Frame, bent: Subtracted) -> tuple[Subtracted, Image]:
     """The star refined once more, on the frame less a ring of known shape; and the ring."""
     assert bent.fit is not None
-    shape = ring_photons(known, bent.fit.opd)
+    shape = ring_photons(known, bent.fit.wavefront)
     amplitude, _ = dr.detect(bent.fit, threshold=math.inf).measure_shape(shape)
     ring = amplitude * shape
     less = replace(shot.observation, data=shot.observation.data - ring)
     fit = dr.refine(known.model, less, known.measured)
-    return Subtracted(fit.residual[0] + ring, bent.seconds + fit.seconds, fit), ring
+    return Subtracted(fit.frames[0].residual[0] + ring, bent.seconds + fit.seconds, fit), ring
 
 
 def seen(here: Setting, counts: Image) -> dr.Observation:
@@ -146,12 +146,10 @@ def seen(here: Setting, counts: Image) -> dr.Observation:
 
 def klip_on_residuals(known: Setting, left: Subtracted, frames: Image) -> Subtracted:
     """KLIP on what refinement leaves of the target and of each of the nine references."""
-    remains = [
-        dr.refine(known.model, seen(known, counts), known.measured).residual[0] for counts in frames
-    ]
+    fits = [dr.refine(known.model, seen(known, counts), known.measured) for counts in frames]
     blank = np.zeros_like(left.image)
     target = Frame(seen(known, left.image), blank, blank, (), blank)
-    return klip(target, np.stack(remains))
+    return klip(target, np.stack([fit.frames[0].residual[0] for fit in fits]))
 
 
 def one_frame(here: Setting, number: int, steps: int, seed: int) -> Table:

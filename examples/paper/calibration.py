@@ -63,8 +63,9 @@ def one_frame(here: Setting, hours: float, seed: int) -> Table:
     inside = (radius >= RINGS[0]) & (radius < RINGS[-1])
     optimal = known_star_snr(found, shot)
     limit = found.error / found.photon_error
-    level = float(fit.values["background"][0])
-    star_error = ((fit.star_image - level - shot.star) / shot.noise)[inside]
+    (fitted,) = fit.frames
+    level = float(fitted.values["background"][0])
+    star_error = ((fitted.star - level - shot.star) / shot.noise)[inside]
     row = {
         "hours": hours,
         "seed": seed,

@@ -31,7 +31,6 @@ from matplotlib.figure import Figure
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.metrics import aperture_sum
-from pyklip_diffrender.detection.relinearise import star_only
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.instrument.masks import ROUND_MASKS
 from pyklip_diffrender.refinement import Refinement
@@ -118,8 +117,9 @@ def one_seed(here: Setting, places: tuple[float, ...], steps: int, seed: int) ->
 
 def together(fit: Refinement, planets: list[Planet]) -> Image:
     """Contrasts of planets measured together, for their wings overlap."""
-    templates = Templates([fit], fit).at(torch.tensor([p.offset for p in planets]).double())
-    matrix, vector = star_only([fit]).normal_equations(templates)
+    places = torch.tensor([p.offset for p in planets]).double()
+    templates = Templates(fit, fit.frames[0]).at(places)
+    matrix, vector = fit.star_only.normal_equations(templates)
     return torch.linalg.solve(matrix, vector).numpy()
 
 

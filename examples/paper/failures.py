@@ -19,6 +19,7 @@ import numpy as np
 from astropy.table import Table
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -90,7 +91,8 @@ def one_frame(here: Setting, case: Case, seed: int) -> Table:
     here = here.redrawn(seed)
     shot = _shot(here, case, seed)
     wrong = {"prior": _prior(here, case.prior)} if case.prior else {}
-    fit = dr.refine(here.model, shot.observation, here.measured, **case.fit, **wrong)
+    settings = GaussNewton(**case.fit, **wrong)
+    fit = dr.refine(here.model, shot.observation, here.measured, settings=settings)
     found = dr.detect(fit, threshold=math.inf)
     radius = np.hypot(found.grid[..., 0], found.grid[..., 1])
     inside = (radius >= 0.3) & (radius < 2.3)
@@ -101,12 +103,12 @@ def one_frame(here: Setting, case: Case, seed: int) -> Table:
                 "seed": seed,
                 "status": fit.status.name,
                 "chi2": fit.chi2_per_pixel,
-                "expected_chi2": 1 - fit.effective_parameters / fit.observation.data[0].size,
+                "expected_chi2": 1 - fit.effective_parameters / shot.star.size,
                 "scatter": found.scatter,
                 "null": found.snr[inside].std(),
                 "highest": np.abs(found.snr[inside]).max(),
                 "limit": float(np.median((found.error / found.photon_error)[inside])),
-                "cycles": float(fit.settings.basis.frequencies.max()),
+                "cycles": float(fit.basis.frequencies.max()),
                 "seconds": fit.seconds,
             }
         ]

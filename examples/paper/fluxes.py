@@ -44,7 +44,7 @@ def one_frame(here: Setting, contrast: float, separation: float, seed: int) -> T
     # What the fit's own residual kept of it, by a matched filter on the true noise.
     weight = shot.planets[0][1] / shot.noise**2
     light = float((weight * shot.planets[0][1]).sum())
-    kept = float((weight * (fit.residual[0])).sum()) / light
+    kept = float((weight * fit.frames[0].residual[0]).sum()) / light
     return Table(
         rows=[
             {

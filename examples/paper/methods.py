@@ -15,7 +15,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.demo import simulate_references
 from pyklip_diffrender.planning import coarse_steps
 from pyklip_diffrender.pyklip_backend.comparison import klip_rdi
-from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement
 from pyklip_diffrender.scene.objects import ALPHA_PICTORIS_W2
 from pyklip_diffrender.scene.simulation import simulate
 
@@ -117,18 +117,18 @@ def adam(here: Setting, shot: Frame, steps: int = STEPS) -> Subtracted:
         coarse,
         shot.observation,
         here.measured,
-        method="adam",
-        iterations=steps,
+        settings=Adam(iterations=steps),
         start={"flux": Star().photons, "background": 0.0},
     )
-    return Subtracted(fit.residual[0], time.perf_counter() - began, fit)
+    return Subtracted(fit.frames[0].residual[0], time.perf_counter() - began, fit)
 
 
-def gauss_newton(here: Setting, shot: Frame, **options: Any) -> Subtracted:
-    """This package's default."""
+def gauss_newton(here: Setting, shot: Frame, **changes: Any) -> Subtracted:
+    """This package's default, or with other settings."""
     began = time.perf_counter()
-    fit = dr.refine(here.model, shot.observation, here.measured, **options)
-    return Subtracted(fit.residual[0], time.perf_counter() - began, fit)
+    settings = GaussNewton(**changes)
+    fit = dr.refine(here.model, shot.observation, here.measured, settings=settings)
+    return Subtracted(fit.frames[0].residual[0], time.perf_counter() - began, fit)
 
 
 def optimal(shot: Frame) -> Subtracted:
@@ -157,7 +157,7 @@ def all_of(
     many : ndarray, optional
         A library, for KLIP once more.
     **fit
-        Options of Gauss-Newton.
+        Fields of `GaussNewton`.
     """
     found = {"initial": initial(here, shot), "KLIP": klip(shot, frames)}
     if many is not None:

@@ -19,6 +19,7 @@ import torch
 from astropy.table import Table
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.scene.objects import Star
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -55,14 +56,15 @@ def one_seed(here: Setting, seed: int) -> Table:
     here = here.redrawn(seed)
     shot, photons = observed(here, seed)
     known = {"star_offset": OFFSET, "lyot_shift": LYOT, "lyot_rotation": ROTATION}
-    aligned = dr.refine(here.model, shot, here.measured, free=("flux", "background"), start=known)
+    held = GaussNewton(free=("flux", "background"))
+    aligned = dr.refine(here.model, shot, here.measured, settings=held, start=known)
     matched = dr.measure(aligned, [PLANET.offset])
     fit = dr.refine(here.model, shot, here.measured)
     found = dr.detect(fit)
     planet = found.measure([PLANET.offset])
     radius = np.hypot(found.grid[..., 0], found.grid[..., 1])
     null = found.residual_snr[(radius > 0.3) & (radius < 2.3)]
-    values = fit.values
+    values = fit.frames[0].values
     return Table(
         rows=[
             {

@@ -52,7 +52,7 @@ def seen_change(here: Setting, opd: Image) -> Image:
 def judge(here: Setting, shot: Frame, step: Subtracted, fit: Refinement | None) -> dict[str, Any]:
     """Numbers of one stage."""
     true = seen_change(here, shot.opd)
-    found = seen_change(here, here.measured if fit is None else np.real(fit.opd))
+    found = seen_change(here, here.measured if fit is None else np.real(fit.wavefront))
     return {
         "annulus_snr": paper_snr(here, step.image, PLANET),
         "star_error": star_error(here, shot, step.image),
@@ -84,7 +84,7 @@ def one_seed(here: Setting, counts: tuple[int, ...], steps: tuple[int, ...], see
         rows.append(
             {"method": method, "step": taken, "seed": seed, **judge(here, shot, left, left.fit)}
         )
-        maps[method] = seen_change(here, np.real(left.fit.opd))
+        maps[method] = seen_change(here, np.real(left.fit.wavefront))
     found = Table(rows=rows)
     found.meta = {"seconds": time.perf_counter() - began}
     for name in ("true", "Gauss-Newton", "Adam"):

@@ -61,10 +61,10 @@ def one_ring(here: Setting, seed: int) -> Table:
     fit = dr.refine(here.model, observation, here.measured)
     found = dr.detect(fit, threshold=math.inf)
     # The shape as an observer would make it: with the fitted wavefront, not the true one.
-    shape = ring_photons(here, np.real(fit.opd))
+    shape = ring_photons(here, np.real(fit.wavefront))
     amplitude, deviation = found.measure_shape(shape)
     weight = light / error**2
-    kept = float((weight * (counts - fit.star_image)).sum() / (weight * light).sum())
+    kept = float((weight * (counts - fit.frames[0].star)).sum() / (weight * light).sum())
     return Table(
         rows=[
             {

@@ -17,6 +17,7 @@ import numpy as np
 from astropy.table import Table
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -48,7 +49,8 @@ def one_seed(here: Setting, counts: tuple[int, ...], linked: int, seed: int) -> 
             "linked_error": math.nan,
         }
         if 1 < count <= linked:
-            joint = dr.refine(here.model, shots[:count], here.measured, drift=DRIFT)
+            settings = GaussNewton(drift=DRIFT)
+            joint = dr.refine(here.model, shots[:count], here.measured, settings=settings)
             together = dr.measure(joint, [PLANET.offset])
             row["linked"] = float(together["contrast"][0])
             row["linked_error"] = float(together["contrast_error"][0])

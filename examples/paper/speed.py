@@ -17,6 +17,7 @@ import numpy as np
 from astropy.table import Table
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.refinement import Adam
 
 sys.path.insert(0, str(Path(__file__).parent))
 from scene import Planet, Setting, frame, options, setting, timed_table
@@ -44,7 +45,8 @@ def measured(
             found = dr.detect(fit)
         times.append(time.perf_counter())
         refine, curve, detect = np.diff(times)
-        star = fit.star_image - float(fit.values["background"][0])
+        (fitted,) = fit.frames
+        star = fitted.star - float(fitted.values["background"][0])
         rows.append(
             {
                 "model": name,
@@ -70,8 +72,7 @@ def recipe(here: Setting) -> dict[str, Any]:
             here.model,
             shot.observation,
             here.measured,
-            method="adam",
-            iterations=steps,
+            settings=Adam(iterations=steps),
             start={"flux": 2.7807e12, "background": 0.0},
         )
         seconds.append(time.perf_counter() - began)
