@@ -44,7 +44,7 @@ FLUX = 3e11
 READ_NOISE = 42.0
 BASIS = JointBasis([SegmentMotions(), FourierModes(8)])
 WHERE = Planet(0.0, 0.7, 60.0)
-FAINT = replace(WHERE, contrast=3e-6)
+FAINT = replace(WHERE, contrast=2e-6)
 """Below the S/N at which the star is refined again."""
 
 NOT_LOOKING = {"min_model_error": 1e-6}
@@ -215,13 +215,13 @@ def test_contrast_and_place_of_planets_are_unbiased_and_their_errors_right(
 
 def test_the_subtracted_frame_has_lost_light_that_the_measurement_has_not(world: World) -> None:
     # Too near for the fit to look for it by itself.
-    planet = Planet(2e-5, 0.33, 60.0)
+    planet = Planet(1e-5, 0.33, 60.0)
     fit = world.fitted(7, planet)
     assert not len(fit.companions)
     light = world.expected(planet) - world.expected()
     weight = light / fit.frames[0].observation.error[0] ** 2
     kept = float((weight * fit.frames[0].residual[0]).sum() / (weight * light).sum())
-    measured = float(dr.measure(fit, [planet.offset])["contrast"][0]) / 2e-5
+    measured = float(dr.measure(fit, [planet.offset])["contrast"][0]) / 1e-5
     assert kept < 0.9
     assert measured == pytest.approx(1.0, abs=0.2)
 
@@ -239,7 +239,7 @@ def test_a_bright_companion_gets_parameters_of_its_own(world: World, contrast: f
     assert fit.frames[0].star == pytest.approx(world.expected(), rel=0.02, abs=100)
 
 
-@pytest.mark.parametrize(("contrast", "seed", "again"), [(5e-6, 7, False), (1e-5, 11, True)])
+@pytest.mark.parametrize(("contrast", "seed", "again"), [(4e-6, 7, False), (1e-5, 11, True)])
 def test_only_what_bends_the_wavefront_far_has_it_fitted_anew(
     world: World, contrast: float, seed: int, again: bool
 ) -> None:
@@ -273,7 +273,7 @@ def test_a_planet_does_not_make_the_noise_larger(world: World) -> None:
     assert len(found.candidates) == 1
     assert len(fit.companions) == 0
     # Its light would be structure that no mode explains.
-    assert fit.reduced_chi2 > 1.1 * quiet.reduced_chi2
+    assert fit.reduced_chi2 > 1.06 * quiet.reduced_chi2
     assert found.scatter == pytest.approx(noise.scatter, rel=0.01)
     # The same where positions are given, once or more often.
     once, thrice = (dr.measure(fit, [planet.offset] * count) for count in (1, 3))

@@ -207,7 +207,10 @@ class GaussNewton:
             relinearise=0.3,
             tolerance=5e-4,
         )
-        return replace(preset, **changes)
+        # What is said to be held needs no prior.
+        free = changes.get("free", preset.free)
+        known = {name: value for name, value in preset.deviations.items() if name in free}
+        return replace(preset, **{"deviations": known, **changes})
 
 
 @dataclass(frozen=True)
