@@ -482,7 +482,7 @@ def test_adam_lowers_the_mean_absolute_error_and_nothing_but_the_opd_moves(tiny:
         "star_offset": [0.002, -0.001], "flux": [1e10], "background": [BACKGROUND],
     }  # fmt: skip
     assert got.status is Status.COMPLETED
-    # 30 steps of a little more than 1e-11 m at most, and the image belongs to the OPD that is returned.
+    # 30 steps of a little more than 1e-11 m, and the image belongs to the OPD that is returned.
     assert 1e-10 < np.abs(got.wavefront - tiny.opd).max() < 3.3e-10
     final = 1e10 * tiny.model(got.wavefront, start["star_offset"]).numpy() + BACKGROUND
     np.testing.assert_allclose(got.frames[0].star, final, rtol=1e-10)
