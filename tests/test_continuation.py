@@ -150,7 +150,8 @@ def test_every_way_a_planned_fit_can_end(
     if planet is not None:
         ((contrast, *place),) = fit.companions
         error = fit.companion_errors[0]
-        assert abs(contrast - planet.contrast) < 4 * error[0] + 0.02 * planet.contrast
+        # The derivatives of two frames come from coarser copies than those of one.
+        assert abs(contrast - planet.contrast) < 4 * error[0] + 0.03 * planet.contrast
         assert np.abs(np.array(place) - planet.offset).max() < 0.005
     for k, frame in enumerate(fit.frames):
         # On the model as given, wherever the fit was done.
