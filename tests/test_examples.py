@@ -292,6 +292,7 @@ def drawn_values(figure: Figure) -> np.ndarray:
     return np.concatenate([np.asarray(each, dtype=float).ravel() for each in data])
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", CHECKS)
 @pytest.mark.usefixtures("examples")
 def test_small_version(name: str, tmp_path: Path) -> None:
