@@ -16,10 +16,11 @@ from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, Systematics
 from pyklip_diffrender.refinement.planned import refine_again
+from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
-from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.wavefront.opd import as_opd_map, random_opd
 
 NPIX, SIZE, FLUX, READ_NOISE = 64, 32, 3e10, 42.0
 BASIS = JointBasis([SegmentMotions(), FourierModes(4)])
@@ -203,3 +204,16 @@ def test_the_recipe_does_not_take_a_pattern() -> None:
             model(), observed(light(), 1), before(), settings=Adam(iterations=2),
             systematics=known(),
         )  # fmt: skip
+
+
+def test_a_given_start_wins_over_the_default_of_the_model() -> None:
+    usual = {"lyot_rotation": 0.5, "lyot_shift": (0.01, 0.0)}
+    system = dr.nircam_coronagraph(
+        "F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE, defaults=usual
+    )
+    start = {"lyot_rotation": 0.2}
+    problem = Problem(system, observed(light(), 1), as_opd_map(before()), start)
+    values = problem.optical_start(("lyot_rotation", "lyot_shift", "blur"))
+    assert values["lyot_rotation"].tolist() == [0.2]
+    assert values["lyot_shift"].tolist() == [0.01, 0.0]
+    assert values["blur"].tolist() == [0.026]

@@ -97,7 +97,9 @@ class Problem:
             {n: v for n, v in self.start.items() if n in self.model.parameters}
         )
         missing = [parameter(name) for name in names if name not in starts]
-        return {**starts, **self.model.values({p.name: np.full(p.size, p.start) for p in missing})}
+        others = self.model.values({p.name: np.full(p.size, p.start) for p in missing})
+        # `values` fills in the model's defaults, which must not replace what was given.
+        return {**others, **starts}
 
     def require_parameters(self, names: Iterable[str], argument: str = "free") -> None:
         """Raise `IncompatibleSetupError` for a name that is no parameter of this problem."""
