@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         Refinement,
         Status,
         Systematics,
+        known_systematics,
         learn_systematics,
         refine,
     )
@@ -68,6 +69,7 @@ __all__ = [
     "drift",
     "from_poppy",
     "from_webbpsf",
+    "known_systematics",
     "learn_prior",
     "learn_systematics",
     "measure",
@@ -91,6 +93,7 @@ _MODULE_OF = {
     "GaussNewton": "refinement",
     "Sequence": "scene.sequence",
     "Systematics": "refinement",
+    "known_systematics": "refinement",
     "learn_systematics": "refinement",
     "model_for": "scene.real_frames",
     "Detection": "detection",

@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Sequence
+from collections import abc
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 
 if TYPE_CHECKING:
-    from pyklip_diffrender.reduction import Reduction
+    from pyklip_diffrender.scene.sequence import Sequence
 
 __all__ = ["main"]
 
@@ -38,6 +38,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     frames.add_argument("-o", "--output", type=Path, required=True, help="folder for the products")
     frames.add_argument("--size", type=int, default=80, help="side of the fitted square, pixels")
+    frames.add_argument("--threshold", type=float, default=5.0, help="S/N of a candidate")
+    frames.add_argument(
+        "--systematics",
+        default="auto",
+        help="pattern of the model's error: 'auto' (from the reference stars and the package's "
+        "library), 'off', or a systematics.fits of an earlier reduction",
+    )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     demo = commands.add_parser(
@@ -62,10 +69,6 @@ def _parser() -> argparse.ArgumentParser:
     reduce.add_argument("frames", type=Path, nargs="+", help="calints files, or a folder of them")
     reduce.add_argument("--target", help="name of the target; the other stars are references")
     reduce.add_argument("--filter", help="which filter, if the files have several")
-    reduce.add_argument("--threshold", type=float, default=5.0, help="S/N of a candidate")
-    reduce.add_argument(
-        "--systematics", type=Path, help="pattern of the model's error, from an earlier reduction"
-    )
     reduce.add_argument(
         "--dry-run", action="store_true", help="list what would be reduced, and stop"
     )
@@ -75,7 +78,6 @@ def _parser() -> argparse.ArgumentParser:
         "detect", parents=[common, frames], help="search a single calints file"
     )
     detect.add_argument("frames", type=Path, help="calints file")
-    detect.add_argument("--threshold", type=float, default=5.0, help="S/N of a candidate")
     detect.set_defaults(run=_detect, products="detection.fits")
 
     psf = commands.add_parser(
@@ -92,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: abc.Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     options = _parser().parse_args(arguments)
     logging.basicConfig(
@@ -182,26 +184,14 @@ def _psf(options: argparse.Namespace) -> None:
 
 
 def _detect(options: argparse.Namespace) -> None:
-    from pyklip_diffrender.reduction import reduce
     from pyklip_diffrender.scene.observation import Observation
     from pyklip_diffrender.scene.sequence import Sequence
 
     observation = Observation.from_fits(options.frames)
-    _conclude(
-        reduce(
-            Sequence(observation.target, (observation,)),
-            options.opd,
-            size=options.size,
-            threshold=options.threshold,
-            progress=not options.quiet,
-        ),
-        options.output,
-    )
+    _search(Sequence(observation.target, (observation,)), options)
 
 
 def _reduce(options: argparse.Namespace) -> None:
-    from pyklip_diffrender.reduction import reduce
-    from pyklip_diffrender.refinement import Systematics
     from pyklip_diffrender.scene.sequence import Sequence
 
     frames = options.frames[0] if len(options.frames) == 1 else options.frames
@@ -209,28 +199,29 @@ def _reduce(options: argparse.Namespace) -> None:
     print("\n".join(sequence.table.pformat(max_lines=-1, max_width=-1)))
     for name, reason in sequence.excluded:
         print(f"left out: {name}: {reason}")
-    if options.dry_run:
-        return
-    known = None if options.systematics is None else Systematics.read(options.systematics)
-    _conclude(
-        reduce(
-            sequence,
-            options.opd,
-            size=options.size,
-            systematics=known,
-            threshold=options.threshold,
-            progress=not options.quiet,
-        ),
-        options.output,
-    )
+    if not options.dry_run:
+        _search(sequence, options)
 
 
-def _conclude(reduction: Reduction, folder: Path) -> None:
-    """Write all products and say what was found."""
+def _search(sequence: Sequence, options: argparse.Namespace) -> None:
+    """Reduce a sequence, write all products and say what they show."""
     from pyklip_diffrender.plotting import draw_detection, save
+    from pyklip_diffrender.reduction import reduce
+    from pyklip_diffrender.refinement import Systematics
 
-    written = reduction.write(folder)
-    figure = folder / "detection.png"
+    known = options.systematics
+    if known not in ("auto", "off"):
+        known = Systematics.read(known)
+    reduction = reduce(
+        sequence,
+        options.opd,
+        size=options.size,
+        systematics=known,
+        threshold=options.threshold,
+        progress=not options.quiet,
+    )
+    written = reduction.write(options.output)
+    figure = options.output / "detection.png"
     save(draw_detection(reduction.detection), figure)
     print(f"\n{reduction}")
     for path in (*written, figure):

@@ -7,15 +7,15 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pyklip_diffrender.detection import Detection, detect
-from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.refinement import (
     GaussNewton,
     Refinement,
     Systematics,
-    learn_systematics,
+    known_systematics,
     refine,
 )
 from pyklip_diffrender.scene.observation import Observation
@@ -81,15 +81,16 @@ def reduce(
     target: str | None = None,
     filter: str | None = None,
     size: int = 80,
-    systematics: Systematics | None = None,
+    systematics: Systematics | Literal["auto", "off"] = "auto",
     settings: GaussNewton | None = None,
     threshold: float = 5.0,
     progress: bool = False,
 ) -> Reduction:
     """Search a sequence of real frames for planets.
 
-    Every reference star is fitted first. What their fits have in common is the pattern of the
-    model's error, with which all frames of the target are then fitted together and searched.
+    Every reference star is fitted first. What their fits have in common, and what the package's
+    library has from other stars on the same pixels of the detector, is the pattern of the model's
+    error, with which all frames of the target are then fitted together and searched.
 
     Parameters
     ----------
@@ -100,9 +101,10 @@ def reduce(
         See `Sequence.from_files`.
     size : int
         Side in pixels of the square about the star that is fitted.
-    systematics : Systematics, optional
-        Pattern of the model's error; default that of the sequence's own reference stars, if there
-        are at least two frames of them.
+    systematics : Systematics, "auto" or "off"
+        Pattern of the model's error. "auto" takes it from the sequence's own reference stars and
+        the package's library (see `known_systematics`); with "off", or where neither has
+        anything, the target is fitted without one.
     settings : GaussNewton, optional
         Of the fits; default those of `refine`.
     threshold : float
@@ -127,7 +129,8 @@ def reduce(
     common: dict[str, Any] = {"settings": settings, "progress": progress}
     references: list[Refinement] = []
     failed: list[tuple[str, str]] = []
-    if systematics is None:
+    pattern = systematics if isinstance(systematics, Systematics) else None
+    if systematics == "auto":
         for star, frames in _by_star(sequence.references).items():
             _log.info("reference star %s: %d frames", star, len(frames))
             try:
@@ -135,13 +138,19 @@ def reduce(
             except DiffrenderError as error:
                 _log.warning("reference star %s is left out: %s", star, error)
                 failed.append((star, str(error)))
-        if sum(len(fit.frames) for fit in references if fit.status.usable) > 1:
-            systematics = learn_systematics(references)
-    if systematics is not None and settings is None and sequence.science[0].is_nircam:
-        common["settings"] = GaussNewton.nircam(min_model_error=_KNOWN_MODEL_ERROR)
-    fit = refine(model, sequence.science, wavefront, systematics=systematics, **common)
+        pattern = known_systematics(sequence.science[0], references)
+        _log.info("pattern of the model's error: %s", pattern)
+    elif systematics != "off" and pattern is None:
+        raise IncompatibleSetupError(
+            f"systematics: got {systematics!r}, expected 'auto', 'off' or a Systematics"
+        )
+    if pattern is not None and settings is None and sequence.science[0].is_nircam:
+        common["settings"] = GaussNewton.nircam(
+            min_model_error=_KNOWN_MODEL_ERROR, max_companions=0
+        )
+    fit = refine(model, sequence.science, wavefront, systematics=pattern, **common)
     detection = detect(fit, threshold=threshold, progress=progress)
-    return Reduction(sequence, fit, detection, tuple(references), systematics, tuple(failed))
+    return Reduction(sequence, fit, detection, tuple(references), pattern, tuple(failed))
 
 
 def _by_star(observations: Iterable[Observation]) -> dict[str, list[Observation]]:

@@ -13,14 +13,18 @@ from torch import Tensor
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.linear.forward_mode import jacfwd
-from pyklip_diffrender.linear.response import coarse_copy, downsample
 from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
 __all__ = ["Templates"]
 
-_MANY_NPIX = 256
-"""Pupil samples for the many sources of frames whose positions are not the pixels' centres."""
+_FINE = 3
+"""Positions of sources per pixel, along x and y, in frames where they are not at pixel centres. A
+source that stands a sixth of a pixel from its template loses 0.5 % of its S/N in a map; candidates
+are measured with templates of their own."""
+
+_WAVELENGTHS = 4
+"""Largest number of wavelengths of the templates of a map."""
 
 _ALIGNED = 1e-6
 """arcsec, degrees: frames that differ by less have their sources at the same places."""
@@ -58,7 +62,7 @@ class Templates:
         self.rolls = {
             k: frame.observation.roll_from(origin.observation) for k, frame in self.frames.items()
         }
-        self._sources: dict[int, PointSources] = {}
+        self._sources: dict[tuple[int, int, int], PointSources] = {}
         ny, nx = origin.model.detector.shape
         rows, columns = np.divmod(np.arange(ny * nx), nx)
         detector = origin.model.detector
@@ -85,13 +89,22 @@ class Templates:
         )
         return offsets @ turn.T
 
-    def _points(self, k: int) -> PointSources:
-        if k not in self._sources:
+    def _points(self, k: int, right: int = 0, up: int = 0) -> PointSources:
+        """Sources of frame k, `right` and `up` in `_FINE` parts of a pixel off the centres."""
+        key = (k, right, up)
+        if key not in self._sources:
             frame = self.frames[k]
-            self._sources[k] = PointSources(
-                frame.model, _as_tensor(frame.opd), frame.optical_values
+            bandpass = frame.model.bandpass.thinned(_WAVELENGTHS)[1]
+            detector = frame.model.detector
+            x, y = (part / _FINE * scale for part, scale in
+                    zip((right, up), detector.pixelscale, strict=True))  # fmt: skip
+            self._sources[key] = PointSources(
+                frame.model.at_wavelengths(bandpass),
+                _as_tensor(frame.opd),
+                frame.optical_values,
+                offset=(x, y + detector.shear * x),
             )
-        return self._sources[k]
+        return self._sources[key]
 
     def _aligned(self, k: int) -> bool:
         """Whether planets at the first frame's pixel centres are at pixel centres in frame k."""
@@ -114,22 +127,35 @@ class Templates:
         offsets = torch.from_numpy(self.grid[rows, columns])
         images = {}
         for k, frame in self.frames.items():
-            # Calls of the model are faster on a coarse pupil.
-            if self._aligned(k) and self._points(k).route == "lattice":
+            if self._aligned(k):
                 sources = self._points(k).images(rows, columns)
             else:
-                sources = self._many(frame, self._turned(k, offsets))
+                sources = self._near(k, self._turned(k, offsets))
             images[k] = (frame.flux * sources).cpu()
         return images
 
-    def _many(self, frame: FrameFit, offsets: Tensor) -> Tensor:
-        model = coarse_copy(frame.model, _MANY_NPIX)
-        opd = downsample(_as_tensor(frame.opd).to(model.device), model.npix)
-        star = self._star(frame)
-        values = {n: v for n, v in frame.optical_values.items() if n != "star_offset"}
-        with torch.no_grad():
-            parts = [model(opd, star + part, **values).float() for part in offsets.split(8)]
-        return torch.cat(parts)
+    def _near(self, k: int, offsets: Tensor) -> Tensor:
+        """Sources in frame k, each moved to the nearest of the places in `_points`.
+
+        Those that are not on the detector have no light.
+        """
+        frame = self.frames[k]
+        detector = frame.model.detector
+        first = self._points(k).positions([0], [0])[0].cpu()
+        x, y = (self._star(frame) + offsets - first).T
+        fine = torch.stack([(y - detector.shear * x) / detector.pixelscale[1],
+                            x / detector.pixelscale[0]])  # fmt: skip
+        fine = (_FINE * fine).round().to(torch.int64)
+        pixel = torch.div(fine + _FINE // 2, _FINE, rounding_mode="floor")
+        part = fine - _FINE * pixel
+        ny, nx = detector.shape
+        row, column = pixel
+        inside = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)
+        images = torch.zeros(len(offsets), ny, nx, dtype=torch.float32)
+        for up, right in torch.unique(part[:, inside], dim=1).T.tolist():
+            chosen = torch.nonzero(inside & (part[0] == up) & (part[1] == right)).flatten()
+            images[chosen] = self._points(k, right, up).images(row[chosen], column[chosen]).cpu()
+        return images
 
     def at(self, offsets: Tensor, slopes: bool = False) -> dict[int, Tensor]:
         """Planets anywhere, with the model as fine as it was fitted.

@@ -275,7 +275,8 @@ class Responses:
         self.relinearise, self.memory_limit, self.progress = relinearise, memory_limit, progress
         self._kept: list[tuple[Tensor, dict[str, Tensor], WavefrontResponse]] = []
         self._slopes: tuple[Tensor, dict[str, Tensor], dict[str, list[Tensor]]] | None = None
-        self._coarse = coarse_copy(model, npix)
+        self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
+        self._coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
 
     def parameters(
         self,
@@ -302,7 +303,8 @@ class Responses:
             coarse = downsample(opd, self._coarse.npix)
             slopes = field_derivatives(self._coarse, coarse, values, names)
             kept = self._slopes = (inside, dict(values), slopes)
-        return image_derivatives(self._coarse, fields, values, names, kept[2])
+        own = [fields[k] for k in self._kept_wavelengths]
+        return image_derivatives(self._coarse, own, values, names, kept[2])
 
     def near(
         self, opd: Tensor, values: dict[str, Tensor], names: tuple[str, ...] = ()

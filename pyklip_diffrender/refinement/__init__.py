@@ -5,6 +5,7 @@ from __future__ import annotations
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.learning import learn_systematics
+from pyklip_diffrender.refinement.library import known_systematics
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
@@ -18,6 +19,7 @@ __all__ = [
     "Refinement",
     "Status",
     "Systematics",
+    "known_systematics",
     "learn_systematics",
     "refine",
     "refine_again",

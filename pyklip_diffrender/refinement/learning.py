@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,13 @@ from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.systematics import Systematics
 
-__all__ = ["learn_systematics"]
+__all__ = [
+    "MeasuredPattern",
+    "average_by_star",
+    "combine_patterns",
+    "learn_systematics",
+    "measure_patterns",
+]
 
 Image = NDArray[np.float64]
 
@@ -24,17 +30,36 @@ _OUTLIER = 4.0
 """Standard deviations from the median of the frames beyond which a pixel of a frame is left out:
 a companion or background source of that star, or a cosmic ray."""
 
-_FAINT = 0.05
-"""Ratios of a standard deviation above this times the prior's say nothing worth their cost."""
 
+@dataclass(frozen=True, eq=False)
+class MeasuredPattern:
+    """Residual over star, as one frame, or all frames of one star, show it.
 
-@dataclass(frozen=True)
-class _Ratio:
-    """Residual over star of one frame on the common pixels; weight 0 where not known."""
+    Attributes
+    ----------
+    star : str
+    value : ndarray, (ny, nx)
+        Residual over star; 0 where not known.
+    variance : ndarray, (ny, nx)
+        Of the data's noise; inf where not known.
+    center : tuple of float
+        x, y of the star, 0-indexed pixels.
+    first_pixel : tuple of int or None
+        Column and row of the first pixel on the full detector, as of an `Observation`.
+    filter, image_mask : str or None
+    frames, dates : tuple of str
+        Where it was measured.
+    """
 
     star: str
     value: Image
     variance: Image
+    center: tuple[float, float]
+    first_pixel: tuple[int, int] | None = None
+    filter: str | None = None
+    image_mask: str | None = None
+    frames: tuple[str, ...] = ()
+    dates: tuple[str, ...] = ()
 
 
 def learn_systematics(
@@ -66,87 +91,150 @@ def learn_systematics(
     IncompatibleSetupError
         For fewer than two frames, frames of different filters, or failed fits.
     """
+    patterns = measure_patterns(fits)
+    if len(patterns) < 2:
+        raise IncompatibleSetupError(
+            f"learn_systematics: got {len(patterns)} usable frames, expected at least two, such "
+            "as two rolls of a reference star"
+        )
+    return combine_patterns(patterns, name)
+
+
+def measure_patterns(fits: Refinement | Sequence[Refinement]) -> list[MeasuredPattern]:
+    """Measure the pattern in every frame of the fits that did not fail."""
     several = [fits] if isinstance(fits, Refinement) else list(fits)
-    frames = [frame for fit in several if fit.status.usable for frame in fit.frames]
-    if len(frames) < 2:
+    return [_measured(frame) for fit in several if fit.status.usable for frame in fit.frames]
+
+
+def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = None) -> Systematics:
+    """Average measured patterns, see `learn_systematics`.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For none, or patterns of different filters.
+    """
+    filters = {pattern.filter for pattern in patterns}
+    if len(filters) != 1:
         raise IncompatibleSetupError(
-            f"learn_systematics: got {len(frames)} usable frames, expected at least two, such as "
-            "two rolls of a reference star"
+            f"systematics: got patterns of {sorted(map(str, filters))}, expected one filter"
         )
-    filters = {frame.observation.filter for frame in frames}
-    if len(filters) > 1:
-        raise IncompatibleSetupError(
-            f"learn_systematics: got frames of {sorted(map(str, filters))}, expected one filter"
-        )
-    ratios, center = _on_common_pixels(frames)
-    ring = _rings(ratios[0].value.shape, center)
-    values = np.stack([ratio.value for ratio in ratios])
-    variances = np.stack([ratio.variance for ratio in ratios])
-    scatter = _scatter_between_frames(ratios, ring)
+    values, variances, center, first_pixel = _on_common_pixels(patterns)
+    ring = _rings(values[0].shape, center)
+    stars = [pattern.star for pattern in patterns]
+    scatter = _scatter_between_frames(values, variances, stars, ring)
     variances = np.where(_outliers(values, variances + scatter**2), np.inf, variances)
     width = _prior_width(values, variances, ring)
     precision = (1 / (variances + scatter**2)).sum(axis=0)
-    # Frames of one star share what is particular to that star: they count as one for its scatter.
     total = precision + width**-2.0
     pattern = (values / (variances + scatter**2)).sum(axis=0) / total
     error = np.sqrt(1 / total + np.where(precision > 0, scatter**2, 0.0))
-    error = np.minimum(error, width)
-    observation = frames[0].observation
-    stars = list(dict.fromkeys(ratio.star for ratio in ratios))
+    names = list(dict.fromkeys(stars))
     return Systematics(
         pattern=pattern,
-        error=error,
+        error=np.minimum(error, width),
         center=center,
+        first_pixel=first_pixel,
         unknown=float(np.median(width)),
-        filter=observation.filter,
-        image_mask=_text(observation.header.get("CORONMSK")),
-        name=name or ", ".join(stars),
+        filter=patterns[0].filter,
+        image_mask=patterns[0].image_mask,
+        name=name or ", ".join(names),
         provenance={
-            "stars": stars,
-            "frames": [frame.observation.name for frame in frames],
-            "dates": [str(frame.observation.date) for frame in frames],
+            "stars": names,
+            "frames": [frame for each in patterns for frame in each.frames],
+            "dates": [date for each in patterns for date in each.dates],
         },
     )
+
+
+def average_by_star(patterns: Sequence[MeasuredPattern]) -> list[MeasuredPattern]:
+    """Average the frames of each star with their inverse variances."""
+    averaged = []
+    for star in dict.fromkeys(pattern.star for pattern in patterns):
+        own = [pattern for pattern in patterns if pattern.star == star]
+        values, variances, center, first_pixel = _on_common_pixels(own)
+        total = (1 / variances).sum(axis=0)
+        seen = total > 0
+        value = np.divide((values / variances).sum(axis=0), total, where=seen, out=0 * total)
+        averaged.append(
+            replace(
+                own[0],
+                value=value,
+                variance=np.divide(1.0, total, where=seen, out=np.full_like(total, np.inf)),
+                center=center,
+                first_pixel=first_pixel,
+                frames=tuple(frame for each in own for frame in each.frames),
+                dates=tuple(date for each in own for date in each.dates),
+            )
+        )
+    return averaged
 
 
 def _text(value: object) -> str | None:
     return value if isinstance(value, str) else None
 
 
-def _ratio(frame: FrameFit) -> tuple[Image, Image]:
-    """Residual over the star's light, and its variance (inf where nothing is known)."""
-    combined = frame.observation.combined()
+def _measured(frame: FrameFit) -> MeasuredPattern:
+    observation = frame.observation
+    combined = observation.combined()
     background = float(frame.values["background"][0])
     light = (frame.star - background) / frame.gain
     left = combined.data[0] - background - frame.companion_image
     usable = combined.valid[0] & (light > 0)
     safe = np.where(usable, light, 1.0)
-    value = np.where(usable, left / safe - 1, 0.0)
-    return value, np.where(usable, (combined.error[0] / safe) ** 2, np.inf)
+    x, y = combined.center[0]
+    return MeasuredPattern(
+        star=observation.target,
+        value=np.where(usable, left / safe - 1, 0.0),
+        variance=np.where(usable, (combined.error[0] / safe) ** 2, np.inf),
+        center=(float(x), float(y)),
+        first_pixel=observation.first_pixel,
+        filter=observation.filter,
+        image_mask=_text(observation.header.get("CORONMSK")),
+        frames=(observation.name,),
+        dates=() if observation.date is None else (observation.date.isot,),
+    )
 
 
-def _on_common_pixels(frames: Sequence[FrameFit]) -> tuple[list[_Ratio], tuple[float, float]]:
-    """The frames' ratios on an array that holds all of them, stars on one pixel."""
-    corners = []
-    for frame in frames:
-        x, y = np.round(frame.observation.center[0]).astype(int)
-        ny, nx = frame.observation.shape
-        corners.append((-x, -y, nx - x, ny - y))
-    left, bottom = np.min(corners, axis=0)[:2]
-    right, top = np.max(corners, axis=0)[2:]
-    ratios = []
-    for frame, (x, y, _, _) in zip(frames, corners, strict=True):
-        value, variance = _ratio(frame)
-        ny, nx = value.shape
-        window = np.s_[y - bottom : y - bottom + ny, x - left : x - left + nx]
-        on_common = np.zeros((top - bottom, right - left))
-        of_common = np.full(on_common.shape, np.inf)
-        on_common[window], of_common[window] = value, variance
-        header = frame.observation.header
-        star = _text(header.get("TARGPROP")) or frame.observation.name
-        ratios.append(_Ratio(star, on_common, of_common))
-    x, y = frames[0].observation.center[0]
-    return ratios, (float(x - round(x) - left), float(y - round(y) - bottom))
+def _on_common_pixels(
+    patterns: Sequence[MeasuredPattern],
+) -> tuple[Image, Image, tuple[float, float], tuple[int, int] | None]:
+    """Values and variances on an array that holds all patterns, each pixel on one of them.
+
+    Pixels are matched on the detector where all patterns say which ones they have, else by the
+    position of the star.
+
+    Returns
+    -------
+    values, variances : ndarray, (patterns, ny, nx)
+    center : tuple of float
+        The first pattern's star.
+    first_pixel : tuple of int or None
+    """
+    on_detector = all(pattern.first_pixel is not None for pattern in patterns)
+    starts = np.array(
+        [
+            pattern.first_pixel if on_detector else -np.round(pattern.center).astype(int)
+            for pattern in patterns
+        ]
+    )
+    ends = starts + [pattern.value.shape[::-1] for pattern in patterns]
+    left, bottom = starts.min(axis=0)
+    right, top = ends.max(axis=0)
+    values = np.zeros((len(patterns), top - bottom, right - left))
+    variances = np.full(values.shape, np.inf)
+    for k, pattern in enumerate(patterns):
+        ny, nx = pattern.value.shape
+        x, y = starts[k] - (left, bottom)
+        values[k, y : y + ny, x : x + nx] = pattern.value
+        variances[k, y : y + ny, x : x + nx] = pattern.variance
+    x, y = starts[0] - (left, bottom) + patterns[0].center
+    return (
+        values,
+        variances,
+        (float(x), float(y)),
+        (int(left), int(bottom)) if on_detector else None,
+    )
 
 
 def _rings(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[np.int64]:
@@ -161,19 +249,22 @@ def _by_ring(variance: NDArray[np.float64], ring: NDArray[np.int64]) -> Image:
     return np.sqrt(np.maximum(variance, 0.0))[ring]
 
 
-def _scatter_between_frames(ratios: Sequence[_Ratio], ring: NDArray[np.int64]) -> Image:
+def _scatter_between_frames(
+    values: Image, variances: Image, stars: Sequence[str], ring: NDArray[np.int64]
+) -> Image:
     """Standard deviation of the ratio between frames beyond noise, on the pixels.
 
-    From frames of different stars where there are any.
+    From frames of different stars where there are any: frames of one star share what is
+    particular to it.
     """
-    pairs = [(a, b) for k, a in enumerate(ratios) for b in ratios[k + 1 :]]
-    across = [(a, b) for a, b in pairs if a.star != b.star] or pairs
+    pairs = [(a, b) for a in range(len(stars)) for b in range(a + 1, len(stars))]
+    across = [(a, b) for a, b in pairs if stars[a] != stars[b]] or pairs
     count = ring.max() + 1
     excess, weight = np.zeros(count), np.zeros(count)
     for a, b in across:
-        noise = a.variance + b.variance
+        noise = variances[a] + variances[b]
         known = np.isfinite(noise)
-        difference = np.abs(a.value - b.value)
+        difference = np.abs(values[a] - values[b])
         for k in range(count):
             inside = known & (ring == k)
             if not inside.any():
@@ -191,7 +282,7 @@ def _outliers(values: Image, variances: Image) -> NDArray[np.bool_]:
     known = np.isfinite(variances)
     if len(values) < 3:
         return ~known
-    middle = np.nanmedian(np.where(known, values, np.nan), axis=0)
+    middle = np.ma.median(np.ma.array(values, mask=~known), axis=0).filled(0.0)
     return ~known | (np.abs(values - middle) > _OUTLIER * np.sqrt(variances))
 
 

@@ -157,6 +157,8 @@ def observation_hdus(observation: Observation, frame: int) -> tuple[dict[str, An
         "position_angles": combined.position_angles,
         "name": combined.name,
         "reference": combined.reference,
+        "star_offset": combined.star_offset,
+        "first_pixel": combined.first_pixel,
         "header": combined.header.tostring(sep="\n"),
     }
     arrays = {
@@ -182,6 +184,8 @@ def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Obs
         position_angles=None if angles is None else np.array(angles),
         name=facts["name"],
         reference=facts["reference"],
+        star_offset=facts.get("star_offset") and tuple(facts["star_offset"]),
+        first_pixel=facts.get("first_pixel") and tuple(facts["first_pixel"]),
         header=fits.Header.fromstring(facts["header"], sep="\n"),
     )
 

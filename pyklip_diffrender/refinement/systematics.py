@@ -27,9 +27,10 @@ class Systematics:
     """A multiplicative pattern that the star model misses, with its uncertainty.
 
     What no wavefront explains in the image of one star is largely the same fraction of the light
-    in the image of another, on the same pixels. The star in pixel p is taken to be
-    ``model_p * (1 + m_p)``, where m_p is Gaussian with mean `pattern` and standard deviation
-    `error`. Light of companions is not multiplied: nothing of it can be mistaken for the pattern.
+    in the image of another, on the same pixels of the detector: mostly an error of the flat field.
+    The star in pixel p is taken to be ``model_p * (1 + m_p)``, where m_p is Gaussian with mean
+    `pattern` and standard deviation `error`. Light of companions is not multiplied: nothing of it
+    can be mistaken for the pattern.
 
     Attributes
     ----------
@@ -41,6 +42,8 @@ class Systematics:
         x, y of the star in the pattern, 0-indexed pixels.
     unknown : float
         Standard deviation of the pattern where it has not been measured.
+    first_pixel : tuple of int or None
+        Column and row of the pattern's first pixel on the full detector, as of an `Observation`.
     filter, image_mask : str or None
         Set-up that it is for; None where it is not known.
     name : str
@@ -53,6 +56,7 @@ class Systematics:
     error: NDArray[np.float64]
     center: tuple[float, float]
     unknown: float
+    first_pixel: tuple[int, int] | None = None
     filter: str | None = None
     image_mask: str | None = None
     name: str = "systematics"
@@ -78,6 +82,8 @@ class Systematics:
         header = hdus[0].header
         header["LABEL"] = self.name
         header["STARX"], header["STARY"] = self.center
+        if self.first_pixel is not None:
+            header["COLUMN"], header["ROW"] = self.first_pixel
         header["UNKNOWN"] = (self.unknown, "deviation where nothing was measured")
         header["FILTER"], header["CORONMSK"] = self.filter or "", self.image_mask or ""
         for key, value in self.provenance.items():
@@ -93,6 +99,7 @@ class Systematics:
             error=native_float64(hdus["PATTERN_ERROR"].data),
             center=(float(header["STARX"]), float(header["STARY"])),
             unknown=float(header["UNKNOWN"]),
+            first_pixel=(header["COLUMN"], header["ROW"]) if "COLUMN" in header else None,
             filter=header["FILTER"] or None,
             image_mask=header["CORONMSK"] or None,
             name=header["LABEL"],
@@ -127,7 +134,8 @@ class Systematics:
     def at(self, observation: Observation) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pattern and its error on the pixels of an observation.
 
-        The pixels are matched by the position of the star, to the nearest whole pixel.
+        Pixels are matched on the detector where both sides know which ones they have, else by the
+        position of the star, to the nearest whole pixel.
 
         Returns
         -------
@@ -146,7 +154,10 @@ class Systematics:
             )
         pattern = np.zeros(observation.shape)
         error = np.full(observation.shape, self.unknown)
-        x, y = np.round(observation.center[0] - self.center).astype(int)
+        if self.first_pixel is not None and observation.first_pixel is not None:
+            x, y = np.subtract(self.first_pixel, observation.first_pixel)
+        else:
+            x, y = np.round(observation.center[0] - self.center).astype(int)
         (ny, nx), (height, width) = observation.shape, self.pattern.shape
         # Overlap of the pattern, moved by (x, y), with the observation's array.
         first_row, first_column = max(y, 0), max(x, 0)

@@ -31,6 +31,7 @@ from pyklip_diffrender.io.units import (
     to_arcsec,
     to_unit,
 )
+from pyklip_diffrender.scene.detector_pixels import first_pixel, net_shifts, shift_frames
 
 __all__ = ["BAD_PIXEL_BITS", "Observation"]
 
@@ -38,6 +39,11 @@ BAD_PIXEL_BITS = 1 | 2 | 512 | 1024
 """JWST data-quality bits that take a pixel out of the fit: DO_NOT_USE, SATURATED, NON_SCIENCE,
 DEAD. A jump (4) that the ramp fit has repaired, or a hot pixel (2048) that was dark-subtracted,
 may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
+
+
+def _usable(quality: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether the data-quality flags let a pixel into the fit."""
+    return np.asarray((np.asarray(quality).astype(np.uint32) & BAD_PIXEL_BITS) == 0)
 
 
 def _spread(array: NDArray[np.float64], shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
@@ -73,6 +79,9 @@ class Observation:
         x, y of the star relative to the occulter as the file says, arcsec; a fit starts there.
     reference : bool
         Another star, whose frames show the wavefront but none of the target's companions.
+    first_pixel : tuple of int or None
+        Column and row of the array's first pixel on the full detector, 0-indexed; None where it is
+        not known, or where the array's pixels are not the detector's.
     name : str
     header : Header
         Primary and science headers of the file, merged.
@@ -90,6 +99,7 @@ class Observation:
     name: str = "observation"
     reference: bool = False
     star_offset: tuple[float, float] | None = None
+    first_pixel: tuple[int, int] | None = None
     header: fits.Header = field(default_factory=fits.Header)
 
     @classmethod
@@ -186,7 +196,8 @@ class Observation:
 
         Uses SCI, ERR and DQ, BUNIT, FILTER, DATE-BEG, the aperture's pixel area, and the star's
         position from STARCENX/Y, else CRPIX1/2 (1-indexed). Of spaceKLIP's aligned files also
-        MASKOFFS, the position of the mask from the star.
+        MASKOFFS, the position of the mask from the star, and IMSHIFTS: the shift is undone, so that
+        the pixels are those of the detector, whose flat-field errors then stay in their pixels.
 
         Raises
         ------
@@ -230,7 +241,13 @@ class Observation:
                 )
                 quality = np.zeros(data.shape, dtype=np.uint32)
             mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
+            shifts = hdus["IMSHIFTS"].data if "IMSHIFTS" in hdus else None
         observation = cls.from_jwst(data, error, quality, header, name=path.name)
+        if shifts is not None:
+            observation = observation._on_detector_pixels(data, error, quality, shifts)
+        elif "STARCENX" not in header:
+            origin = first_pixel(header, np.zeros(2, dtype=np.int64), path.name)
+            observation = replace(observation, first_pixel=origin)
         if mask is None:
             return observation
         # spaceKLIP says where the mask is from the star, in pixels, for every integration.
@@ -272,7 +289,7 @@ class Observation:
         return cls.from_arrays(
             data,
             error,
-            valid=(np.asarray(quality).astype(np.uint32) & BAD_PIXEL_BITS) == 0,
+            valid=_usable(quality),
             unit=unit,
             pixelscale=area**0.5,
             center=None if np.isnan(star).any() else np.array(star) - 1,
@@ -281,6 +298,39 @@ class Observation:
             position_angles=np.full(frames, angle),
             name=name,
             header=header,
+        )
+
+    def _on_detector_pixels(
+        self, data: NDArray[Any], error: NDArray[Any], quality: NDArray[Any], shifts: Any
+    ) -> Observation:
+        """Undo the shifts (IMSHIFTS) by which frames were aligned, up to whole pixels.
+
+        The arguments are the file's arrays. The alignment leaves DQ where it was.
+        """
+        if np.shape(shifts) != (len(self), 2):
+            raise ShapeError(
+                f"{self.name}: IMSHIFTS: got shape {np.shape(shifts)}, expected ({len(self)}, 2), "
+                "x and y for every frame"
+            )
+        require_finite(native_float64(shifts), f"{self.name}: IMSHIFTS")
+        net = net_shifts(shifts, self.center, self.header, self.name)
+        whole = np.round(net.mean(axis=0)).astype(np.int64)
+        shape = self.data.shape
+        back = [
+            shift_frames(np.nan_to_num(native_float64(a).reshape(shape)), whole - net)
+            for a in (data, error)
+        ]
+        known = np.isfinite(data).reshape(shape) & np.isfinite(error).reshape(shape)
+        usable = _usable(quality).reshape(shape)
+        usable = np.roll(usable, (whole[1], whole[0]), axis=(1, 2))
+        good = known & usable & (back[1] > 0)
+        return replace(
+            self,
+            data=np.where(good, back[0], 0.0),
+            error=np.where(good, back[1], 1.0),
+            valid=good,
+            center=self.center + whole - net,
+            first_pixel=first_pixel(self.header, whole, self.name),
         )
 
     def __len__(self) -> int:
@@ -340,12 +390,17 @@ class Observation:
                  zip(stack, corners, strict=True)]
             )  # fmt: skip
 
+        origin = None
+        if self.first_pixel is not None and (corners == corners[0]).all():
+            column, row = self.first_pixel
+            origin = (column + int(corners[0, 0]), row + int(corners[0, 1]))
         return replace(
             self,
             data=cut(self.data),
             error=cut(self.error),
             valid=cut(self.valid),
             center=self.center - corners,
+            first_pixel=origin,
         )
 
     def combined(self) -> Observation:

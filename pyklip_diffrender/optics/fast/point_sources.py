@@ -1,9 +1,9 @@
 """Point sources at every detector pixel, by convolution on cells that fit the detector.
 
-A source at p is a tilt of the pupil: what `cells` needs of the field, F[E] and F[L E], becomes
-F[E](c - p) and F[L E](x - p). Where cells, samples and sources are points of one lattice, all
-differences lie on it too. Both are computed once, on larger pieces of the lattice, and a source
-costs two small FFTs.
+A source at p is a tilt of the pupil: what the propagation needs of the field, F[E] in the cells c
+of the occulter and F[L E] at the samples x of the detector, becomes F[E](c - p) and F[L E](x - p).
+Where cells, samples and sources are points of one lattice, all differences lie on it too. Both are
+computed once, on larger pieces of the lattice, and a source costs two small FFTs.
 """
 
 from __future__ import annotations
@@ -56,6 +56,8 @@ class PointSources:
         The model's other parameters. A ``star_offset`` is ignored: the positions are the pixels'.
     sampling : float
         Cells of the occulter per lambda/D, at least.
+    offset : tuple of float
+        x, y in arcsec by which all sources stand off the pixels' centres.
 
     Attributes
     ----------
@@ -73,8 +75,9 @@ class PointSources:
         values: Mapping[str, Value | None] | None = None,
         *,
         sampling: float = 1.5,
+        offset: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        self.model = model
+        self.model, self._offset = model, torch.tensor(offset, dtype=torch.float64)
         given = {name: value for name, value in (values or {}).items() if name != "star_offset"}
         with torch.no_grad():
             self._opd = model.opd(opd).detach()
@@ -117,7 +120,8 @@ class PointSources:
     def _wave(self, planes: Sequence[Plane], wavelength: float, sampling: float) -> _Wave:
         model, values = self.model, self._values
         windows = model.windows(values)
-        front = model.pupil_field(self._opd, wavelength, values)
+        tilted = {**values, "star_offset": self._offset} if self._offset.any() else values
+        front = model.pupil_field(self._opd, wavelength, tilted)
         ones = torch.ones((), dtype=model.dtype.to_complex(), device=model.device)
         stop = Wavefront(ones.expand(front.grid.shape), wavelength, front.grid)
         occulter = None
@@ -134,17 +138,18 @@ class PointSources:
         return _Wave(front, stop, occulter, model.detector, axes, sampling)
 
     def positions(self, rows: Index, columns: Index) -> Tensor:
-        """Centres of pixels relative to the optical axis, (k, 2) as x, y in arcsec, float64."""
+        """Sources of pixels relative to the optical axis, (k, 2) as x, y in arcsec, float64."""
         rows, columns = self._indices(rows, columns)
         detector = self.model.detector
         x, y = (
             axis.reshape(-1, detector.oversample).mean(dim=1) / ARCSEC
             for axis in detector.axes(self._values)
         )
-        return torch.stack([x[columns], y[rows] + detector.shear * x[columns]], dim=-1)
+        centres = torch.stack([x[columns], y[rows] + detector.shear * x[columns]], dim=-1)
+        return centres + self._offset.to(centres.device)
 
     def images(self, rows: Index, columns: Index) -> Tensor:
-        """Images of point sources, each in the middle of a pixel.
+        """Images of point sources, each at `offset` from the middle of a pixel.
 
         Parameters
         ----------

@@ -1,0 +1,152 @@
+"""Patterns of the model's error that were measured on other stars and come with the package.
+
+The table was made by ``examples/make_pattern_library.py`` from frames of JWST programme 1184.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+
+from pyklip_diffrender.io.files import open_fits, write_fits
+from pyklip_diffrender.io.units import native_float64
+from pyklip_diffrender.refinement.learning import (
+    MeasuredPattern,
+    combine_patterns,
+    measure_patterns,
+)
+from pyklip_diffrender.refinement.result import Refinement
+from pyklip_diffrender.refinement.systematics import Systematics
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["known_systematics", "read_patterns", "write_patterns"]
+
+_COVERED = 0.5
+"""Smallest part of a frame's pixels that the patterns must cover to be of use."""
+
+
+def known_systematics(
+    observation: Observation, references: Refinement | Sequence[Refinement] = ()
+) -> Systematics | None:
+    """Pattern of the model's error from reference stars and from the package's own library.
+
+    Parameters
+    ----------
+    observation : Observation
+        Frames that it is for. Patterns of the same star are left out, so that nothing of its
+        planets is in the pattern.
+    references : Refinement or sequence of Refinement
+        Fits of reference stars, if there are any.
+
+    Returns
+    -------
+    Systematics or None
+        None if there are fewer than two frames, or stars of the library, to learn from.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pyklip_diffrender as dr
+    >>> frame = dr.Observation.from_arrays(np.ones((8, 8)), np.ones((8, 8)), pixelscale=0.06)
+    >>> print(dr.known_systematics(frame))
+    None
+    """
+    patterns = measure_patterns(references)
+    stars = {_plain(pattern.star) for pattern in patterns} | {_plain(observation.target)}
+    patterns += [each for each in _library_for(observation) if _plain(each.star) not in stars]
+    return combine_patterns(patterns) if len(patterns) > 1 else None
+
+
+def _plain(name: str) -> str:
+    """A star's name without what spellings differ in."""
+    return "".join(c for c in name.upper() if c.isalnum())
+
+
+def _library_for(observation: Observation) -> list[MeasuredPattern]:
+    """The library's patterns of the observation's filter and mask, if they cover its pixels."""
+    if observation.first_pixel is None or observation.header.get("DETECTOR") != "NRCALONG":
+        return []
+    mask = str(observation.header.get("CORONMSK", "")).strip().upper()
+    return [
+        pattern
+        for pattern in _library()
+        if pattern.filter == observation.filter
+        and pattern.image_mask == mask
+        and _covered(pattern, observation) >= _COVERED
+    ]
+
+
+def _covered(pattern: MeasuredPattern, observation: Observation) -> float:
+    """The part of the observation's pixels that a pattern covers."""
+    if pattern.first_pixel is None or observation.first_pixel is None:
+        return 0.0
+    starts = np.array([pattern.first_pixel, observation.first_pixel])
+    shapes = np.array([pattern.value.shape[::-1], observation.shape[::-1]])
+    overlap = (starts + shapes).min(axis=0) - starts.max(axis=0)
+    return float(np.clip(overlap, 0, None).prod() / shapes[1].prod())
+
+
+@lru_cache(maxsize=1)
+def _library() -> tuple[MeasuredPattern, ...]:
+    name = resources.files("pyklip_diffrender.refinement") / "data" / "patterns.fits.gz"
+    with resources.as_file(name) as path:
+        return tuple(read_patterns(path))
+
+
+def write_patterns(patterns: Sequence[MeasuredPattern], path: str | os.PathLike[str]) -> Path:
+    """Write patterns to a FITS file, two extensions (PATTERN, ERROR) for each, atomically."""
+    hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [fits.PrimaryHDU()]
+    for k, pattern in enumerate(patterns, 1):
+        value = fits.ImageHDU(pattern.value.astype(np.float32), name="PATTERN", ver=k)
+        error = np.sqrt(np.where(np.isfinite(pattern.variance), pattern.variance, np.nan))
+        header = value.header
+        header["STAR"] = (pattern.star, "star that it was measured on")
+        header["FILTER"], header["CORONMSK"] = pattern.filter or "", pattern.image_mask or ""
+        header["STARX"], header["STARY"] = pattern.center
+        if pattern.first_pixel is not None:
+            header["COLUMN"], header["ROW"] = pattern.first_pixel
+        header["NFRAMES"] = len(pattern.frames)
+        for n, frame in enumerate(pattern.frames, 1):
+            header[f"FRAME{n}"] = frame
+        header["NDATES"] = len(pattern.dates)
+        for n, date in enumerate(pattern.dates, 1):
+            header[f"DATE{n}"] = date
+        hdus += [value, fits.ImageHDU(error.astype(np.float32), name="ERROR", ver=k)]
+    write_fits(fits.HDUList(hdus), path)
+    return Path(path)
+
+
+def read_patterns(path: str | os.PathLike[str]) -> list[MeasuredPattern]:
+    """Read what `write_patterns` wrote.
+
+    Raises
+    ------
+    CorruptFileError
+        If the file is missing or truncated.
+    """
+    patterns = []
+    with open_fits(path) as hdus:
+        for k in range(1, 1 + sum(hdu.name == "PATTERN" for hdu in hdus)):
+            header = hdus["PATTERN", k].header
+            error = native_float64(hdus["ERROR", k].data)
+            known = np.isfinite(error)
+            patterns.append(
+                MeasuredPattern(
+                    star=header["STAR"],
+                    value=np.where(known, native_float64(hdus["PATTERN", k].data), 0.0),
+                    variance=np.where(known, error, np.inf) ** 2,
+                    center=(header["STARX"], header["STARY"]),
+                    first_pixel=(header["COLUMN"], header["ROW"]) if "COLUMN" in header else None,
+                    filter=header["FILTER"] or None,
+                    image_mask=header["CORONMSK"] or None,
+                    frames=tuple(header[f"FRAME{n + 1}"] for n in range(header["NFRAMES"])),
+                    dates=tuple(header[f"DATE{n + 1}"] for n in range(header["NDATES"])),
+                )
+            )
+    return patterns
