@@ -267,6 +267,7 @@ def test_targets_are_judged_by_ratio_and_error() -> None:
     assert targets(table)[-1][-1] == "no"
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--rows", "nothing", "-o", str(tmp_path)]) == 1
     assert "expected some of 'forward'" in capsys.readouterr().err

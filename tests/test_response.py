@@ -260,6 +260,7 @@ def test_the_log_evidence_is_that_of_the_data(linear: dict[str, torch.Tensor]) -
     assert got == pytest.approx(exact(one) - exact(other), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_an_absent_kind_ends_at_the_floor(linear: dict[str, torch.Tensor]) -> None:
     truth = linear["truth"].clone()
     truth[2:][linear["group"] == 1] = 0
