@@ -121,7 +121,7 @@ def show(
 ) -> AxesImage:
     """Show an image, y up, with a colour bar as high as it; NaN is grey."""
     shown = ax.imshow(image, origin="lower", extent=extent, interpolation="nearest", **style)
-    shown.cmap.set_bad("0.75")
+    ax.set_facecolor("0.75")
     ax.set_title(title, color=INK, loc="left")
     # An inset follows the image, whose box is not that of the axes; a stolen strip does not.
     strip = ax.inset_axes((1.03, 0.0, 0.05, 1.0))
@@ -129,7 +129,8 @@ def show(
     extend = ("neither", "max", "min", "both")[
         2 * bool(np.nanmin(image) < low) + bool(np.nanmax(image) > high)
     ]
-    ax.figure.colorbar(shown, cax=strip, label=bar, extend=extend, ticks=ticks)
+    form = None if ticks is None else "%g"
+    ax.figure.colorbar(shown, cax=strip, label=bar, extend=extend, ticks=ticks, format=form)
     return shown
 
 

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from pyklip_diffrender.detection import Detection
     from pyklip_diffrender.optics.detector import Detector
     from pyklip_diffrender.optics.grid import PupilGrid
-    from pyklip_diffrender.optics.planes import Wavefront
+    from pyklip_diffrender.optics.planes import Values, Wavefront
     from pyklip_diffrender.optics.system import OpticalSystem
-    from pyklip_diffrender.refinement import FrameFit, Refinement
+    from pyklip_diffrender.refinement import Refinement
     from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["plot_detection", "plot_observation", "plot_refinement", "plot_system"]
@@ -104,8 +104,8 @@ def plot_system(system: OpticalSystem, ax: Any = None, *, opd: Any = None) -> ND
         axes.set_xlabel("m")
     title = f"star on the axis, {1e6 * mean:.2f} um"
     show(
-        image, light, _extent(system.detector), bar="fraction of the star's light", title=title,
-        cmap=_LIGHT, norm=_log(light),
+        image, light, _extent(system.detector, values), bar="fraction of the star's light",
+        title=title, cmap=_LIGHT, norm=_log(light),
     )  # fmt: skip
     image.set_xlabel("x from the optical axis (arcsec)")
     image.set_ylabel("y from the optical axis (arcsec)")
@@ -119,7 +119,7 @@ def plot_refinement(fit: Refinement, ax: Any = None, *, frame: int = 0) -> NDArr
     observation = part.observation.combined()
     valid, noise = observation.valid[0], observation.error[0]
     data = np.where(valid, observation.data[0], np.nan)
-    extent, unit = _extent(part.model.detector, part), unit_label(observation.unit)
+    extent, unit = _extent(part.model.detector, part.optical_values), unit_label(observation.unit)
     norm = light_norm(data, noise[valid])
     show(left, data, extent, bar=unit, title="data", cmap=_LIGHT, norm=norm)
     show(middle, part.star, extent, bar=unit, title="star model", cmap=_LIGHT, norm=norm)
@@ -198,9 +198,8 @@ def _whole(wavefront: Wavefront, full: PupilGrid) -> NDArray[np.float64]:
     return np.asarray(wavefront.grid.crop(wavefront.field.abs(), full).double().cpu().numpy())
 
 
-def _extent(detector: Detector, frame: FrameFit | None = None) -> Extent:
-    """Edges of the detector in arcsec, from the optical axis or the star of a frame."""
-    values = {} if frame is None else frame.optical_values
+def _extent(detector: Detector, values: Values) -> Extent:
+    """Edges of the detector in arcsec from the star."""
     star = values.get("star_offset", torch.zeros(2)).cpu().numpy()
     x, y = (
         axis.reshape(-1, detector.oversample).mean(dim=1).cpu().numpy() / ARCSEC
