@@ -265,7 +265,10 @@ def test_a_bright_companion_gets_parameters_of_its_own(
     assert fit.frames[0].star == pytest.approx(world.expected(), rel=0.02, abs=100)
 
 
-@pytest.mark.parametrize(("contrast", "seed", "again"), [(4e-6, 7, False), (1e-5, 11, True)])
+@pytest.mark.parametrize(
+    ("contrast", "seed", "again"),
+    [(4e-6, 7, False), pytest.param(1e-5, 11, True, marks=pytest.mark.slow)],
+)
 def test_only_what_bends_the_wavefront_far_has_it_fitted_anew(
     world: World, contrast: float, seed: int, again: bool
 ) -> None:
@@ -275,6 +278,7 @@ def test_only_what_bends_the_wavefront_far_has_it_fitted_anew(
     assert (began != sorted(began)) == again
 
 
+@pytest.mark.slow
 def test_what_a_fit_took_for_a_companion_need_not_be_one(world: World) -> None:
     observation = world.observed(world.expected(), 4)
     fit = world.refined(observation, companions=(replace(WHERE, contrast=1e-6),))
@@ -512,6 +516,7 @@ def test_a_fit_that_is_gone_holds_no_memory(large: World) -> None:
 # -- several frames --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_independent_looks_add_their_information(world: World) -> None:
     fits = [world.fitted(seed, FAINT) for seed in (5, 20, 21)]
     single = [float(dr.measure(fit, [WHERE.offset])["contrast_error"][0]) for fit in fits]

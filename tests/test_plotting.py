@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import Detection
+from pyklip_diffrender.detection import Candidates, Detection
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import GaussNewton, Refinement
@@ -263,9 +263,8 @@ def test_a_detection_shows_candidates_and_the_curve(found: Detection) -> None:
 
 
 def test_a_detection_without_candidates_has_no_circles(found: Detection) -> None:
-    none = dr.detect(found.fits[0], threshold=1e6)
-    left, right = none.plot()
-    assert left.get_title(loc="left") == "0 candidates above S/N 1e+06"
+    left, right = replace(found, candidates=Candidates.none()).plot()
+    assert left.get_title(loc="left") == "0 candidates above S/N 5"
     assert points(left, "companions").shape == (0, 2)
     assert "candidates" not in [text.get_text() for text in right.get_legend().get_texts()]
 

@@ -61,7 +61,11 @@ def slope(
 MODES = (0, 1, 29, 41, 54, 57, 90, len(BASIS) - 1)
 
 
-@pytest.mark.parametrize("changes", [{}, {"monochromatic": None, "nlambda": 2}], ids=["1", "2"])
+@pytest.mark.parametrize(
+    "changes",
+    [{}, pytest.param({"monochromatic": None, "nlambda": 2}, marks=pytest.mark.slow)],
+    ids=["1", "2"],
+)
 @pytest.mark.parametrize(("npix", "tolerance"), [(NPIX, 1e-4), (128, 0.025)])
 def test_wavefront_response_is_the_slope_of_the_fine_model(
     opd: torch.Tensor,
