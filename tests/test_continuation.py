@@ -104,7 +104,7 @@ def pulls(fit: Refinement, k: int) -> np.ndarray:
 
 # -- plans ---------------------------------------------------------------------------------------
 
-QUICK = ((False, False, None, 2), (False, False, PLANET, 1), (True, True, None, 1))
+QUICK = ((False, False, None, 2), (True, True, None, 1))
 """The others need ``--full``."""
 
 BRANCHES = [

@@ -66,7 +66,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "no occulter": ({"image_mask": None}, {}),
     "no Lyot stop": ({"pupil_mask": None}, {}),
 }
-QUICK = ("on axis", "ND squares, 0.6 arcsec")
+QUICK = ("on axis",)
 """The others need ``--full``."""
 
 QUICK_EMBEDDED = ("MASK335R",)
