@@ -23,8 +23,10 @@ from pyklip_diffrender.wavefront.bases import FourierModes
 from pyklip_diffrender.wavefront.opd import random_opd
 
 NPIX, FLUX, NOISE = 64, 3e10, 100.0
-STAR = (0.05, -0.1)
-"""Of the frames, arcsec from the middle, as a shift of the detector."""
+AXIS = (0.05, -0.1)
+"""Where the optical axis is in the frames, arcsec from the middle."""
+OFFSET = (0.02, 0.03)
+"""Of the star from the axis."""
 PLANET = Planet(3e-4, 0.6, 100.0)
 ANGLES = (70.0, 40.0)
 HOLE = (3, 20)
@@ -43,7 +45,7 @@ def model() -> OpticalSystem:
         monochromatic=4.5e-6,
         npix=NPIX,
         fov_pixels=(30, 34),
-        defaults={"detector_shift": STAR},
+        defaults={"detector_shift": AXIS},
     )
 
 
@@ -54,14 +56,15 @@ def frames(model: OpticalSystem) -> list[Observation]:
     scale = np.array(model.detector.pixelscale)
     for k, angle in enumerate(ANGLES):
         place = replace(PLANET, position_angle=PLANET.position_angle - angle).offset
-        light = FLUX * (model(opd) + PLANET.contrast * model(opd, place)).numpy()
+        planet = model(opd, tuple(np.add(OFFSET, place)))
+        light = FLUX * (model(opd, OFFSET) + PLANET.contrast * planet).numpy()
         data = light + NOISE * np.random.default_rng(k).normal(size=light.shape)
         valid = np.ones(data.shape, dtype=bool)
         valid[HOLE] = False
         made.append(
             Observation.from_arrays(
                 data, np.full(data.shape, NOISE), valid=valid, pixelscale=tuple(scale),
-                center=(16.5, 14.5) + np.array(STAR) / scale, name="HD 1", filter="F444W",
+                center=(16.5, 14.5) + np.array(AXIS) / scale, name="HD 1", filter="F444W",
                 position_angles=np.array([angle]),
             )
         )  # fmt: skip
@@ -89,6 +92,7 @@ def shown(ax: Axes) -> NDArray[np.float64]:
 def place_of(ax: Axes, row: int, column: int) -> NDArray[np.float64]:
     """x, y of a pixel's centre on the axes."""
     (image,) = ax.images
+    assert image.origin == "lower"
     left, right, bottom, top = image.get_extent()
     ny, nx = image.get_array().shape
     return np.array(
@@ -191,7 +195,7 @@ def test_a_system_shows_its_pupils_and_the_star(model: OpticalSystem) -> None:
         np.testing.assert_allclose(ax.images[0].get_extent(), 3.3 * np.array([-1, 1, -1, 1]), 0.02)
     # The optical axis lies beside the middle of the detector.
     np.testing.assert_allclose(
-        (place_of(image, 0, 0) + place_of(image, 29, 33)) / 2, -np.array(STAR), atol=1e-12
+        (place_of(image, 0, 0) + place_of(image, 29, 33)) / 2, -np.array(AXIS), atol=1e-12
     )
     labels = [bar_of(ax).get_ylabel() for ax in axes]
     assert labels == [
@@ -233,7 +237,7 @@ def test_a_fit_shows_data_star_and_what_is_left(fit: Refinement, frame: int) -> 
     turned = replace(PLANET, position_angle=PLANET.position_angle - ANGLES[frame])
     np.testing.assert_allclose(place, turned.offset, atol=0.01)
     middle = (place_of(data, 0, 0) + place_of(data, 29, 33)) / 2
-    np.testing.assert_allclose(middle, -np.array(STAR), atol=0.01)
+    np.testing.assert_allclose(middle, -np.add(AXIS, OFFSET), atol=0.01)
     expected = np.sin(np.deg2rad([ANGLES[frame], 90 - ANGLES[frame]]))
     np.testing.assert_allclose(arrows(data)["N"], expected)
 
