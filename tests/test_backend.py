@@ -193,7 +193,7 @@ def test_other_algorithms_are_bit_identical(algo: str, imgs: np.ndarray, tmp_pat
 
 
 @pytest.mark.usefixtures("registered")
-@pytest.mark.parametrize("save_ints", [False, True])
+@pytest.mark.parametrize("save_ints", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("collapse", ["mean", "weighted-mean"])
 @pytest.mark.parametrize(
     ("mode", "wvs"),

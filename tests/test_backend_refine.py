@@ -138,6 +138,7 @@ def test_star_goes_companion_stays(
     assert header["DRSHA256"] == OLD.sha256
 
 
+@pytest.mark.slow
 def test_what_is_detected_keeps_its_light(small: OpticalSystem, tmp_path: Path) -> None:
     contrast = 5e-6  # Too faint for a fit of one roll to look for it by itself.
     shots = exposed(contrast)

@@ -54,6 +54,7 @@ def line(table: Table, row: str, column: str, precision: str = "float64") -> Any
     return found
 
 
+@pytest.mark.slow
 def test_every_way_to_an_image_agrees_with_the_converged_one(measured: Table) -> None:
     """The codes that are compared with solve the same problem: no flip, no wrong scale."""
     assert line(measured, "forward", "this package, 128")["error"] < 1e-7
@@ -82,6 +83,7 @@ def test_the_papers_recipe_has_the_derivative_of_the_package(here: Setting) -> N
     assert (slopes[0] - slopes[1]).norm() < 1e-5 * slopes[1].norm()
 
 
+@pytest.mark.slow
 def test_errors_are_of_the_answers_and_ratios_to_the_reference(measured: Table) -> None:
     ours, theirs = (
         line(measured, "forward + backward", name)
@@ -96,6 +98,7 @@ def test_errors_are_of_the_answers_and_ratios_to_the_reference(measured: Table) 
     assert line(measured, "forward", "this package, 128", "float32")["error"] > ours["error"]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_measured_is_said(measured: Table) -> None:
     found = line(measured, "forward", "stpsf calc_psf, fft_oversample 4")
     assert math.isnan(found["seconds"])
@@ -235,6 +238,7 @@ def test_page_and_figure_from_the_table_alone(measured: Table, tmp_path: Path) -
     assert "not measured: no data directory" in text
 
 
+@pytest.mark.slow
 def test_the_figure_shows_every_measured_case_at_its_place(measured: Table) -> None:
     figure = draw(measured)
     for ax, row in zip(figure.axes, ("forward", "forward + backward"), strict=True):
@@ -267,6 +271,7 @@ def test_targets_are_judged_by_ratio_and_error() -> None:
     assert targets(table)[-1][-1] == "no"
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--rows", "nothing", "-o", str(tmp_path)]) == 1
     assert "expected some of 'forward'" in capsys.readouterr().err

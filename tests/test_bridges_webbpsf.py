@@ -71,6 +71,7 @@ def error(image: Any, truth: Any) -> float:
     return float(np.abs(image - truth).max() / truth.max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flipped", [True, False])
 def test_the_flip_of_the_internal_wavefront_is_recorded_and_can_be_chosen(
     nircam: Callable[..., Any], flipped: bool
@@ -112,6 +113,7 @@ def test_keywords_and_extensions_are_those_of_stpsf(nircam: Callable[..., Any]) 
         assert mine.header["DRPROP"] == "MASK335R: compact"
 
 
+@pytest.mark.slow
 def test_a_script_for_stpsf_runs_unchanged(nircam: Callable[..., Any], tmp_path: Path) -> None:
     instrument = nircam()
     model = from_webbpsf(instrument)
@@ -240,7 +242,9 @@ def test_gradients(
     assert abs(found - wanted) <= 1e-6 * abs(wanted)
 
 
-@pytest.mark.parametrize("offset", [(0.31, -0.12), (-0.04, 0.52)])
+@pytest.mark.parametrize(
+    "offset", [(0.31, -0.12), pytest.param((-0.04, 0.52), marks=pytest.mark.slow)]
+)
 def test_star_offsets_are_source_offsets(
     nircam: Callable[..., Any], offset: tuple[float, float]
 ) -> None:

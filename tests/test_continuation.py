@@ -104,8 +104,11 @@ def pulls(fit: Refinement, k: int) -> np.ndarray:
 
 # -- plans ---------------------------------------------------------------------------------------
 
+QUICK = ((False, False, None, 2), (True, True, None, 1))
+"""The others need ``--full``."""
+
 BRANCHES = [
-    pytest.param(*branch, marks=[pytest.mark.slow] if branch[2] and branch[3] > 1 else [])
+    pytest.param(*branch, marks=[] if branch in QUICK else [pytest.mark.slow])
     for branch in itertools.product((False, True), (False, True), (None, PLANET), (1, 2))
 ]
 
@@ -169,6 +172,7 @@ def test_every_way_a_planned_fit_can_end(
     assert len(dr.measure(fit, [[0.3, -0.5]])) == 1
 
 
+@pytest.mark.slow
 def test_drifts_and_a_known_companion_go_on_when_a_plan_is_given_up(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -193,26 +197,25 @@ def test_drifts_and_a_known_companion_go_on_when_a_plan_is_given_up(
     assert contrast == pytest.approx(PLANET.contrast, rel=0.03)
 
 
-def test_a_companion_can_be_added_to_a_planned_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    for allowed in (True, False):
-        with monkeypatch.context() as patch:
-            patch.setattr(Plan, "allows", lambda plan, error, good=allowed: good)
-            faint = replace(PLANET, contrast=3e-4)
-            frame = shot(0, faint)
-            fit = dr.refine(
-                model(), frame, before(), settings=settings(min_model_error=1e-6, cycles=4.0),
-                plan=coarse_plan(),
-            )  # fmt: skip
-            assert not len(fit.companions)
-            again = refine_again(fit, companions=(faint,))
-        assert len(again.companions) == 1
-        assert abs(again.companions[0, 0] - 3e-4) < 4 * again.companion_errors[0, 0]
-        assert again.chi2_per_pixel < fit.chi2_per_pixel
-        assert again.frames[0].model is model()
-        # A plan that was given up is not tried again.
-        assert (again.plan is not None) == allowed
+@pytest.mark.parametrize("allowed", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_a_companion_can_be_added_to_a_planned_fit(
+    monkeypatch: pytest.MonkeyPatch, allowed: bool
+) -> None:
+    monkeypatch.setattr(Plan, "allows", lambda plan, error: allowed)
+    faint = replace(PLANET, contrast=3e-4)
+    kept = settings(min_model_error=1e-6, cycles=4.0)
+    fit = dr.refine(model(), shot(0, faint), before(), settings=kept, plan=coarse_plan())
+    assert not len(fit.companions)
+    again = refine_again(fit, companions=(faint,))
+    assert len(again.companions) == 1
+    assert abs(again.companions[0, 0] - 3e-4) < 4 * again.companion_errors[0, 0]
+    assert again.chi2_per_pixel < fit.chi2_per_pixel
+    assert again.frames[0].model is model()
+    # A plan that was given up is not tried again.
+    assert (again.plan is not None) == allowed
 
 
+@pytest.mark.slow
 def test_a_planned_fit_that_fails_is_on_the_model_as_given() -> None:
     dark = replace(shot(), data=-shot().data)
     fit = dr.refine(model(), dark, before(), settings=settings(), plan=coarse_plan())

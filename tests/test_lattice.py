@@ -158,6 +158,7 @@ def test_bad_pixels_and_maps_are_refused(opd: torch.Tensor) -> None:
         PointSources(system(), opd, {"lyot_shfit": (0, 0)})
 
 
+@pytest.mark.slow
 def test_templates_at_full_size() -> None:
     """1024 samples, sheared pixels: on the axis, 0.3, 0.6 and 2 arcsec from it, in a corner."""
     model = nircam_coronagraph(monochromatic=WAVELENGTH, **SIAF)
@@ -212,6 +213,7 @@ def test_both_routes_take_parameters_alike(name: str, opd: torch.Tensor) -> None
     assert float((fast(opd, **values) - truth).abs().max() / truth.max()) < 3e-8
 
 
+@pytest.mark.slow
 def test_full_size_error_of_the_default() -> None:
     fast, planes = both_routes(npix=1024, fov_pixels=80)
     opd = torch.from_numpy(random_opd(5).data)

@@ -196,6 +196,7 @@ def test_a_file_of_zeros_is_refused(tmp_path: Path, opd: np.ndarray) -> None:
         read_opd(write(tmp_path / "blank.fits", 0 * opd))
 
 
+@pytest.mark.slow
 def test_stpsfs_own_files_are_read(tmp_path: Path) -> None:
     """An OPD in metres in the primary HDU, with stpsf's keywords: nothing is converted."""
     from stpsf_data import make_stpsf_data
@@ -365,7 +366,10 @@ def weighted(map_: np.ndarray) -> tuple[float, float]:
     return float((weight * map_).sum()), float(np.sqrt((weight * map_**2).sum()))
 
 
-@pytest.mark.parametrize("seed", [0, 1, 77])
+@pytest.mark.parametrize(
+    "seed",
+    [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(77, marks=pytest.mark.slow)],
+)
 def test_random_opd_has_the_rms_that_was_asked_for_and_no_piston(seed: int) -> None:
     for rms in (66e-9, 10e-9):
         mean, got = weighted(random_opd(seed, npix=NPIX, rms=rms).data)

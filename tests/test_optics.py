@@ -263,6 +263,7 @@ def test_half_of_the_light_passes_where_the_mask_is_named_for(name: str) -> None
     assert found == pytest.approx(PROFILES[name][1], rel=0.015)
 
 
+@pytest.mark.slow
 @pytest.mark.hard
 def test_a_finer_occulter_changes_less_and_less(opd: torch.Tensor) -> None:
     exact = small(occulter_sampling=16.0)(opd)

@@ -66,8 +66,11 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "no occulter": ({"image_mask": None}, {}),
     "no Lyot stop": ({"pupil_mask": None}, {}),
 }
-QUICK = ("on axis", "ND squares, 0.6 arcsec", "jitter and diffusion", "no Lyot stop")
+QUICK = ("on axis",)
 """The others need ``--full``."""
+
+QUICK_EMBEDDED = ("MASK335R",)
+"""Of STScI's own files."""
 
 
 def nircam(
@@ -109,6 +112,7 @@ def test_images_agree_to_rounding(stpsf_path: Path, case: str) -> None:
         assert np.abs(image - truth[name].data).max() <= 1e-11 * truth[name].data.max()
 
 
+@pytest.mark.slow
 def test_the_default_sampling_is_good_enough(stpsf_path: Path) -> None:
     """4 points per lambda/D against stpsf at 8: what a user of either sees."""
     call = {**CALL, "fov_pixels": 60}
@@ -187,6 +191,7 @@ def official(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 FULL = {"fft_oversample": 2, "detector_oversample": 1, "fov_pixels": 80}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["ND squares, 0.6 arcsec", "pupil shift, rotation, offset"])
 def test_converted_models_agree_on_the_official_files(official: Path, case: str) -> None:
     """To rounding, DET_SAMP and DET_DIST, at 1024 samples."""
@@ -251,12 +256,16 @@ def differences(official: Path, case: str, wrong: dict[str, Any]) -> list[float]
     return [float(error[ring].mean() / truth[ring].mean()) for ring in rings]
 
 
-@pytest.mark.parametrize("case", EMBEDDED)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(k, marks=() if k in QUICK_EMBEDDED else pytest.mark.slow) for k in EMBEDDED],
+)
 def test_the_embedded_coronagraph_is_that_of_the_official_files(official: Path, case: str) -> None:
     """What is left: the outlines of pupil (0.2 %) and stop (0.1 %), and poppy's Zernike circle."""
     assert max(differences(official, case, {})) < EMBEDDED[case][-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", WRONG)
 def test_what_is_wrong_in_the_embedded_coronagraph_is_seen(official: Path, wrong: str) -> None:
     assert max(differences(official, "MASK335R", WRONG[wrong])) > 0.03

@@ -440,6 +440,7 @@ def test_a_probe_that_claims_too_much_is_caught(
 # -- in a fit ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_planned_fit_sees_the_same_planet_on_the_model_as_given() -> None:
     settings = GaussNewton(**SETTINGS)
     exact = refine(model(), frame(), before(), settings=settings, plan="off")
@@ -480,6 +481,7 @@ def test_refine_plans_by_itself_and_honours_what_it_was_told() -> None:
         assert refine(model(), frame(), before(), settings=few).plan is None
 
 
+@pytest.mark.slow
 def test_a_plan_that_fails_at_the_solution_is_abandoned(caplog: pytest.LogCaptureFixture) -> None:
     keep = {"npix": 128, "multifidelity": False, "cycles": 4.0}
     bright = frame(7200.0)

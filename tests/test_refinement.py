@@ -273,6 +273,7 @@ def test_frames_of_the_same_star_are_averaged(tiny: Case) -> None:
     )
 
 
+@pytest.mark.slow
 def test_an_independent_minimiser_ends_where_gauss_newton_does() -> None:
     """The penalised chi-squared written out once more, with reverse-mode gradients."""
     basis = FourierModes(2)
@@ -387,12 +388,13 @@ def test_nothing_that_was_passed_in_is_modified(tiny: Case) -> None:
 # -- how a fit ends --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.hard
 @pytest.mark.parametrize(
     "turn",
     [
         pytest.param(lambda a: a[::-1].copy(), id="upside down"),
-        pytest.param(lambda a: a.T.copy(), id="transposed", marks=pytest.mark.slow),
+        pytest.param(lambda a: a.T.copy(), id="transposed"),
     ],
 )
 def test_a_turned_wavefront_does_not_end_in_success(bright: Case, turn: object) -> None:
@@ -415,6 +417,7 @@ def test_too_few_iterations_are_said(bright: Case) -> None:
     assert len(got.history) == 2
 
 
+@pytest.mark.slow
 def test_a_frame_without_a_star_is_no_success(tiny: Case) -> None:
     dark = observed(0 * tiny.star, tiny.observation.pixelscale, 3)
     negative = replace(dark, data=-tiny.observation.data)

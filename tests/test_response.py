@@ -61,7 +61,11 @@ def slope(
 MODES = (0, 1, 29, 41, 54, 57, 90, len(BASIS) - 1)
 
 
-@pytest.mark.parametrize("changes", [{}, {"monochromatic": None, "nlambda": 2}], ids=["1", "2"])
+@pytest.mark.parametrize(
+    "changes",
+    [{}, pytest.param({"monochromatic": None, "nlambda": 2}, marks=pytest.mark.slow)],
+    ids=["1", "2"],
+)
 @pytest.mark.parametrize(("npix", "tolerance"), [(NPIX, 1e-4), (128, 0.025)])
 def test_wavefront_response_is_the_slope_of_the_fine_model(
     opd: torch.Tensor,
@@ -260,6 +264,7 @@ def test_the_log_evidence_is_that_of_the_data(linear: dict[str, torch.Tensor]) -
     assert got == pytest.approx(exact(one) - exact(other), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_an_absent_kind_ends_at_the_floor(linear: dict[str, torch.Tensor]) -> None:
     truth = linear["truth"].clone()
     truth[2:][linear["group"] == 1] = 0

@@ -12,7 +12,7 @@ from astropy import units as u
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from pyklip_diffrender.detection import detect
+from pyklip_diffrender.detection import detect, measure
 from pyklip_diffrender.errors import (
     CorruptFileError,
     IncompatibleSetupError,
@@ -168,6 +168,7 @@ def test_a_pattern_is_learned_from_another_star() -> None:
     assert learned.filter == "F444W"
 
 
+@pytest.mark.slow
 def test_with_the_pattern_the_planet_of_another_star_is_unbiased() -> None:
     target = [frame("TARGET", 20, planet=True), frame("TARGET", 21, planet=True, roll=10.0)]
     without = refine(model(), target, opd(), settings=SETTINGS)
@@ -202,14 +203,15 @@ def test_systematics_survive_the_file(tmp_path: Path) -> None:
         Systematics.read(tmp_path / "other.fits")
 
 
+@cache
+def rolled_fit() -> Refinement:
+    frames = [frame("TARGET", 20, planet=True), frame("TARGET", 21, planet=True, roll=10.0)]
+    learned = learn_systematics(reference_fit())
+    return refine(model(), frames, opd(), settings=SETTINGS, systematics=learned)
+
+
 def test_a_refinement_survives_the_file(tmp_path: Path) -> None:
-    fit = refine(
-        model(),
-        [frame("TARGET", 20, planet=True), frame("TARGET", 21, planet=True, roll=10.0)],
-        opd(),
-        settings=SETTINGS,
-        systematics=learn_systematics(reference_fit()),
-    )
+    fit = rolled_fit()
     back = Refinement.read(fit.write(tmp_path / "fit.fits"))
     assert (back.status, back.settings, back.seed) == (fit.status, fit.settings, fit.seed)
     for ours, theirs in zip(back.frames, fit.frames, strict=True):
@@ -217,7 +219,16 @@ def test_a_refinement_survives_the_file(tmp_path: Path) -> None:
         np.testing.assert_array_equal(ours.opd, theirs.opd)
         assert ours.observation.position_angle == theirs.observation.position_angle
         assert ours.observation.target == "TARGET"
-    again, first = detect(back), detect(fit)
+    places = [PLANET.offset, [0.5, -0.3]]
+    again, first = measure(back, places), measure(fit, places)
+    np.testing.assert_array_equal(again["contrast"], first["contrast"])
+    np.testing.assert_array_equal(again["contrast_error"], first["contrast_error"])
+
+
+@pytest.mark.slow
+def test_a_detection_in_a_file_is_that_in_the_fit(tmp_path: Path) -> None:
+    fit = rolled_fit()
+    again, first = detect(Refinement.read(fit.write(tmp_path / "fit.fits"))), detect(fit)
     np.testing.assert_array_equal(again.snr, first.snr)
     np.testing.assert_array_equal(again.table["contrast"], first.table["contrast"])
     assert again.table["position_angle"][0].to_value(u.deg) == pytest.approx(40, abs=0.5)

@@ -121,6 +121,7 @@ def fitted(observation: Observation, systematics: Systematics | None) -> Refinem
     return dr.refine(model(), observation, before(), settings=settings, systematics=systematics)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("separation", "angle"), [(0.6, 300.0), (0.8, 100.0)])
 def test_a_pattern_hides_planets_and_is_taken_out_where_it_is_known(
     separation: float, angle: float
@@ -152,6 +153,7 @@ def test_a_pattern_hides_planets_and_is_taken_out_where_it_is_known(
     assert refine_again(with_it, max_iterations=2).systematics is with_it.systematics
 
 
+@pytest.mark.slow
 def test_the_error_of_a_pattern_counts_as_noise() -> None:
     """The frames' own pattern differs from the one that was measured, by what its error says."""
     drawn = 0.02 * np.random.default_rng(8).normal(size=(SIZE, SIZE))
@@ -167,6 +169,7 @@ def test_the_error_of_a_pattern_counts_as_noise() -> None:
     assert row["contrast_error"] > 1.2 * exact["contrast_error"]
 
 
+@pytest.mark.slow
 def test_the_pattern_follows_the_star_over_the_detector() -> None:
     """Where the pattern was not measured its standard deviation counts."""
     shift = (3, -2)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -324,6 +325,25 @@ class Detection:
                 else "position angles east of north"
             ),
         }
+
+    def plot(self, ax: Any = None) -> NDArray[Any]:
+        """Draw the S/N map with the candidates, and the contrast curve.
+
+        The map is in arcsec from the star; arrows point to north and east where the position angle
+        of the first frame is known.
+
+        Parameters
+        ----------
+        ax : two Axes, optional
+            Default those of a new figure.
+
+        Returns
+        -------
+        ndarray of Axes, (2,)
+        """
+        from pyklip_diffrender import plotting
+
+        return plotting.plot_detection(self, ax)
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write maps (FITS), candidates and contrast curve (ECSV); returns the paths."""

@@ -502,6 +502,27 @@ class OpticalSystem:
             return hdus, system.debug(opd, None, **parameters)
         return hdus
 
+    def plot(self, ax: Any = None, *, opd: Value | None = None) -> NDArray[Any]:
+        """Draw the entrance pupil, the wavefront error, the light in the last pupil and the image.
+
+        The light in the last pupil and the image are those of a star on the optical axis, in
+        logarithmic scale.
+
+        Parameters
+        ----------
+        ax : four Axes, optional
+            Default those of a new figure.
+        opd : Tensor, Quantity or array, (npix, npix), optional
+            As in a call of the system.
+
+        Returns
+        -------
+        ndarray of Axes, (4,)
+        """
+        from pyklip_diffrender import plotting
+
+        return plotting.plot_system(self, ax, opd=opd)
+
     def debug(
         self, opd: Value | None = None, wavelength: float | None = None, **parameters: Value
     ) -> dict[str, Tensor]:

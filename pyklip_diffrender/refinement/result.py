@@ -300,6 +300,27 @@ class Refinement:
                     f"{name}: not a complete refinement ({error}). Write the fit again"
                 ) from error
 
+    def plot(self, ax: Any = None, *, frame: int = 0) -> NDArray[Any]:
+        """Draw the data, the star model and the residual over the noise of a frame.
+
+        Axes are in arcsec from the star. Circles are around companions that were part of the fit,
+        and arrows point to north and east where the position angle of the frame is known.
+
+        Parameters
+        ----------
+        ax : three Axes, optional
+            Default those of a new figure.
+        frame : int
+            Which of `frames`; the integrations of an observation are averaged.
+
+        Returns
+        -------
+        ndarray of Axes, (3,)
+        """
+        from pyklip_diffrender import plotting
+
+        return plotting.plot_refinement(self, ax, frame=frame)
+
     def summary(self) -> Mapping[str, Any]:
         """Return the facts that belong in a header or a log, without arrays."""
         return {

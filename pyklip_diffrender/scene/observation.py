@@ -403,6 +403,25 @@ class Observation:
             first_pixel=origin,
         )
 
+    def plot(self, ax: Any = None, *, frame: int = 0) -> Any:
+        """Draw a frame, in arcsec from the star; masked pixels are grey.
+
+        Arrows point to north and east where the position angle is known.
+
+        Parameters
+        ----------
+        ax : Axes, optional
+            Default that of a new figure.
+        frame : int
+
+        Returns
+        -------
+        Axes
+        """
+        from pyklip_diffrender import plotting
+
+        return plotting.plot_observation(self, ax, frame=frame)
+
     def combined(self) -> Observation:
         """One frame, the mean of all weighted by their inverse variances pixel by pixel.
 

@@ -16,6 +16,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.jwst import TABULATED_GAP, jwst_segments
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
 from pyklip_diffrender.optics.zernike import zernike_basis
@@ -92,6 +93,13 @@ def _whole(grid: PupilGrid) -> PupilGrid:
 @lru_cache(maxsize=4)
 def _sampled_segments(grid: PupilGrid) -> list[tuple[PupilGrid, Tensor]]:
     """For each segment the window that holds it and its three modes there."""
+    reach = max(float(outline.abs().max()) for outline in jwst_segments().values())
+    if 2 * reach > 1.01 * grid.diameter:
+        raise IncompatibleSetupError(
+            f"the pupil array is {grid.diameter:.3g} m wide, but JWST's segments, whose motions "
+            f"are modes by default, span {2 * reach:.3g} m. For another telescope use "
+            "GaussNewton(basis=FourierModes(24)), from pyklip_diffrender.wavefront.bases"
+        )
     # Half the gap on every side: each point of the gaps belongs to a segment too.
     return [
         _sampled_segment(widen_polygon(outline, TABULATED_GAP / 2), grid)

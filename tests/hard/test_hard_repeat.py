@@ -73,7 +73,11 @@ def test_a_fit_with_eight_threads_is_the_serial_fit() -> None:
     assert error_of(first.frames[0].star) < 1
 
 
-@pytest.mark.parametrize("dtype", DTYPES, ids=["float64", "float32"])
+@pytest.mark.parametrize(
+    "dtype",
+    [torch.float64, pytest.param(torch.float32, marks=pytest.mark.slow)],
+    ids=["float64", "float32"],
+)
 def test_eight_callers_of_one_model_get_what_one_gets(dtype: torch.dtype) -> None:
     """A fresh model: its constants are built by whoever comes first."""
     serial, shared = (

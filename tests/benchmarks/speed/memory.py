@@ -13,6 +13,7 @@ import math
 import subprocess
 import sys
 from dataclasses import asdict
+from pathlib import Path
 
 import torch
 
@@ -21,6 +22,8 @@ from tests.benchmarks.speed.setting import Setting
 from tests.benchmarks.speed.timing import give_back, resident, start_peak
 
 __all__ = ["memory_of", "peak_memory"]
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def memory_of(case: Case, here: Setting) -> float:
@@ -42,7 +45,8 @@ def memory_of(case: Case, here: Setting) -> float:
 
 def peak_memory(case: Case, here: Setting, timeout: float = 300.0) -> float:
     """Bytes, measured in a process of its own; NaN where that fails."""
-    program = f"from {__name__} import main; main()"
+    # Last, as in tests/conftest.py: an installed package comes before its source.
+    program = f"import sys; sys.path.append({str(ROOT)!r}); from {__name__} import main; main()"
     command = [sys.executable, "-c", program, json.dumps(asdict(here)), case.key]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=True)

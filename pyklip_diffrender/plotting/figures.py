@@ -1,63 +1,25 @@
-"""Figures. The only module that imports matplotlib, and only when a figure is drawn."""
+"""Whole figures: the demo, a subtraction and a detection with everything that they made."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pyklip_diffrender.demo import DemoResult
-from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.instrument.jwst import maskrnd_openings
-from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
-from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.plotting.panels import INK, draw_image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_demo", "draw_detection", "draw_image", "draw_subtraction", "save"]
+    from pyklip_diffrender.demo import DemoResult
+    from pyklip_diffrender.detection import Detection
+    from pyklip_diffrender.refinement import Refinement
 
-_INK = "#1b1f24"
-
-
-def save(figure: Figure, path: str | Path, dpi: int = 150) -> None:
-    """Write a figure in one step."""
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=dpi, facecolor="white")
-
-
-def draw_image(
-    ax: Axes,
-    image: NDArray[np.float64],
-    pixelscale: float,
-    *,
-    limits: tuple[float, float],
-    cmap: str,
-    title: str,
-    norm: Any = None,
-) -> Any:
-    """Show an image with its axes in arcseconds from the middle, y up.
-
-    Returns
-    -------
-    AxesImage
-    """
-    half_y, half_x = (n * pixelscale / 2 for n in image.shape)
-    shown = ax.imshow(
-        image,
-        origin="lower",
-        extent=(-half_x, half_x, -half_y, half_y),
-        cmap=cmap,
-        interpolation="nearest",
-        **({"norm": norm} if norm is not None else {"vmin": limits[0], "vmax": limits[1]}),
-    )
-    ax.set_title(title, fontsize=10, color=_INK, loc="left")
-    ax.tick_params(labelsize=8, colors=_INK)
-    return shown
+__all__ = ["draw_demo", "draw_detection", "draw_subtraction"]
 
 
 def draw_demo(result: DemoResult) -> Figure:
@@ -95,7 +57,7 @@ def draw_demo(result: DemoResult) -> Figure:
             ax, result.images[name] / result.noise, scale, limits=(-6, 6), cmap="RdBu_r",
             title=f"{titles[name]}\nSNR {facts['annulus SNR']:.1f}{kept}",
         )  # fmt: skip
-        ax.plot(*planet.offset, "o", mfc="none", mec=_INK, ms=13, mew=1.2, clip_on=True)
+        ax.plot(*planet.offset, "o", mfc="none", mec=INK, ms=13, mew=1.2, clip_on=True)
         figure.colorbar(shown, ax=ax, label="residual / noise", shrink=0.85)
 
     grid = PupilGrid.full(result.model.npix, result.model.diameter)
@@ -135,7 +97,7 @@ def _draw_found(ax: Axes, figure: Figure, result: DemoResult) -> None:
         ax, found.snr, scale, limits=(-6, 6), cmap="RdBu_r",
         title=f"Wavefront integrated out:\n{facts}",
     )  # fmt: skip
-    ax.plot(*planet.offset, "o", mfc="none", mec=_INK, ms=13, mew=1.2)
+    ax.plot(*planet.offset, "o", mfc="none", mec=INK, ms=13, mew=1.2)
     figure.colorbar(shown, ax=ax, label="S/N of a point source", shrink=0.85)
 
 
@@ -195,9 +157,9 @@ def draw_detection(found: Detection) -> Figure:
     ):
         shown = ax.imshow(image, origin="lower", extent=extent, cmap="RdBu_r", vmin=-8, vmax=8)
         figure.colorbar(shown, ax=ax, shrink=0.85, label=label)
-        ax.plot(0, 0, "+", color=_INK, ms=9)
+        ax.plot(0, 0, "+", color=INK, ms=9)
         ax.plot(table["x"].value, table["y"].value, "o", mfc="none", mec="#2f9e44", ms=15, mew=1.4)
-        ax.set_title(title, fontsize=10, color=_INK, loc="left")
+        ax.set_title(title, fontsize=10, color=INK, loc="left")
         ax.set_xlabel("arcsec from the star", fontsize=8)
     curve = found.contrast_curve
     separation = curve["separation"].value
@@ -209,7 +171,7 @@ def draw_detection(found: Detection) -> Figure:
         right.semilogy(
             separation, curve["small_sample"], ":", color="#5b3f95", label="with few elements"
         )
-    right.semilogy(separation, curve["known_star"], "--", color=_INK, label="star known")
+    right.semilogy(separation, curve["known_star"], "--", color=INK, label="star known")
     right.semilogy(
         table["separation"].value, table["contrast"], "o", mfc="none", mec="#2f9e44", ms=9
     )

@@ -1,0 +1,241 @@
+"""Frames made by the real stpsf and the real poppy, fitted with the models converted from them.
+
+What is simulated is no image of the package: the other code's own `calc_psf` makes it, from the
+user's object with the later wavefront in it, and the planet from the same object with its source
+moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import poppy
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from numpy.typing import NDArray
+from poppy.poppy_core import PlaneType
+from stpsf_data import lopsided
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.bridges import from_poppy, from_webbpsf
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.instrument.jwst import maskrnd_openings
+from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.refinement import GaussNewton, Status
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.bases import FourierModes
+
+Array = NDArray[np.float64]
+
+READ_NOISE = 20.0
+
+
+@dataclass
+class World:
+    """A converted model of an earlier wavefront, and what the other code shows later.
+
+    Attributes
+    ----------
+    model : OpticalSystem
+    before, later : ndarray, (npix, npix)
+        Wavefronts, m.
+    star, light : ndarray, (ny, nx)
+        Images of the star and of the planet's place, by the other code, later.
+    seen : ndarray of bool, (npix, npix)
+        Where light passes the stop.
+    """
+
+    model: OpticalSystem
+    before: Array
+    later: Array
+    star: Array
+    light: Array
+    planet: Planet
+    flux: float
+    seen: Array
+
+    def observed(self, seed: int) -> Observation:
+        """A frame with photon and read noise."""
+        rng = np.random.default_rng(seed)
+        expected = self.flux * (self.star + self.planet.contrast * self.light)
+        data = rng.poisson(expected) + rng.normal(0, READ_NOISE, expected.shape)
+        error = np.sqrt(np.maximum(data, 0) + READ_NOISE**2)
+        return Observation.from_arrays(data, error, pixelscale=self.model.detector.pixelscale)
+
+    def error_of(self, star: Array) -> float:
+        """Rms of a star model's error over the noise."""
+        truth = self.flux * self.star
+        return float(np.sqrt(np.mean((star - truth) ** 2 / (truth + READ_NOISE**2))))
+
+    def unseen_rms(self, opd: Array) -> float:
+        """Rms of a wavefront's error behind the stop, piston and tilt apart, m."""
+        y, x = np.nonzero(self.seen)
+        design = np.stack([np.ones(len(x)), x, y], axis=1)
+        away = (opd - self.later)[self.seen]
+        return float(np.std(away - design @ np.linalg.lstsq(design, away, rcond=None)[0]))
+
+
+def check(world: World, settings: GaussNewton, seed: int = 5) -> None:
+    """The drift is recovered, and the planet measured."""
+    fit = dr.refine(world.model, world.observed(seed), world.before, settings=settings)
+    assert fit.status is Status.CONVERGED
+    outdated = world.error_of(world.flux * world.model(world.before).numpy())
+    assert outdated > 3
+    star = fit.frames[0].star - fit.frames[0].values["background"][0]
+    assert world.error_of(star) < 0.15 * outdated
+    assert world.unseen_rms(fit.wavefront) < 0.5 * world.unseen_rms(world.before)
+    (row,) = dr.detect(fit).table
+    away = abs(float(row["contrast"]) - world.planet.contrast)
+    assert away < 3 * row["contrast_error"]
+    assert away < 0.1 * world.planet.contrast
+    for axis, true in zip("xy", world.planet.offset, strict=True):
+        assert abs(row[axis].value - true) < 3 * row[f"{axis}_error"].value
+
+
+# -- stpsf ---------------------------------------------------------------------------------------
+
+
+def nircam(folder: Path, npix: int, opd: fits.HDUList | None = None, **options: Any) -> Any:
+    import stpsf
+
+    instrument = stpsf.NIRCam()
+    instrument.filter = "F444W"
+    instrument.image_mask, instrument.pupil_mask = "MASK335R", "MASKRND"
+    instrument.pupil = str(folder / f"jwst_pupil_RevW_npix{npix}.fits.gz")
+    instrument.options.update(options)
+    if opd is not None:
+        instrument.pupilopd = opd
+    return instrument
+
+
+@pytest.fixture
+def stpsf_folder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The made-up directory of stpsf, or STScI's own files."""
+    if request.param == "made up":
+        return Path(request.getfixturevalue("stpsf_path"))
+    folder = Path(request.getfixturevalue("shared_data")) / "stpsf-data"
+    if not folder.is_dir():
+        pytest.skip(f"needs STScI's files for stpsf in {folder}")
+    monkeypatch.setenv("STPSF_PATH", str(folder))
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("stpsf_folder", "npix", "distorted"),
+    [("made up", 256, False), ("STScI's", 1024, True)],
+    indirect=["stpsf_folder"],
+)
+def test_a_frame_made_by_stpsf(stpsf_folder: Path, npix: int, distorted: bool) -> None:
+    """NIRCam's round mask after the telescope has drifted by 10 nm."""
+    call = {
+        "monochromatic": 4.5e-6,
+        "fov_pixels": 40,
+        "fft_oversample": 2,
+        "detector_oversample": 1,
+    }
+    with fits.open(stpsf_folder / "JWST_OTE_OPD_cycle1_example_2022-07-30.fits") as hdus:
+        opd = hdus[0].data + lopsided(npix, 77, 10e-9) * (hdus[0].data != 0)
+        drifted = fits.HDUList([fits.PrimaryHDU(opd, hdus[0].header)])
+    planet = Planet(3e-5, 0.7, 60.0)
+    offset = dict(zip(("source_offset_x", "source_offset_y"), planet.offset, strict=True))
+    star, light = (
+        nircam(stpsf_folder, npix, drifted, **options)
+        .calc_psf(**call)["DET_DIST" if distorted else "DET_SAMP"]
+        .data
+        for options in ({}, offset)
+    )
+    model = from_webbpsf(nircam(stpsf_folder, npix), add_distortion=distorted, **call)
+    assert model.entrance.opd is not None
+    later = from_webbpsf(nircam(stpsf_folder, npix, drifted), **call).entrance.opd
+    assert later is not None
+    stop = polygon_coverage(maskrnd_openings()[1:], PupilGrid.full(npix)).numpy() > 0.5
+    world = World(
+        model, model.entrance.opd.numpy(), later.numpy(), star, light, planet, 3e10,
+        stop & (model.entrance.lit.numpy()),
+    )  # fmt: skip
+    check(world, GaussNewton(cycles=8.0, response_npix=64))
+
+
+# -- poppy ---------------------------------------------------------------------------------------
+
+DIAMETER = 2.4
+
+
+def coronagraph(
+    opd: Array, planet: Planet | None = None, *, pixels: int, oversample: int
+) -> poppy.OpticalSystem:
+    """A telescope of 2.4 m with one strut, a hard-edged spot and a ring-shaped stop."""
+    npix = len(opd)
+    y, x = (np.mgrid[:npix, :npix] - (npix - 1) / 2) * DIAMETER / npix
+    radius = np.hypot(x, y)
+    strut = (np.abs(x - 0.1) < 0.03) & (y > 0)
+    system = poppy.OpticalSystem(oversample=oversample, npix=npix, verbose=False)
+    system.pupil_diameter = DIAMETER * u.m
+    sampling = {
+        "pixelscale": DIAMETER / npix * u.m / u.pixel,
+        "planetype": PlaneType.pupil,
+    }
+    primary = (radius < 0.5 * DIAMETER) & (radius > 0.18 * DIAMETER) & ~strut
+    system.add_pupil(
+        poppy.ArrayOpticalElement(
+            name="primary", transmission=primary.astype(float), opd=opd, **sampling
+        )
+    )
+    system.add_inversion(axis="y")
+    system.add_image(poppy.CircularOcculter(name="spot", radius=0.35))
+    stop = stop_of(npix).astype(float)
+    system.add_pupil(poppy.ArrayOpticalElement(name="stop", transmission=stop, **sampling))
+    system.add_detector(pixelscale=0.06, fov_pixels=pixels, oversample=oversample)
+    if planet is not None:
+        system.source_offset_r = planet.separation
+        system.source_offset_theta = planet.position_angle
+    return system
+
+
+def stop_of(npix: int) -> NDArray[np.bool_]:
+    y, x = (np.mgrid[:npix, :npix] - (npix - 1) / 2) / npix
+    return (np.hypot(x, y) < 0.42) & (np.hypot(x, y) > 0.24)
+
+
+@pytest.mark.parametrize(
+    ("npix", "pixels", "oversample", "waves", "cycles"),
+    [
+        (64, 28, 1, (1.6e-6,), 5.0),
+        pytest.param(128, 36, 2, (1.55e-6, 1.65e-6), 6.0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_frame_made_by_poppy(
+    npix: int, pixels: int, oversample: int, waves: tuple[float, ...], cycles: float
+) -> None:
+    """Somebody's own coronagraph, whose modes are not those of JWST's segments."""
+    before = lopsided(npix, 1, 30e-9)
+    # A part of a map has lower frequencies across the pupil than the whole.
+    later = before + lopsided(2 * npix, 2, 10e-9)[:npix, :npix]
+    planet = Planet(1e-4, 0.7, 130.0)
+    weights = [1.0, 2.0][: len(waves)]
+    shape = {"pixels": pixels, "oversample": oversample}
+
+    def image(source: Planet | None) -> Array:
+        hdus = coronagraph(later, source, **shape).calc_psf(list(waves) * u.m, weight=weights)
+        samples = hdus[0].data.reshape(pixels, oversample, pixels, oversample)
+        return np.asarray(samples.sum(axis=(1, 3)), dtype=float)
+
+    model = from_poppy(coronagraph(before, **shape), list(waves) * u.m, weights)
+    star, light = image(None), image(planet)
+    world = World(model, before, later, star, light, planet, 5e8, stop_of(npix))
+    free = ("star_offset", "flux", "background")
+    check(world, GaussNewton(basis=FourierModes(cycles), free=free, response_npix=npix))
+
+
+def test_the_segments_of_jwst_are_no_modes_of_another_telescope() -> None:
+    model = from_poppy(coronagraph(lopsided(64, 1, 3e-8), pixels=8, oversample=1), 1.6e-6)
+    observation = Observation.from_arrays(np.ones((8, 8)), np.ones((8, 8)), pixelscale=0.06)
+    with pytest.raises(IncompatibleSetupError, match=r"2\.4 m.*basis=FourierModes"):
+        dr.refine(model, observation, lopsided(64, 1, 3e-8))

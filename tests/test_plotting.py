@@ -1,0 +1,287 @@
+"""What the `plot` methods draw: the numbers, where they are, and what is said about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from matplotlib import pyplot
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.detection import Candidates, Detection
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.refinement import GaussNewton, Refinement
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.bases import FourierModes
+from pyklip_diffrender.wavefront.opd import random_opd
+
+NPIX, FLUX, NOISE = 64, 3e10, 100.0
+AXIS = (0.05, -0.1)
+"""Where the optical axis is in the frames, arcsec from the middle."""
+OFFSET = (0.02, 0.03)
+"""Of the star from the axis."""
+PLANET = Planet(3e-4, 0.6, 100.0)
+ANGLES = (70.0, 40.0)
+HOLE = (3, 20)
+
+
+@pytest.fixture(autouse=True)
+def _closed() -> Iterator[None]:
+    yield
+    pyplot.close("all")
+
+
+@pytest.fixture(scope="module")
+def model() -> OpticalSystem:
+    return dr.nircam_coronagraph(
+        "F444W",
+        monochromatic=4.5e-6,
+        npix=NPIX,
+        fov_pixels=(30, 34),
+        defaults={"detector_shift": AXIS},
+    )
+
+
+@pytest.fixture(scope="module")
+def frames(model: OpticalSystem) -> list[Observation]:
+    """Two rolls; the sky turns in the frame by as much as the position angle falls."""
+    opd, made = random_opd(3, npix=NPIX).data, []
+    scale = np.array(model.detector.pixelscale)
+    for k, angle in enumerate(ANGLES):
+        place = replace(PLANET, position_angle=PLANET.position_angle - angle).offset
+        planet = model(opd, tuple(np.add(OFFSET, place)))
+        light = FLUX * (model(opd, OFFSET) + PLANET.contrast * planet).numpy()
+        data = light + NOISE * np.random.default_rng(k).normal(size=light.shape)
+        valid = np.ones(data.shape, dtype=bool)
+        valid[HOLE] = False
+        made.append(
+            Observation.from_arrays(
+                data, np.full(data.shape, NOISE), valid=valid, pixelscale=tuple(scale),
+                center=(16.5, 14.5) + np.array(AXIS) / scale, name="HD 1", filter="F444W",
+                position_angles=np.array([angle]),
+            )
+        )  # fmt: skip
+    return made
+
+
+@pytest.fixture(scope="module")
+def fit(model: OpticalSystem, frames: list[Observation]) -> Refinement:
+    first = replace(PLANET, position_angle=PLANET.position_angle - ANGLES[0])
+    settings = GaussNewton(basis=FourierModes(2), response_npix=NPIX, companions=(first,))
+    return dr.refine(model, frames, random_opd(3, npix=NPIX).data, settings=settings, plan="off")
+
+
+@pytest.fixture(scope="module")
+def found(fit: Refinement) -> Detection:
+    return dr.detect(fit)
+
+
+def shown(ax: Axes) -> NDArray[np.float64]:
+    """The image that an axes shows; NaN where it is masked."""
+    (image,) = ax.images
+    return np.ma.filled(image.get_array().astype(float), np.nan)
+
+
+def place_of(ax: Axes, row: int, column: int) -> NDArray[np.float64]:
+    """x, y of a pixel's centre on the axes."""
+    (image,) = ax.images
+    assert image.origin == "lower"
+    left, right, bottom, top = image.get_extent()
+    ny, nx = image.get_array().shape
+    return np.array(
+        [left + (column + 0.5) * (right - left) / nx, bottom + (row + 0.5) * (top - bottom) / ny]
+    )
+
+
+def points(ax: Axes, label: str) -> NDArray[np.float64]:
+    """Coordinates of the points of one label, (k, 2)."""
+    (line,) = (line for line in ax.lines if line.get_label() == label)
+    return np.stack(line.get_data(), axis=1)
+
+
+def bar_of(ax: Axes) -> Axes:
+    """The axes of the colour bar."""
+    (bar,) = ax.child_axes
+    return bar
+
+
+def arrows(ax: Axes) -> dict[str, NDArray[np.float64]]:
+    """Unit vectors of the compass, by letter."""
+    found = {each.get_text(): np.subtract(each.xyann, each.xy) for each in ax.texts}
+    return {name: v / np.hypot(*v) for name, v in found.items() if name in "NE"}
+
+
+# -- observations --------------------------------------------------------------------------------
+
+
+def test_a_frame_is_drawn_from_its_star(frames: list[Observation]) -> None:
+    observation = frames[0]
+    _, given = pyplot.subplots()
+    ax = observation.plot(given)
+    assert ax is given
+    assert len(pyplot.get_fignums()) == 1
+    image = shown(ax)
+    assert np.argwhere(np.isnan(image)).tolist() == [list(HOLE)]
+    np.testing.assert_array_equal(image[observation.valid[0]], observation.data[observation.valid])
+    # The star is where the observation says, in pixels of the image.
+    np.testing.assert_allclose(points(ax, "star"), [[0, 0]])
+    np.testing.assert_allclose(place_of(ax, 14, 16) - place_of(ax, 13, 15), observation.pixelscale)
+    offset = (np.array([16, 14]) - observation.center[0]) * observation.pixelscale
+    np.testing.assert_allclose(place_of(ax, 14, 16), offset, atol=1e-12)
+    assert ax.get_xlabel() == "x from the star (arcsec)"
+    assert ax.get_ylabel() == "y from the star (arcsec)"
+    assert ax.get_title(loc="left") == "HD 1, F444W"
+    assert bar_of(ax).get_ylabel() == "photon"
+
+
+@pytest.mark.parametrize("angle", [0.0, 70.0, 200.0])
+def test_the_compass_points_where_planets_are(frames: list[Observation], angle: float) -> None:
+    ax = replace(frames[0], position_angles=np.array([angle])).plot()
+    drawn = arrows(ax)
+    for letter, position_angle in (("N", 0.0), ("E", 90.0)):
+        expected = replace(PLANET, separation=1.0, position_angle=position_angle - angle).offset
+        np.testing.assert_allclose(drawn[letter], expected, atol=1e-12)
+    # All of it is inside the axes.
+    assert all(min(*each.xy, *each.xyann) > 0 for each in ax.texts)
+
+
+def test_without_a_position_angle_there_is_no_compass(frames: list[Observation]) -> None:
+    assert not arrows(replace(frames[0], position_angles=None).plot())
+
+
+def test_the_frame_can_be_chosen(frames: list[Observation]) -> None:
+    one, other = frames
+    both = replace(
+        one,
+        data=np.concatenate([one.data, other.data]),
+        error=np.concatenate([one.error, other.error]),
+        valid=np.concatenate([one.valid, other.valid]),
+        center=np.concatenate([one.center, other.center + 1.0]),
+        position_angles=np.array(ANGLES),
+    )
+    ax = both.plot(frame=1)
+    np.testing.assert_array_equal(shown(ax)[other.valid[0]], other.data[other.valid])
+    moved = place_of(one.plot(), 0, 0) - place_of(ax, 0, 0)
+    np.testing.assert_allclose(moved, both.pixelscale)
+    np.testing.assert_allclose(arrows(ax)["N"], np.sin(np.deg2rad([ANGLES[1], 90 - ANGLES[1]])))
+
+
+# -- systems -------------------------------------------------------------------------------------
+
+
+def test_a_system_shows_its_pupils_and_the_star(model: OpticalSystem) -> None:
+    opd = random_opd(3, npix=NPIX).data
+    pupil, wavefront, last, image = axes = model.plot(opd=opd)
+    lit = model.entrance.lit.numpy()
+    assert ((shown(pupil) > 0) == lit).all()
+    assert shown(pupil).max() == 1
+    np.testing.assert_allclose(shown(wavefront)[lit], 1e9 * opd[lit])
+    assert np.isnan(shown(wavefront)[~lit]).all()
+    np.testing.assert_array_equal(shown(image), model(opd).numpy())
+    # The same light that goes through all planes to the detector, where the stop lets it pass.
+    fields = model.debug(opd)
+    behind = (fields["NIRCam internal WFE"].abs() / fields["JWST pupil"].abs().max()) ** 2
+    assert shown(last).sum() == pytest.approx(float(behind.sum()), rel=1e-12)
+    stopped = ~(fields["MASKRND"].abs() > 0)
+    assert (shown(last) == 0).sum() == lit.size - int((~stopped).sum())
+    for ax in (pupil, wavefront, last):
+        np.testing.assert_allclose(ax.images[0].get_extent(), 3.3 * np.array([-1, 1, -1, 1]), 0.02)
+    # The optical axis lies beside the middle of the detector.
+    np.testing.assert_allclose(
+        (place_of(image, 0, 0) + place_of(image, 29, 33)) / 2, -np.array(AXIS), atol=1e-12
+    )
+    labels = [bar_of(ax).get_ylabel() for ax in axes]
+    assert labels == [
+        "amplitude",
+        "nm",
+        "light, 1 in the first pupil",
+        "fraction of the star's light",
+    ]
+    assert image.images[0].norm.vmin == pytest.approx(1e-6 * float(model(opd).max()))
+
+
+def test_a_system_without_a_wavefront_is_flat(model: OpticalSystem) -> None:
+    wavefront = model.plot()[1]
+    assert np.nanmax(np.abs(shown(wavefront))) == 0
+    assert wavefront.images[0].get_clim() == (-1, 1)
+
+
+# -- fits ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frame", [0, 1])
+def test_a_fit_shows_data_star_and_what_is_left(fit: Refinement, frame: int) -> None:
+    part = fit.frames[frame]
+    data, star, residual = axes = fit.plot(frame=frame)
+    valid = part.observation.valid[0]
+    # A mean of one integration is rounded.
+    np.testing.assert_allclose(shown(data)[valid], part.observation.data[0][valid], rtol=1e-14)
+    np.testing.assert_array_equal(shown(star), part.star)
+    np.testing.assert_allclose(shown(residual)[valid], part.residual[0][valid] / NOISE)
+    assert np.isnan(shown(residual)[HOLE])
+    # One scale for both, or they could not be compared.
+    assert data.images[0].norm is star.images[0].norm
+    assert residual.images[0].get_clim() == (-5, 5)
+    assert [bar_of(ax).get_ylabel() for ax in axes] == ["photon", "photon", "standard deviations"]
+    # The circle is where the companion's light is, in this frame and from this star.
+    row, column = np.unravel_index(np.argmax(part.companion_image), part.star.shape)
+    (place,) = points(residual, "companions")
+    assert np.abs(place - place_of(residual, row, column)).max() < 0.07
+    turned = replace(PLANET, position_angle=PLANET.position_angle - ANGLES[frame])
+    np.testing.assert_allclose(place, turned.offset, atol=0.01)
+    middle = (place_of(data, 0, 0) + place_of(data, 29, 33)) / 2
+    np.testing.assert_allclose(middle, -np.add(AXIS, OFFSET), atol=0.01)
+    expected = np.sin(np.deg2rad([ANGLES[frame], 90 - ANGLES[frame]]))
+    np.testing.assert_allclose(arrows(data)["N"], expected)
+
+
+def test_a_detection_shows_candidates_and_the_curve(found: Detection) -> None:
+    left, right = found.plot()
+    np.testing.assert_array_equal(shown(left), found.snr)
+    np.testing.assert_allclose(place_of(left, 4, 7), found.grid[4, 7], atol=1e-12)
+    (row,) = found.table
+    circled = points(left, "companions")
+    np.testing.assert_allclose(circled, [[row["x"].value, row["y"].value]])
+    peak = np.unravel_index(np.nanargmax(found.snr), found.snr.shape)
+    assert np.abs(circled[0] - found.grid[peak]).max() < 0.07
+    assert f"S/N {row['snr']:.1f}" in [each.get_text() for each in left.texts]
+    assert left.get_title(loc="left") == "1 candidate above S/N 5"
+    assert bar_of(left).get_ylabel() == "S/N of a point source"
+    expected = np.sin(np.deg2rad([ANGLES[0], 90 - ANGLES[0]]))
+    np.testing.assert_allclose(arrows(left)["N"], expected)
+    curve = found.contrast_curve
+    for label, name in (("median", "contrast"), ("star known exactly", "known_star")):
+        drawn = points(right, label)
+        np.testing.assert_array_equal(drawn[:, 0], curve["separation"].value)
+        np.testing.assert_array_equal(drawn[:, 1], curve[name])
+    assert right.get_yscale() == "log"
+    assert right.get_xlabel() == "separation (arcsec)"
+    assert right.get_ylabel() == "contrast at 5 sigma"
+
+
+def test_a_detection_without_candidates_has_no_circles(found: Detection) -> None:
+    left, right = replace(found, candidates=Candidates.none()).plot()
+    assert left.get_title(loc="left") == "0 candidates above S/N 5"
+    assert points(left, "companions").shape == (0, 2)
+    assert "candidates" not in [text.get_text() for text in right.get_legend().get_texts()]
+
+
+def test_axes_that_were_given_are_taken(fit: Refinement) -> None:
+    _, given = pyplot.subplots(1, 3)
+    assert fit.plot(given).tolist() == given.tolist()
+    assert len(pyplot.get_fignums()) == 1
+    with pytest.raises(IncompatibleSetupError, match=r"got 2 axes, expected 3"):
+        fit.plot(given[:2])
+
+
+def test_absorption_does_not_spoil_the_wavefront(model: OpticalSystem) -> None:
+    opd = torch.from_numpy(random_opd(3, npix=NPIX).data)
+    both = model.plot(opd=torch.complex(opd, 1e-8 * torch.ones_like(opd)))[1]
+    np.testing.assert_array_equal(shown(both), shown(model.plot(opd=opd)[1]))
