@@ -6,7 +6,6 @@ Every public name is loaded when it is first used, so that ``import pyklip_diffr
 
 from __future__ import annotations
 
-import warnings
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
@@ -132,23 +131,7 @@ except PackageNotFoundError:
     __version__ = "0+unknown"
 
 
-_REMOVED = {
-    "keep_freed_memory": (
-        "it has no effect any more; set the environment variables MALLOC_MMAP_MAX_=0 and "
-        "MALLOC_TRIM_THRESHOLD_=2147483647 before the program starts instead"
-    ),
-}
-"""Public names that stay importable for one release, and what to do without them."""
-
-
 def __getattr__(name: str) -> Any:
-    if name in _REMOVED:
-        warnings.warn(
-            f"pyklip_diffrender.{name} is deprecated: {_REMOVED[name]}",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return lambda: False
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

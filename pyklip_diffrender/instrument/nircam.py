@@ -36,19 +36,11 @@ from pyklip_diffrender.optics.system import OpticalSystem, Value
 __all__ = [
     "FLIGHT_ALIGNMENT",
     "NIRCAM_LW_PIXELSCALE",
-    "SIAF_PIXELSCALE",
-    "SIAF_SHEAR",
     "nircam_coronagraph",
 ]
 
 NIRCAM_LW_PIXELSCALE = ROUND_MASKS["MASK335R"].pixelscale
 """arcsec per pixel at MASK335R, the square scale that stpsf 2.2.0 uses before distortion."""
-
-SIAF_PIXELSCALE = ROUND_MASKS["MASK335R"].siaf_pixelscale
-"""arcsec per pixel in x and y at MASK335R, see `RoundMask`."""
-
-SIAF_SHEAR = ROUND_MASKS["MASK335R"].siaf_shear
-"""Growth of the ideal y with the ideal x at MASK335R, see `RoundMask`."""
 
 FLIGHT_ALIGNMENT: dict[str, Any] = {"lyot_shift": (-0.0127, 0.0068), "lyot_rotation": 0.567}
 """How the stop MASKRND stands in flight in the long-wave channel, for the argument `defaults`.

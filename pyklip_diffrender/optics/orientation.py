@@ -55,11 +55,6 @@ class Orientation:
         ((a, b), (c, d)) = self.matrix
         return a * d - b * c
 
-    @property
-    def is_identity(self) -> bool:
-        """Whether nothing changes."""
-        return self.matrix == ((1, 0), (0, 1))
-
     def positions(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """New positions of points."""
         ((a, b), (c, d)) = self.matrix

@@ -47,7 +47,6 @@ __all__ = [
     "InternalAberration",
     "LyotStop",
     "Plane",
-    "PupilStop",
     "Values",
     "Wavefront",
 ]
@@ -147,39 +146,6 @@ class EntrancePupil:
         # torch.polar does the same in 1.6 times the time (1024 x 1024, two cores).
         field = torch.complex(amplitude * torch.cos(phase), amplitude * torch.sin(phase))
         return Wavefront(field, wavelength, self.grid)
-
-
-class PupilStop:
-    """A fixed amplitude stop, with an optional OPD, in a pupil plane."""
-
-    parameters: tuple[str, ...] = ()
-
-    def __init__(
-        self,
-        amplitude: Tensor,
-        diameter: float,
-        dtype: torch.dtype,
-        name: str,
-        opd: Tensor | None = None,
-    ) -> None:
-        self.name = name
-        full = PupilGrid.full(amplitude.shape[-1], diameter)
-        self.grid = full.around(amplitude)
-        self.amplitude = full.crop(amplitude, self.grid).to(dtype)
-        self.opd = None if opd is None else full.crop(opd, self.grid).to(dtype)
-
-    def window(self, values: Values) -> PupilGrid:
-        return self.grid
-
-    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
-        field = wavefront.grid.crop(wavefront.field, self.grid)
-        if self.opd is None:
-            field = field * self.amplitude
-        else:
-            field = field * torch.polar(
-                self.amplitude, (2 * math.pi / wavefront.wavelength) * self.opd
-            )
-        return replace(wavefront, field=field, grid=self.grid)
 
 
 class LyotStop:

@@ -48,9 +48,6 @@ def _allowed(candidates: Candidates, given: dict[str, Any], trial: Trial) -> Can
     return kept
 
 
-_FIXED = "the model cannot change it"
-
-
 def _measured(
     trial: Trial,
     name: str,

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from pyklip_diffrender.instrument.jwst import TABULATED_GAP, jwst_segments
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
-from pyklip_diffrender.optics.zernike import zernike_basis
 
-__all__ = ["Basis", "FourierModes", "JointBasis", "SegmentMotions", "ZernikeModes", "default_basis"]
+__all__ = ["Basis", "FourierModes", "JointBasis", "SegmentMotions", "default_basis"]
 
 
 class Basis(Protocol):
@@ -180,42 +179,6 @@ class FourierModes:
         waves_x = torch.complex(torch.cos(in_x), torch.sin(in_x))
         waves_y = torch.complex(torch.cos(in_y), torch.sin(in_y))
         return math.sqrt(2) * (waves_y @ table @ waves_x).real
-
-
-class ZernikeModes:
-    """Zernike polynomials over the whole pupil.
-
-    Global aberrations such as those that vary over the field of the telescope: single segments
-    would have to move together to make them.
-
-    Parameters
-    ----------
-    first, last : int
-        Noll indices. Tip and tilt (2 and 3) are the star's position.
-    """
-
-    groups = ("global",)
-
-    def __init__(self, first: int = 4, last: int = 21) -> None:
-        self.first, self.last = first, last
-
-    def __len__(self) -> int:
-        return self.last - self.first + 1
-
-    @property
-    def group_index(self) -> Tensor:
-        return torch.zeros(len(self), dtype=torch.int64)
-
-    @property
-    def frequencies(self) -> Tensor:
-        return torch.zeros(len(self), dtype=torch.float64)
-
-    def modes(self, grid: PupilGrid, start: int, stop: int) -> Tensor:
-        every = zernike_basis(self.last, grid.x, grid.y, grid.diameter / 2)
-        return every[self.first - 1 + start : self.first - 1 + stop]
-
-    def opd(self, coefficients: Tensor, grid: PupilGrid) -> Tensor:
-        return torch.tensordot(coefficients.double(), self.modes(grid, 0, len(self)), dims=1)
 
 
 class JointBasis:

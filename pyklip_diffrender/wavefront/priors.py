@@ -35,6 +35,14 @@ __all__ = [
 _ROUNDING = 1e-12
 """Relative error of the curvature's elements."""
 
+_SCALE_LIMITS = (1e-4, 100.0)
+"""Smallest and largest scale. Without a floor, a group without any signal ends in a division by
+zero; without a ceiling, a bright companion that is missing from the model makes the prior so wide
+that the equations cannot be solved."""
+
+_ENOUGH_MODES = 20.0
+"""Number of determined modes below which nothing can be said about the scale of a group."""
+
 
 @dataclass(frozen=True)
 class WavefrontPrior:
@@ -207,8 +215,6 @@ def solve_with_evidence(
     damping: float = 0.0,
     current: Tensor | None = None,
     errors: bool = False,
-    floor: float = 1e-4,
-    ceiling: float = 100.0,
 ) -> EvidenceUpdate:
     """Solve a whitened linear least-squares problem with Gaussian priors about zero.
 
@@ -234,10 +240,6 @@ def solve_with_evidence(
         Where the unknowns are now.
     errors : bool
         Also compute the variances.
-    floor, ceiling : float
-        Smallest and largest scale: an absent group must not end in a division by zero, nor what
-        no wavefront explains (a bright companion that is not in the model) in a prior so wide
-        that the equations cannot be solved.
     """
     others = len(fixed_deviation)
     effective = float("nan")
@@ -261,7 +263,7 @@ def solve_with_evidence(
         power = (step[others:] / shape) ** 2
         counted = torch.zeros_like(scales).index_add(0, group, determined)
         summed = torch.zeros_like(scales).index_add(0, group, power)
-        scales = torch.sqrt(summed / counted.clamp(min=1e-3)).clamp(min=floor, max=ceiling)
+        scales = torch.sqrt(summed / counted.clamp(min=1e-3)).clamp(*_SCALE_LIMITS)
     known = torch.isfinite(deviation)
     log_evidence = float(
         0.5 * gradient @ step - factor.diagonal().log().sum() - deviation[known].log().sum()
@@ -269,10 +271,8 @@ def solve_with_evidence(
     return EvidenceUpdate(step, variance if errors else None, scales, effective, log_evidence)
 
 
-def scale_ratios(
-    step: Tensor, variance: Tensor, deviation: Tensor, group: Tensor, *, enough: float = 20.0
-) -> Tensor:
-    """How large the modes of each group are, relative to what their prior says.
+def scale_ratios(step: Tensor, variance: Tensor, deviation: Tensor, group: Tensor) -> Tensor:
+    """Size of the modes of each group relative to their prior.
 
     At the scales of the highest evidence, the sum of (step / deviation)^2 is the number of modes
     that the data determine.
@@ -282,8 +282,6 @@ def scale_ratios(
     step, variance, deviation : Tensor, (modes,)
         Most probable values, their variance, and the prior's standard deviation.
     group : Tensor, (modes,), int64
-    enough : float
-        Groups of which fewer modes are determined are left out.
 
     Returns
     -------
@@ -294,4 +292,4 @@ def scale_ratios(
     determined = torch.zeros(count, dtype=step.dtype)
     determined.index_add_(0, group, 1 - variance / deviation**2)
     size = torch.zeros_like(determined).index_add_(0, group, (step / deviation) ** 2)
-    return torch.where(determined > enough, (size / determined).clamp(min=0).sqrt(), 1.0)
+    return torch.where(determined > _ENOUGH_MODES, (size / determined).clamp(min=0).sqrt(), 1.0)

@@ -32,7 +32,6 @@ from pyklip_diffrender.optics.planes import (
     InternalAberration,
     LyotStop,
     Plane,
-    PupilStop,
     Values,
     Wavefront,
 )
@@ -40,8 +39,7 @@ from pyklip_diffrender.optics.sampled_planes import Gain, PupilOptic
 
 __all__ = ["LatticeRoute", "is_pointwise"]
 
-_POINTWISE = (Gain, InternalAberration, LyotStop, PupilOptic, PupilStop)
-
+_POINTWISE = (Gain, InternalAberration, LyotStop, PupilOptic)
 
 _LARGE = 512
 """Samples across a pupil whose arrays do not fit into the cache: only there does it pay to compute
