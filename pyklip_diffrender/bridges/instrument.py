@@ -1,4 +1,4 @@
-"""The settings and the detector of a user's stpsf instrument, read without changing it."""
+"""Read the settings and the detector of an stpsf instrument without changing it."""
 
 from __future__ import annotations
 
@@ -71,16 +71,16 @@ def oversampling(recipe: Mapping[str, Any]) -> tuple[int, int]:
         )
     if both is None and fine is None and pixels is None:
         both = 4
-    found = (fine if fine is not None else both, pixels if pixels is not None else both)
-    if None in found:
+    image, detector = both if fine is None else fine, both if pixels is None else pixels
+    if image is None or detector is None:
         raise IncompatibleSetupError(
             f"fft_oversample={fine}, detector_oversample={pixels}: give both, or oversample"
         )
-    return int(found[0]), int(found[1])
+    return int(image), int(detector)
 
 
 def band(instrument: Any, recipe: Mapping[str, Any]) -> tuple[list[float], list[float]]:
-    """Wavelengths (m) and weights: those of a `Bandpass`, otherwise those that stpsf chooses.
+    """Wavelengths (m) and weights: those of a `Bandpass`, otherwise the choice of stpsf.
 
     Parameters
     ----------
@@ -98,10 +98,10 @@ def band(instrument: Any, recipe: Mapping[str, Any]) -> tuple[list[float], list[
     DiffrenderWarning
         For a single wavelength outside the filter.
     """
-    given: Bandpass | None = recipe["bandpass"]
+    bandpass: Bandpass | None = recipe["bandpass"]
     monochromatic = None
-    if given is not None:
-        wavelengths, weights = given.wavelengths, given.weights
+    if bandpass is not None:
+        wavelengths, weights = bandpass.wavelengths, bandpass.weights
     else:
         if recipe["monochromatic"] is not None:
             monochromatic = float(to_metres(recipe["monochromatic"], "monochromatic"))
@@ -126,7 +126,7 @@ def _warn_outside(instrument: Any, wavelength: float) -> None:
     """Warn of a wavelength outside the filter, which stpsf accepts silently."""
     path = instrument._filters[instrument.filter].filename
     if not os.path.exists(path):
-        return  # stpsf needs the curve for broadband PSFs only.
+        return  # stpsf needs the curve only for broadband PSFs.
     table = fits.getdata(path, 1)
     used = np.asarray(table["THROUGHPUT"], dtype=float)
     passed = np.asarray(table["WAVELENGTH"], dtype=float)[used > 1e-3 * used.max()] * 1e-10
@@ -141,7 +141,7 @@ def _warn_outside(instrument: Any, wavelength: float) -> None:
 
 @contextmanager
 def data_errors() -> Iterator[None]:
-    """Turn stpsf's errors about missing files into one that names its data directory."""
+    """Replace stpsf's errors about missing files by one that names its data directory."""
     try:
         yield
     except (FileNotFoundError, OSError, RuntimeError) as error:
