@@ -67,7 +67,7 @@ class Orientation:
     def apply_to_lattice(self, array: Tensor) -> Tensor:
         """Turn an array (..., n, n) whose middle is sample n // 2, as after an FFT, n even.
 
-        The samples at ``-n / 2`` have no partner; they stay, as they are periodic.
+        The samples at ``-n / 2`` have no mirror image and stay, because they are periodic.
         """
         return self._turn(array, roll=1)
 

@@ -49,6 +49,7 @@ __all__ = [
     "Plane",
     "Values",
     "Wavefront",
+    "phase_factor",
 ]
 
 Values = Mapping[str, Tensor]
@@ -74,16 +75,22 @@ class Wavefront:
 
 
 class Plane(Protocol):
-    """What an `OpticalSystem` needs of its planes after the first."""
+    """Interface of the planes of an `OpticalSystem` behind the entrance pupil."""
 
     name: str
     parameters: tuple[str, ...]
 
     def window(self, values: Values) -> PupilGrid | None:
-        """The part of the pupil that this plane passes on; None if it takes what comes."""
+        """The part of the pupil that this plane passes on; None for all of it."""
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Propagate; `onto` is the window that the planes behind need."""
+
+
+def phase_factor(opd: Tensor, wavelength: float, dtype: torch.dtype) -> Tensor:
+    """``exp(2 pi i OPD / wavelength)``, from float64 to a real type `dtype`."""
+    phase = ((2 * math.pi / wavelength) * opd).to(dtype)
+    return torch.polar(torch.ones_like(phase), phase)
 
 
 class EntrancePupil:
@@ -101,7 +108,7 @@ class EntrancePupil:
 
     parameters: tuple[str, ...] = ("star_offset",)
     opd: Tensor | None = None
-    """The OPD of a system that is called without one, (npix, npix) in m; None for a flat one."""
+    """The OPD for calls without one, (npix, npix) in m; None for a flat wavefront."""
 
     def __init__(
         self, amplitude: Tensor, diameter: float, dtype: torch.dtype, name: str = "entrance pupil"
@@ -143,7 +150,7 @@ class EntrancePupil:
         if star_offset is not None:
             x, y = tilt_phases(star_offset * ARCSEC, self.grid, wavelength)
             phase = phase + (x[..., None, :] + y[..., :, None]).to(self.dtype)
-        # torch.polar does the same in 1.6 times the time (1024 x 1024, two cores).
+        # torch.polar takes 1.6 times as long (1024 x 1024, two cores).
         field = torch.complex(amplitude * torch.cos(phase), amplitude * torch.sin(phase))
         return Wavefront(field, wavelength, self.grid)
 
@@ -151,8 +158,8 @@ class EntrancePupil:
 class LyotStop:
     """A stop made of polygonal openings that can be shifted and turned, exactly.
 
-    The openings are rasterised anew wherever they lie (`polygon_coverage`), so that the image is
-    a smooth function of shift and rotation with the true derivative.
+    The openings are rasterised at every position (`polygon_coverage`), so that the image is a
+    smooth function of shift and rotation with the true derivative.
 
     Parameters
     ----------
@@ -182,8 +189,8 @@ class LyotStop:
         self.diameter = diameter
         self.dtype, self.device = dtype, device
         full = PupilGrid.full(npix, diameter)
-        # Symmetric about the axis, for then transforms are half as large. Windows are just these
-        # two, for whatever else is kept is kept for each.
+        # Symmetric about the axis, which halves the transforms. Only these two windows occur,
+        # because other results are cached for each window.
         self._tight = centred(full.around(polygon_coverage(openings, full)))
         self._wide = self._tight.widened(self.margin * diameter)
         self._latest: dict[PupilGrid, tuple[Position, Tensor]] = {}
@@ -265,8 +272,7 @@ class InternalAberration:
         phasor = self._phasors.get(key)
         if phasor is None or "si_zernikes" in values:
             opd = self.opd(wavefront.wavelength, wavefront.grid, values)
-            phase = ((2 * math.pi / wavefront.wavelength) * opd).to(self.dtype)
-            phasor = torch.polar(torch.ones_like(phase), phase)
+            phasor = phase_factor(opd, wavefront.wavelength, self.dtype)
             if "si_zernikes" not in values:
                 self._phasors[key] = phasor
         return replace(wavefront, field=wavefront.field * phasor)
@@ -281,8 +287,8 @@ class CompactOcculter:
     Parameters
     ----------
     complement : callable
-        (x, y) angles in arcsec, arrays, to the amplitude 1 - t. Evaluated in double precision
-        as a constant: 1 - t must be computed without forming t, which would cancel.
+        From angles (x, y) in arcsec to the amplitude 1 - t, computed directly in double precision
+        because 1 - t from t would lose digits by cancellation.
     radius : float
         arcsec; `complement` vanishes beyond.
     sampling : float, optional
