@@ -13,7 +13,7 @@ from astropy.table import Table
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.aberrations import ChromaticAberration, internal_wavefront_error
-from pyklip_diffrender.instrument.masks import ROUND_MASKS, filter_shift, mask_center
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.io.files import embedded_table
@@ -84,25 +84,6 @@ def test_focus_is_zero_where_the_table_was_made_and_tilt_at_the_reference() -> N
     assert short(2.12e-6)[4] == 0
     assert short(2.0e-6)[4] * 1e9 == pytest.approx(-15.8, abs=0.05)
     assert short(2.0e-6)[3] * 1e9 == pytest.approx(-162.0, abs=0.05)
-
-
-# -- places on the detector --------------------------------------------------------------------
-
-
-def test_places_on_the_detector_count_from_zero() -> None:
-    assert mask_center("NRCA5_MASK335R") == pytest.approx((149.2, 173.6))
-    full, sub = mask_center("NRCA5_FULL_MASK335R"), mask_center("NRCA5_MASK335R")
-    # The corner of the subarray lies on a whole pixel.
-    assert [a - b for a, b in zip(full, sub, strict=True)] == pytest.approx([491, 1501])
-    assert filter_shift("F335M") == filter_shift("F210M") == (0.0, 0.0)
-    assert filter_shift("f444w") == (0.177, -0.205)
-
-
-def test_places_that_are_not_known_are_refused_with_those_that_are() -> None:
-    with pytest.raises(IncompatibleSetupError, match=r"'NRCB5_MASK335R'.*NRCA5_MASK335R"):
-        mask_center("NRCB5_MASK335R")
-    with pytest.raises(IncompatibleSetupError, match=r"F182M.*F480M, not for 'F277W'"):
-        filter_shift("F277W")
 
 
 # -- crosstalk ---------------------------------------------------------------------------------

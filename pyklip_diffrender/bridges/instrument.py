@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
+from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.detector_effects import (
+    ChainDetector,
     Effect,
     GaussianBlur,
     LinearResampling,
@@ -31,7 +33,7 @@ __all__ = [
     "kernel_files_left_open",
     "oversampling",
     "private_copy",
-    "stpsf_effects",
+    "with_effects",
 ]
 
 Array = NDArray[np.float64]
@@ -162,40 +164,18 @@ def kernel_files_left_open() -> Iterator[None]:
         yield
 
 
-def stpsf_effects(
-    instrument: Any,
-    *,
-    shape: tuple[int, int],
-    oversample: int,
-    fft_oversample: int,
-    pixelscale: float,
-    distortion: bool,
-) -> tuple[tuple[Effect, ...], tuple[Effect, ...]]:
-    """The detector effects of an instrument, as functions of torch images.
-
-    Parameters
-    ----------
-    instrument : stpsf.NIRCam
-    shape : tuple of int
-        Pixels (ny, nx).
-    oversample, fft_oversample : int
-        Oversampling of the detector and of the image planes.
-    pixelscale : float
-        arcsec per pixel.
-    distortion : bool
-        Include all effects up to DET_DIST; otherwise jitter only, as in DET_SAMP.
-
-    Returns
-    -------
-    on_samples, on_pixels : tuple of Effect
-        Effects that act on the samples of the image, and on the pixels after binning.
+def with_effects(
+    detector: Detector, instrument: Any, fft_oversample: int, distortion: bool
+) -> ChainDetector:
+    """A detector with the effects of an instrument: all up to DET_DIST, or jitter only.
 
     Raises
     ------
     IncompatibleSetupError
         For a kind of jitter that is not supported.
     """
-    scale = pixelscale / oversample
+    oversample, shape = detector.oversample, detector.shape
+    scale = detector.pixelscale[0] / oversample
     on_samples: list[Effect] = []
     jitter = instrument.options.get("jitter")
     if jitter is not None:
@@ -205,20 +185,28 @@ def stpsf_effects(
             )
         sigma = instrument.options.get("jitter_sigma")
         on_samples.append(GaussianBlur((_JITTER if sigma is None else sigma) / scale))
-    if not distortion:
-        return tuple(on_samples), ()
-    header = _header(instrument, shape, oversample, fft_oversample, scale)
-    aperture = instrument.siaf.apertures[header["APERNAME"].upper()]
-    samples = (shape[0] * oversample, shape[1] * oversample)
-    on_samples.append(SplineRotation(aperture.V3IdlYAngle, samples))
-    on_samples.append(_distortion(aperture, header, samples, scale))
-    diffusion = _charge_diffusion(instrument, header)
-    if diffusion:
-        on_samples.append(GaussianBlur(diffusion / scale))
     on_pixels: list[Effect] = []
-    if instrument.options.get("add_ipc", True):
-        on_pixels += [PixelCrosstalk(kernel) for kernel in _crosstalk(instrument, header)]
-    return tuple(on_samples), tuple(on_pixels)
+    if distortion:
+        header = _header(instrument, shape, oversample, fft_oversample, scale)
+        aperture = instrument.siaf.apertures[header["APERNAME"].upper()]
+        samples = (shape[0] * oversample, shape[1] * oversample)
+        on_samples.append(SplineRotation(aperture.V3IdlYAngle, samples))
+        on_samples.append(_distortion(aperture, header, samples, scale))
+        diffusion = _charge_diffusion(instrument, header)
+        if diffusion:
+            on_samples.append(GaussianBlur(diffusion / scale))
+        if instrument.options.get("add_ipc", True):
+            on_pixels += [PixelCrosstalk(kernel) for kernel in _crosstalk(instrument, header)]
+    return ChainDetector(
+        shape=shape,
+        pixelscale=detector.pixelscale,
+        oversample=oversample,
+        dtype=detector.dtype,
+        device=detector.device,
+        name=detector.name,
+        on_samples=tuple(on_samples),
+        on_pixels=tuple(on_pixels),
+    )
 
 
 def _header(

@@ -17,7 +17,7 @@ from pyklip_diffrender.bridges.instrument import (
     kernel_files_left_open,
     oversampling,
     private_copy,
-    stpsf_effects,
+    with_effects,
 )
 from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
 from pyklip_diffrender.bridges.maps import check_opd, opd_to_hdus
@@ -25,8 +25,6 @@ from pyklip_diffrender.bridges.poppy import PoppySystem, check_supported, refuse
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
-from pyklip_diffrender.optics.detector import Detector
-from pyklip_diffrender.optics.detector_effects import ChainDetector
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.psf_file import poppy_psf, save
 from pyklip_diffrender.optics.sampled_planes import AberrationOptic
@@ -243,7 +241,8 @@ def from_webbpsf(
         {**recipe, "wavelength": wavelengths, "weights": weights, "fov_pixels": None},
         {} if aberrations is None else {aberrations.name: AberrationOptic},
     )
-    detector = _with_effects(conversion.detector, instrument, sampling, add_distortion)
+    with data_errors():
+        detector = with_effects(conversion.detector, instrument, sampling, add_distortion)
     system = WebbSystem.of(conversion, recipe, from_webbpsf, detector)
     system.instrument, system.si_wfe_flipped = instrument, flipped
     return system
@@ -265,30 +264,6 @@ def _set_flip(plane: Any, wanted: bool | None) -> bool:
     # The map alone: focus and tilt, which depend on the wavelength, are added to it later.
     plane.opd = plane.opd[::-1].copy()
     return wanted
-
-
-def _with_effects(
-    detector: Detector, instrument: Any, sampling: int, distortion: bool
-) -> ChainDetector:
-    with data_errors():
-        on_samples, on_pixels = stpsf_effects(
-            instrument,
-            shape=detector.shape,
-            oversample=detector.oversample,
-            fft_oversample=sampling,
-            pixelscale=detector.pixelscale[0],
-            distortion=distortion,
-        )
-    return ChainDetector(
-        shape=detector.shape,
-        pixelscale=detector.pixelscale,
-        oversample=detector.oversample,
-        dtype=detector.dtype,
-        device=detector.device,
-        name=detector.name,
-        on_samples=on_samples,
-        on_pixels=on_pixels,
-    )
 
 
 def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:

@@ -1,4 +1,4 @@
-"""NIRCam's round coronagraph masks: profile, filters, pixel scales, places on the detector."""
+"""NIRCam's round coronagraph masks: profile, filters, pixel scales."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 
-__all__ = ["ROUND_MASKS", "RoundMask", "filter_shift", "mask_center", "require_mask_and_filter"]
+__all__ = ["ROUND_MASKS", "RoundMask", "require_mask_and_filter"]
 
 _SECOND_ZERO_OF_J1 = 7.015586669815619
 
@@ -23,7 +23,7 @@ LONG_WAVE = (
 
 @dataclass(frozen=True)
 class RoundMask:
-    """A round occulter of NIRCam's module A with the channel that it is made for.
+    """A round occulter of NIRCam's module A and its channel.
 
     Its amplitude transmission is ``t = 1 - (2 J1(s) / s)^2`` with ``s = sigma r`` up to the second
     zero of J1, and 1 beyond (Krist et al., "The JWST/NIRCam coronagraph: mask design and
@@ -91,13 +91,13 @@ ROUND_MASKS = {
 
 
 def require_mask_and_filter(mask: str | None, name: str) -> RoundMask:
-    """The mask of a legal combination of image mask and filter.
+    """Check a combination of image mask and filter, and return the mask.
 
     Parameters
     ----------
     mask : str or None
-        Image mask; None stands for the mask that is usual in the filter's channel (MASK210R or
-        MASK335R), whose geometry then applies without the mask.
+        Image mask. None gives the usual mask of the filter's channel (MASK210R or MASK335R), for
+        its geometry.
     name : str
         Filter, in any case.
 
@@ -119,89 +119,3 @@ def require_mask_and_filter(mask: str | None, name: str) -> RoundMask:
         f"filter: got {name!r} with image mask {mask!r}, which do not go together. Legal "
         f"combinations are {legal}"
     )
-
-
-# J. Leisenring's measurements in flight, as in spaceKLIP's resources crpix_jarron.json and
-# filter_shifts_jarron.json (commit 07eaf7d); the centres count from 1.
-_CENTERS = {
-    "NRCA2_MASK210R": (321.8, 331.5),
-    "NRCA2_FULL_MASK210R": (712.8, 1516.5),
-    "NRCA5_MASK335R": (150.2, 174.6),
-    "NRCA5_FULL_MASK335R": (641.2, 1675.6),
-    "NRCA5_MASK430R": (151.3, 175.2),
-    "NRCA5_FULL_MASK430R": (964.3, 1676.2),
-    "NRCA5_MASKLWB": (151.3, 175.2),
-}
-_SHIFTS = {
-    "F182M": (-0.071, -1.365),
-    "F187N": (-0.108, -1.216),
-    "F200W": (2.543, 4.119),
-    "F210M": (0.0, 0.0),
-    "F212N": (0.037, 0.344),
-    "F250M": (0.056, -2.038),
-    "F300M": (0.086, -0.526),
-    "F322W2": (0.198, -0.583),
-    "F335M": (0.0, 0.0),
-    "F356W": (0.783, -0.159),
-    "F360M": (0.204, -0.087),
-    "F410M": (0.209, -0.132),
-    "F430M": (0.196, -0.182),
-    "F444W": (0.177, -0.205),
-    "F460M": (0.237, -0.766),
-    "F480M": (0.226, -0.899),
-}
-
-
-def mask_center(aperture: str) -> tuple[float, float]:
-    """Where a mask's centre is imaged on the detector in F335M (short wave: F210M).
-
-    Parameters
-    ----------
-    aperture : str
-        Aperture as SIAF names it, such as "NRCA5_MASK335R", the 320 x 320 subarray, or
-        "NRCA5_FULL_MASK335R", the full detector.
-
-    Returns
-    -------
-    tuple of float
-        x, y in pixels of the science frame, counted from 0 at the middle of the first pixel.
-        SIAF and FITS (``CRPIX``) count from 1. In another filter add `filter_shift`.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For an aperture that is not in the table.
-    """
-    if aperture not in _CENTERS:
-        raise IncompatibleSetupError(
-            f"aperture: got {aperture!r}, expected one of {', '.join(_CENTERS)}"
-        )
-    x, y = _CENTERS[aperture]
-    return x - 1, y - 1
-
-
-def filter_shift(name: str) -> tuple[float, float]:
-    """How far the image of the mask, and of the sky with it, lies from where it is in F335M.
-
-    The filters' substrates and the coronagraph's wedge displace the image by up to two pixels.
-
-    Parameters
-    ----------
-    name : str
-        Filter. Those of the short-wave channel are relative to F210M.
-
-    Returns
-    -------
-    tuple of float
-        x, y in pixels of the filter's channel, science frame.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For a filter whose shift was not measured.
-    """
-    if name.upper() not in _SHIFTS:
-        raise IncompatibleSetupError(
-            f"filter: the image shift was measured for {', '.join(_SHIFTS)}, not for {name!r}"
-        )
-    return _SHIFTS[name.upper()]

@@ -1,8 +1,8 @@
 """Bases for wavefront changes: rigid segment motions and Fourier modes.
 
 A coefficient is the rms of its mode in metres (over the segment, or over the full array), so that
-one prior scale means the same for every mode of a kind. Modes are analytic: they can be sampled
-on any pupil grid, which is what lets a coarse model serve a fine one.
+a prior scale has the same meaning for all modes of a kind. Modes are analytic and can be sampled on
+any pupil grid, so that a coarse and a fine model share their coefficients.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class Basis(Protocol):
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Kinds of mode, each with a prior scale of its own."""
+        """Kinds of mode, each with its own prior scale."""
 
     @property
     def group_index(self) -> Tensor:
-        """For every mode the index of its group, (modes,), int64."""
+        """Index of the group of every mode, (modes,), int64."""
 
     @property
     def frequencies(self) -> Tensor:
@@ -84,14 +84,14 @@ class SegmentMotions:
 
 
 def _whole(grid: PupilGrid) -> PupilGrid:
-    """Of the whole segment, whatever part of it `grid` holds: the modes stay the same."""
+    """The full grid, so that modes do not depend on the part of a segment that `grid` covers."""
     return PupilGrid.full(grid.npix, grid.diameter)
 
 
 @lru_cache(maxsize=4)
 def _sampled_segments(grid: PupilGrid) -> list[tuple[PupilGrid, Tensor]]:
     """For each segment the window that holds it and its three modes there."""
-    # Half the gap on every side: each point of the gaps belongs to a segment too.
+    # Half the gap on every side, so that each point of the gaps belongs to a segment.
     return [
         _sampled_segment(widen_polygon(outline, TABULATED_GAP / 2), grid)
         for outline in jwst_segments().values()
@@ -121,7 +121,7 @@ class FourierModes:
     ----------
     max_cycles : float
         Highest radial frequency. MASKRND's narrow openings spread light over 11 lambda/D, so a
-        5 arcsec field at 4.5 um hears frequencies to about 24.
+        field of 5 arcsec at 4.5 um is sensitive to frequencies up to about 24.
     min_cycles : float
         Lowest radial frequency.
     """
@@ -158,7 +158,7 @@ class FourierModes:
         for axis, positions in ((0, grid.x), (1, grid.y)):
             angle = (2 * math.pi / grid.diameter) * pairs[:, axis, None] * positions
             waves.append(math.sqrt(2) ** 0.5 * torch.complex(torch.cos(angle), torch.sin(angle)))
-        # A plane wave is a product of one in x and one in y: no trigonometry on the full grid.
+        # A plane wave is a product of waves in x and y, which saves trigonometry on the full grid.
         product = waves[1][:, :, None] * waves[0][:, None, :]
         both = torch.stack([product.real, product.imag], dim=1)
         first = 2 * (start // 2)
