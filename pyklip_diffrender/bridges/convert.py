@@ -24,6 +24,7 @@ from pyklip_diffrender.bridges.sampling import (
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, native_float64, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
+from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.masks import (
     BoxPart,
     FourierMask,
@@ -37,7 +38,6 @@ from pyklip_diffrender.optics.rotation import FreeRotation
 from pyklip_diffrender.optics.sampled_planes import (
     Gain,
     MovableStop,
-    OffsetDetector,
     OrientedPupil,
     PupilOptic,
 )
@@ -351,7 +351,7 @@ class Conversion:
 
         return FourierMask(transmission, padding, self.npix, diameter, optic.name)
 
-    def _detector(self) -> OffsetDetector:
+    def _detector(self) -> Detector:
         detector = self.osys.planes[-1]
         scale = detector.pixelscale
         if not scale.unit.is_equivalent(u.arcsec / u.pix):
@@ -366,7 +366,7 @@ class Conversion:
             raise IncompatibleSetupError(f"fov_pixels: got {pixels}, expected at least 1")
         samples = arcsec / detector.oversample
         offset = (0.0, 0.0) if detector.offset is None else tuple(detector.offset)
-        return OffsetDetector(
+        return Detector(
             shape=(int(shape[0]), int(shape[1])),
             pixelscale=(arcsec, arcsec),
             oversample=int(detector.oversample),

@@ -1,4 +1,4 @@
-"""Values of FITS headers, checked: a card is text that anybody may have typed."""
+"""Read values of FITS headers with checks, because headers are often edited by hand."""
 
 from __future__ import annotations
 
@@ -15,18 +15,14 @@ __all__ = ["header_date", "header_number", "header_text", "merged_header"]
 
 
 def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fits.Header:
-    """Cards of the primary header, and those of an extension, which win.
+    """Cards of the primary header, replaced and completed by those of an extension.
 
-    Parameters
-    ----------
-    primary, extension : Header
-    name : str
-        The file's, for the message.
+    `name` is the name of the file in messages.
 
     Raises
     ------
     CorruptFileError
-        If a card cannot be read, or has characters that no card may have.
+        If a card cannot be read, or has invalid characters.
     """
     merged = primary.copy()
     try:
@@ -40,25 +36,18 @@ def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fi
 
 
 def _value(header: fits.Header, key: str) -> Any:
-    """None for a card that is not there, and for one without a value."""
+    """Value of a card; None if it is missing or undefined."""
     value = header.get(key)
     return None if isinstance(value, fits.card.Undefined) else value
 
 
 def header_number(header: fits.Header, key: str, name: str) -> float | None:
-    """Finite number on a card, None if there is none.
-
-    Parameters
-    ----------
-    header : Header
-    key : str
-    name : str
-        The file's, for the message.
+    """Finite number of a card, None if there is none; `name` is that of the file.
 
     Raises
     ------
     CorruptFileError
-        If something else is on the card.
+        If the card holds something else.
     """
     value = _value(header, key)
     if value is None:
@@ -72,12 +61,12 @@ def header_number(header: fits.Header, key: str, name: str) -> float | None:
 
 
 def header_text(header: fits.Header, key: str, name: str) -> str | None:
-    """Word on a card, None if there is none or it is empty.
+    """Text of a card, None if it is missing or empty; `name` is that of the file.
 
     Raises
     ------
     CorruptFileError
-        If something else is on the card.
+        If the card holds something else.
     """
     value = _value(header, key)
     if value is not None and not isinstance(value, str):
@@ -89,12 +78,12 @@ def header_text(header: fits.Header, key: str, name: str) -> str | None:
 
 
 def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time | None:
-    """Date (UTC) on the first card of some that has one.
+    """Date (UTC) of the first of several cards that has one; `name` is that of the file.
 
     Raises
     ------
     CorruptFileError
-        If that is no date.
+        If the card does not hold a date.
     """
     for key in keys:
         text = header_text(header, key, name)

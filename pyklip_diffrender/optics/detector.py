@@ -30,7 +30,9 @@ class Detector:
         Samples per pixel along each axis; a pixel's value is the mean of its samples times the
         pixel's area, so with 1 it is the intensity at the pixel's centre.
     shear : float
-        Growth of y with x on the sky, arcsec per arcsec (0 for square axes).
+        Increase of y with x on the sky, arcsec per arcsec (0 for square axes).
+    centre : tuple of float
+        x, y of the middle of the array on the image, arcsec.
     """
 
     shape: tuple[int, int]
@@ -40,6 +42,7 @@ class Detector:
     device: torch.device
     shear: float = 0.0
     name: str = "detector"
+    centre: tuple[float, float] = (0.0, 0.0)
     parameters: tuple[str, ...] = ("detector_shift", "blur")
     # Not copied by `dataclasses.replace`, because a changed detector has other transforms.
     _transforms: dict[tuple[float, PupilGrid], MatrixFourier] = field(
@@ -56,7 +59,7 @@ class Detector:
             axis = (index - (samples - 1) / 2) * (scale / self.oversample)
             if shift is not None:
                 axis = axis - shift[..., k].to(self.device)
-            axes.append(axis * ARCSEC)
+            axes.append(axis * ARCSEC + self.centre[k] * ARCSEC)
         return axes[0], axes[1]
 
     def field(self, wavefront: Wavefront, values: Values) -> Tensor:

@@ -16,9 +16,8 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.units import native_float64
-from pyklip_diffrender.optics.detector import mirrored_convolution
+from pyklip_diffrender.optics.detector import Detector, mirrored_convolution
 from pyklip_diffrender.optics.planes import Values
-from pyklip_diffrender.optics.sampled_planes import OffsetDetector
 
 __all__ = ["ChainDetector", "Effect", "GaussianBlur", "LinearResampling", "PixelCrosstalk"]
 
@@ -122,7 +121,7 @@ class PixelCrosstalk:
 
 
 @dataclass
-class ChainDetector(OffsetDetector):
+class ChainDetector(Detector):
     """A detector with effects, before and after the samples are binned to pixels.
 
     Attributes
@@ -139,7 +138,7 @@ class ChainDetector(OffsetDetector):
         if "blur" in values:
             # Blur the samples without binning them.
             shape, oversample = self.shape, self.oversample
-            fine = OffsetDetector(
+            fine = Detector(
                 (shape[0] * oversample, shape[1] * oversample),
                 (self.pixelscale[0] / oversample, self.pixelscale[1] / oversample),
                 1,

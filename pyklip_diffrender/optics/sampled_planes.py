@@ -14,8 +14,6 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.differentiation import Position, kept, position_of
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.orientation import Orientation
@@ -27,7 +25,6 @@ __all__ = [
     "AberrationOptic",
     "Gain",
     "MovableStop",
-    "OffsetDetector",
     "OrientedPupil",
     "PupilOptic",
 ]
@@ -305,21 +302,3 @@ class Gain:
         if self.factor == 1:
             return wavefront
         return replace(wavefront, field=wavefront.field * self.factor)
-
-
-@dataclass
-class OffsetDetector(Detector):
-    """A detector whose middle is off the optical axis.
-
-    Attributes
-    ----------
-    centre : tuple of float
-        x, y of its middle on the image, arcsec.
-    """
-
-    centre: tuple[float, float] = (0.0, 0.0)
-
-    def axes(self, values: Values) -> tuple[Tensor, Tensor]:
-        """See `Detector.axes`."""
-        x, y = super().axes(values)
-        return x + self.centre[0] * ARCSEC, y + self.centre[1] * ARCSEC

@@ -153,8 +153,8 @@ class OpticalSystem(Propagation):
         bandpass = changes.pop("bandpass", None)
         if bandpass is None and changes.keys().isdisjoint(_BAND):
             bandpass = self._other_bandpass
-        made = self._remade(changes) if changes else self
-        return made if bandpass is None else made.at_wavelengths(bandpass)
+        system = self._remade(changes) if changes else self
+        return system if bandpass is None else system.at_wavelengths(bandpass)
 
     def at_wavelengths(self, bandpass: Bandpass) -> OpticalSystem:
         """The same system with another bandpass.

@@ -84,8 +84,8 @@ class NoiseModel:
                 )
             frame = subject.combined()
             data, sigma, valid = (
-                torch.from_numpy(each[0]).to(image.device)
-                for each in (frame.data, frame.error, frame.valid)
+                torch.from_numpy(array[0]).to(image.device)
+                for array in (frame.data, frame.error, frame.valid)
             )
             if not bool(valid.any()):
                 raise NoValidPixelsError(f"{subject.name}: all pixels are masked")
@@ -167,7 +167,7 @@ class RidgeResidual:
         self._slopes = slopes.flatten(1)
         self._curvature = self._slopes @ self._slopes.T
 
-    def left(self, whitened: Tensor, modes: int) -> Tensor:
+    def residual(self, whitened: Tensor, modes: int) -> Tensor:
         """Residual of an error, (ny, nx) in units of the noise, after a fit of the first modes."""
         rows, flat = self._slopes[:modes], whitened.flatten()
         system = self._curvature[:modes, :modes] + torch.eye(len(rows)).to(rows)

@@ -214,7 +214,7 @@ class Trial:
         change = self.image(choice, which) - self.image(base or self.finest, which)
         residual = self.noise.unexplained(change)
         if choice.cycles < self.finest.cycles and self._ridge:
-            residual = self._ridge.left(residual, self.drift.count(choice.cycles))
+            residual = self._ridge.residual(residual, self.drift.count(choice.cycles))
         return self.noise.error(residual)
 
     def verified(self, choice: Choice) -> ModelError:

@@ -13,7 +13,7 @@ import logging
 import threading
 from collections.abc import Iterator
 from contextvars import ContextVar
-from typing import Any, Unpack
+from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
@@ -21,7 +21,6 @@ from pyklip_diffrender.pyklip_backend.reduction import Reduction, mark_filtered
 from pyklip_diffrender.pyklip_backend.settings import (
     DiffrenderSettings,
     OPDLike,
-    Options,
     settings_of,
 )
 from pyklip_diffrender.pyklip_backend.source import keeping_source
@@ -106,7 +105,7 @@ def is_registered() -> bool:
     return _registry.patches is not None
 
 
-def register(opd: OPDLike | None = None, model: Any = None, **options: Unpack[Options]) -> None:
+def register(opd: OPDLike | None = None, model: Any = None, **options: Any) -> None:
     """Make ``klip_dataset(..., algo="diffrender")`` work until `unregister`.
 
     Calling it again changes only the settings that are given. While registered, `JWSTData` also
@@ -162,7 +161,7 @@ def backend(
     opd: OPDLike | None = None,
     model: Any = None,
     force: bool = True,
-    **options: Unpack[Options],
+    **options: Any,
 ) -> Iterator[None]:
     """Use this backend within a block, without changing the code that is called there.
 

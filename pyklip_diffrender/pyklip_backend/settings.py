@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from astropy import units as u
@@ -29,31 +29,13 @@ if TYPE_CHECKING:
     from pyklip_diffrender.planning import Plan
     from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
 
-__all__ = ["ATTRIBUTE", "DiffrenderSettings", "OPDLike", "Options", "settings_of", "starting_opd"]
+__all__ = ["ATTRIBUTE", "DiffrenderSettings", "OPDLike", "settings_of", "starting_opd"]
 
 OPDLike: TypeAlias = "str | os.PathLike[str] | NDArray[np.floating[Any]] | u.Quantity | OPDMap"
 """A wavefront map: a FITS file, an array in metres, a Quantity, or what `read_opd` returns."""
 
 ATTRIBUTE = "diffrender"
 """Attribute of a dataset that holds its own settings."""
-
-
-class Options(TypedDict, total=False):
-    """The settings other than `opd` and `model`, as keywords."""
-
-    filter: str
-    pixelscale: float | tuple[float, float]
-    fit_pixels: int
-    error: ArrayLike
-    unit: u.UnitBase
-    seed: int
-    fit: GaussNewton | Adam
-    start: Mapping[str, Any]
-    systematics: Systematics
-    plan: Plan | str
-    keep_detected: bool
-    model_options: Mapping[str, Any]
-    subtractor: Callable[..., Any]
 
 
 @dataclass(frozen=True, eq=False)

@@ -115,7 +115,7 @@ def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
     source = SourceFrames(
         headers=[header for header, frames in zip(headers, data, strict=True) for _ in frames],
         data=np.concatenate(data),
-        error=None if any(each is None for each in errors) else np.concatenate(errors),
+        error=None if any(error is None for error in errors) else np.concatenate(errors),
         usable=np.concatenate(usable),
         centers=np.concatenate(centers),
         aligned=np.array(dataset.input),

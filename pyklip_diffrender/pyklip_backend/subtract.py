@@ -173,8 +173,8 @@ def _with_companions(results: list[Refinement]) -> list[Refinement]:
 
 def _groups(observation: Observation) -> list[tuple[NDArray[np.intp], Observation]]:
     """Frames with the same star centre and position angle, with their indices."""
-    given = observation.position_angles
-    angles = np.zeros(len(observation)) if given is None else given
+    known = observation.position_angles
+    angles = np.zeros(len(observation)) if known is None else known
     keys = np.round(np.column_stack([observation.center, angles]), 6)
     _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     groups = []
