@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import poppy
@@ -21,7 +21,6 @@ from pyklip_diffrender.io.units import to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.grid import resample
-from pyklip_diffrender.optics.orientation import Orientation
 from pyklip_diffrender.optics.psf_file import poppy_psf
 from pyklip_diffrender.optics.sampled_planes import PupilOptic
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -50,27 +49,21 @@ class PoppySystem(OpticalSystem):
         For every plane of poppy's, from its frame to the frame of this system's pupils.
     """
 
-    propagation: dict[str, str]
-    frames: list[Orientation]
     _sources: ClassVar[tuple[str, ...]] = ("osys", "trainable")
     """Arguments that define the system, as opposed to settings of it."""
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
         **OpticalSystem._replaced,
         "wavelength": ("weights",),
     }
-    _fixed: set[str]
-    _copies: dict[frozenset[tuple[str, Any]] | None, OpticalSystem]
 
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         conversion: Conversion,
         recipe: dict[str, Any],
         remake: Callable[..., OpticalSystem],
         detector: Detector | None = None,
-    ) -> Self:
-        """Assemble a system from converted planes."""
-        system = cls(
+    ) -> None:
+        super().__init__(
             conversion.entrance,
             conversion.planes,
             detector or conversion.detector,
@@ -78,10 +71,9 @@ class PoppySystem(OpticalSystem):
             recipe={**recipe, "occulter_sampling": conversion.sampling},
             remake=remake,
         )
-        system.propagation, system.frames = conversion.propagation, conversion.frames
-        system._fixed = conversion.fixed
-        system._copies = {}
-        return system
+        self.propagation, self.frames = conversion.propagation, conversion.frames
+        self._fixed = conversion.fixed
+        self._copies: dict[frozenset[tuple[str, Any]] | None, OpticalSystem] = {}
 
     @property
     def adjustable(self) -> frozenset[str]:
@@ -278,7 +270,7 @@ def from_poppy(
 
 def _from_private(**recipe: Any) -> PoppySystem:
     """As `from_poppy`, for a system that is not shared with the caller."""
-    return PoppySystem.of(Conversion(recipe["osys"], recipe), recipe, _from_private)
+    return PoppySystem(Conversion(recipe["osys"], recipe), recipe, _from_private)
 
 
 def opd_to_poppy(opd: Any, osys: poppy.OpticalSystem) -> poppy.OpticalSystem:

@@ -243,7 +243,7 @@ def from_webbpsf(
     )
     with data_errors():
         detector = with_effects(conversion.detector, instrument, sampling, add_distortion)
-    system = WebbSystem.of(conversion, recipe, from_webbpsf, detector)
+    system = WebbSystem(conversion, recipe, from_webbpsf, detector)
     system.instrument, system.si_wfe_flipped = instrument, flipped
     return system
 

@@ -32,6 +32,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
+from pyklip_diffrender.io.headers import card_error
 from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.units import native_float64, require_shape
 
@@ -367,9 +368,8 @@ def _date(header: fits.Header, name: str) -> Time | None:
         try:
             return Time(date, scale="utc")
         except ValueError as error:
-            raise CorruptFileError(
-                f"{name}: DATE-OBS and TIME-OBS are {date!r}, expected such as "
-                "'2022-08-11T01:02:03'. Correct the header, or fetch the file again"
+            raise card_error(
+                name, "DATE-OBS with TIME-OBS", date, "a date such as '2022-08-11T01:02:03'"
             ) from error
     match = re.match(r"[A-Z](\d{4})(\d{2})(\d{2})\d{2}-", name)
     if match is None:

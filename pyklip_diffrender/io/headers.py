@@ -11,7 +11,7 @@ from astropy.time import Time
 
 from pyklip_diffrender.errors import CorruptFileError
 
-__all__ = ["header_date", "header_number", "header_text", "merged_header"]
+__all__ = ["card_error", "header_date", "header_number", "header_text", "merged_header"]
 
 
 def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fits.Header:
@@ -35,6 +35,14 @@ def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fi
     return merged
 
 
+def card_error(name: str, card: str, value: Any, expected: str) -> CorruptFileError:
+    """Error for a card that does not hold what is expected."""
+    return CorruptFileError(
+        f"{name}: {card} is {value!r}, expected {expected}. Correct the header, or fetch the file "
+        "again"
+    )
+
+
 def _value(header: fits.Header, key: str) -> Any:
     """Value of a card; None if it is missing or undefined."""
     value = header.get(key)
@@ -53,10 +61,7 @@ def header_number(header: fits.Header, key: str, name: str) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
-        raise CorruptFileError(
-            f"{name}: {key} is {value!r}, expected a finite number. Correct the header, or fetch "
-            "the file again"
-        )
+        raise card_error(name, key, value, "a finite number")
     return float(value)
 
 
@@ -70,10 +75,7 @@ def header_text(header: fits.Header, key: str, name: str) -> str | None:
     """
     value = _value(header, key)
     if value is not None and not isinstance(value, str):
-        raise CorruptFileError(
-            f"{name}: {key} is {value!r}, expected text. Correct the header, or fetch the file "
-            "again"
-        )
+        raise card_error(name, key, value, "text")
     return value or None
 
 
@@ -92,8 +94,5 @@ def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time |
         try:
             return Time(text, scale="utc")
         except ValueError as error:
-            raise CorruptFileError(
-                f"{name}: {key} is {text!r}, expected a date such as '2022-08-11T01:02:03'. "
-                "Correct the header, or fetch the file again"
-            ) from error
+            raise card_error(name, key, text, "a date such as '2022-08-11T01:02:03'") from error
     return None
