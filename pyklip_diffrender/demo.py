@@ -101,7 +101,7 @@ def run_demo(
     Parameters
     ----------
     contrast, separation, position_angle : float
-        Of the planet; arcsec and degrees.
+        The planet, in arcsec and degrees.
     hours : float
         Age of the wavefront map.
     seed : int

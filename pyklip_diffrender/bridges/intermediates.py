@@ -37,7 +37,7 @@ def intermediate_wavefronts(
     ----------
     system : OpticalSystem
     orientations : sequence of Orientation
-        Of every plane, the entrance pupil first, relative to poppy's.
+        Orientation of every plane relative to poppy's, the entrance pupil first.
     normalize : str
         Only "first".
     only_last : bool

@@ -168,11 +168,11 @@ def load_wss_opd_by_date(
     ----------
     date : str (ISO, UTC) or Time
     choice : "closest", "before", "after" or "interpolate"
-        Which measurement; the last interpolates linearly between the two around the date.
+        Measurement to take; the last interpolates linearly between the two around the date.
     npix, backout_si_wfe
         See `load_wss_opd`.
     folder : path, optional
-        Where downloads are kept; default stpsf's own cache.
+        Folder for downloads; default stpsf's own cache.
 
     Returns
     -------

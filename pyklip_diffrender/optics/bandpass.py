@@ -54,7 +54,7 @@ class Bandpass:
         Returns
         -------
         indices : tuple of int
-            Of the wavelengths kept.
+            Indices of the wavelengths kept.
         bandpass : Bandpass
         """
         total = len(self.wavelengths)

@@ -64,7 +64,7 @@ class LinearResampling:
     rows, columns : array_like, (ny, nx)
         Position in the image of each sample of the result, in samples.
     shape : tuple of int
-        Of the image.
+        Shape of the image.
     """
 
     def __init__(self, rows: ArrayLike, columns: ArrayLike, shape: tuple[int, int]) -> None:

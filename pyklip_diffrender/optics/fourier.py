@@ -61,7 +61,7 @@ def tilt_phases(offset: Tensor, grid: PupilGrid, wavelength: float) -> tuple[Ten
 class RowTransform:
     """The kernel ``exp(sign 2 pi i q p / lambda)`` between positions q and p, along axis -2.
 
-    Where the positions lie symmetrically about zero, as cells and centred pixels do, the kernel
+    If the positions are symmetric about zero, as for cells and centred pixels, the kernel
     splits into a cosine that is even and a sine that is odd: two real products of half the size,
     and a quarter of it where both kinds of position are symmetric.
     """

@@ -233,7 +233,7 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
 
 
 def _border_crossings(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-    """Where edges cross integer x or y, as fractions of the edge; every edge also has its 0.
+    """Crossings of edges with integer x or y, as fractions of the edge, and the start of each edge.
 
     Returns
     -------

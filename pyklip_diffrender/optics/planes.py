@@ -66,7 +66,7 @@ class Wavefront:
     wavelength : float
         m.
     grid : PupilGrid
-        Where the samples are.
+        The window of the samples.
     """
 
     field: Tensor
@@ -122,7 +122,7 @@ class EntrancePupil:
         power = (amplitude**2).sum() * full.spacing**2
         self.amplitude = full.crop(amplitude / torch.sqrt(power), self.grid).to(dtype)
         self.lit = amplitude > 0
-        """Where light passes, (npix, npix)."""
+        """Samples that transmit light, (npix, npix)."""
 
     def on_window(self, maps: Tensor) -> Tensor:
         """OPD maps (..., npix, npix) on the samples of the field, (..., rows, columns)."""

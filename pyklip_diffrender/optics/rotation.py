@@ -96,7 +96,7 @@ class FreeRotation:
         self._rotation = SplineRotation(-angle, (npix, npix))
 
     def window(self, values: Values) -> PupilGrid:
-        """All of the pupil."""
+        """The whole pupil."""
         return self._full
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:

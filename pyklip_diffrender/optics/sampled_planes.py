@@ -74,7 +74,7 @@ class OrientedPupil(EntrancePupil):
             self.total = collected
         self.opd = opd.to(device, torch.float64)
         self.lit = (amplitude > 0).to(device)
-        """Where light passes, (npix, npix), in the frame of the OPD."""
+        """Samples that transmit light, (npix, npix), in the frame of the OPD."""
         self.orientation = orientation
         self.pointing = torch.tensor(pointing, dtype=torch.float64, device=device)
         self.chromatic = {w: extra.to(device) for w, extra in (chromatic or {}).items()}

@@ -50,6 +50,8 @@ class OpticalSystem(Propagation):
     Attributes
     ----------
     defaults : dict of str to Tensor
+    maker : callable or None
+        `remake`.
 
     Raises
     ------
@@ -81,7 +83,7 @@ class OpticalSystem(Propagation):
     ) -> None:
         super().__init__(entrance, planes, detector, bandpass, route, defaults)
         self.recipe = dict(recipe or {})
-        self._remake = remake
+        self.maker = remake
         self._other_bandpass: Bandpass | None = None
 
     def __repr__(self) -> str:
@@ -94,11 +96,6 @@ class OpticalSystem(Propagation):
             f"{'s' if waves > 1 else ''} about {self.bandpass.mean_wavelength * 1e6:.2f} um, "
             f"{self.detector.shape[1]} x {self.detector.shape[0]} px>"
         )
-
-    @property
-    def maker(self) -> Callable[..., OpticalSystem] | None:
-        """The function that makes this system from its recipe; None if there is none."""
-        return self._remake
 
     @property
     def setup(self) -> dict[str, str]:
@@ -120,7 +117,7 @@ class OpticalSystem(Propagation):
         function that made the system. A system made directly from planes can only change its
         bandpass, and not even that if its planes were sampled at certain wavelengths.
         """
-        names = set(self.recipe) if self._remake is not None else set()
+        names = set(self.recipe) if self.maker is not None else set()
         return frozenset(names if self._is_sampled else {*names, "bandpass"})
 
     def with_fidelity(self, **changes: Any) -> OpticalSystem:
@@ -193,14 +190,14 @@ class OpticalSystem(Propagation):
 
     def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
         """Another system from the same recipe with some changes."""
-        assert self._remake is not None  # Otherwise its arguments are not adjustable.
+        assert self.maker is not None  # Otherwise its arguments are not adjustable.
         dropped = {
             other: None
             for name in changes
             for other in self._replaced.get(name, ())
             if other in self.recipe and other not in changes
         }
-        return self._remake(**{**self.recipe, **dropped, **changes})
+        return self.maker(**{**self.recipe, **dropped, **changes})
 
     def calc_psf(
         self,

@@ -95,7 +95,7 @@ def coarse_steps(
     npix : int
         Pupil samples of the copy and of its wavefronts; must divide the model's.
     dtype : torch.dtype, optional
-        Of the copy; default the model's.
+        Type of the copy; default the model's.
     """
     coarse = CheapSystem(model.with_fidelity(npix=npix, dtype=dtype or model.dtype))
     with torch.no_grad():

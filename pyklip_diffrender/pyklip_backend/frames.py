@@ -41,7 +41,7 @@ class Frames:
     data : ndarray, (m, ny, nx)
         Their pixels. Unlike in `observation`, flagged pixels keep their values.
     usable : ndarray of bool, (n,)
-        Which of the frames that were asked for these are.
+        Mask of these frames among those requested.
     pixels : str
         "recorded", or "as given" for the pixels of ``dataset.input``.
     noise : str
@@ -200,7 +200,7 @@ def _recorded(
 
 
 def _usable(valid: NDArray[np.bool_], name: str) -> NDArray[np.bool_]:
-    """Which of n frames have any valid pixel, (n,)."""
+    """Mask of the frames that have any valid pixel, (n,)."""
     usable = np.asarray(valid.any(axis=(1, 2)))
     if not usable.any():
         raise NoValidPixelsError(

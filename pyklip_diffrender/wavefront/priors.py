@@ -142,8 +142,8 @@ def learn_prior(
     npix : int
         Samples on which modes are fitted; the maps are averaged onto them.
     ridge : float
-        Of the fit, relative to the norms of the modes; modes that are degenerate on the mirror
-        share what they explain.
+        Ridge of the fit, relative to the norms of the modes. Modes that are degenerate on the
+        mirror share what they explain.
 
     Returns
     -------

@@ -54,7 +54,7 @@ class _Axis:
     Attributes
     ----------
     samples : int
-        Of the detector.
+        Number of detector samples.
     phases : int
         Samples per cell, if those are finer; each has its own kernel.
     cells : int
@@ -62,7 +62,7 @@ class _Axis:
     half : int
         Cells are numbered from -half to half.
     spacing : float
-        Of the cells, radians.
+        Distance between cells, radians.
     """
 
     samples: int
@@ -87,7 +87,7 @@ class _Axis:
 
     @property
     def positions(self) -> Tensor:
-        """Of the cells, radians, float64."""
+        """Positions of the cells, radians, float64."""
         return torch.arange(-self.half, self.half + 1, dtype=torch.float64) * self.spacing
 
     @property
@@ -97,7 +97,7 @@ class _Axis:
 
     @property
     def period(self) -> int:
-        """Of the convolution, in steps between samples of one phase."""
+        """Period of the convolution, in steps between samples of one phase."""
         cells = (self.count - 1) * self.cells + 2 * self.half + 1
         return int(next_fast_len(math.ceil(cells / self.cells)))
 

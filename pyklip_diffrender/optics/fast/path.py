@@ -251,7 +251,7 @@ class _StreamedStar:
         To the cells in front of the mask, and to the detector.
     lattice : OcculterLattice
     kernel : Tensor
-        Of the convolution.
+        Transform of the kernel of the convolution.
     per_sample : float
         See `Detector`.
     """
@@ -263,7 +263,7 @@ class _StreamedStar:
     per_sample: float
 
     def products(self, opd: Tensor, offset: Tensor | None) -> list[Tensor]:
-        """Of the field along x, see `PupilStream.products`; the star's offset in arcsec."""
+        """Products of the field along x, see `PupilStream.products`; the offset is in arcsec."""
         with torch.no_grad():
             return self.stream.products(opd, _radians(offset), self.branches)
 

@@ -149,7 +149,7 @@ class PupilStream:
         opd : Tensor, (npix, npix)
             m; see `EntrancePupil.field`.
         offset : Tensor, (2,), or None
-            Of the source, radians.
+            Offset of the source, radians.
         branches : sequence of Branch
             All at one wavelength.
 
