@@ -137,15 +137,16 @@ def noise_cube(
     frames: NDArray[np.float64],
     center: NDArray[np.float64],
     annuli: Annuli,
+    count: int,
     numthreads: int | None,
 ) -> NDArray[np.float64]:
-    """Azimuthal scatter of each frame by pyKLIP's own measure, (n, ny, nx), for weighted means."""
+    """Azimuthal scatter of frames (n, ny, nx) as measured by pyKLIP, (count, n, ny, nx)."""
     from pyklip.parallelized import generate_noise_maps
 
     maps = generate_noise_maps(
         frames, center, annuli.width, IWA=annuli.inner, OWA=annuli.outer, numthreads=numthreads
     )
-    return np.asarray(maps)
+    return np.repeat(np.asarray(maps)[np.newaxis], count, axis=0)
 
 
 def aligned_before(

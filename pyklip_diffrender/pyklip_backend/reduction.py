@@ -194,8 +194,7 @@ class Reduction:
         count, dtype = len(np.atleast_1d(kw["numbasis"])), kw.get("dtype")
         noise: NDArray[Any] = np.array([1.0])
         if kw.get("compute_noise_cube"):
-            maps = noise_cube(placed, center, annuli, kw.get("numthreads"))
-            noise = np.repeat(maps[np.newaxis], count, axis=0)
+            noise = noise_cube(placed, center, annuli, count, kw.get("numthreads"))
         outputs: tuple[Any, ...] = (slices(placed, count, dtype), list(center), noise)
         if kw.get("save_aligned"):
             outputs += (aligned_before(imgs, centers, wvs, center, dtype),)

@@ -72,7 +72,7 @@ class _Patches:
 
 
 class _Registry:
-    """Counts who uses the backend, and holds the settings given to `register`."""
+    """The users of the backend, and the settings given to `register`."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -81,9 +81,9 @@ class _Registry:
         self.blocks = 0
         self.defaults = DiffrenderSettings()
 
-    def update(self) -> None:
-        """Apply the patches for the first user, restore pyKLIP after the last."""
-        in_use = self.registered or self.blocks > 0
+    def use(self, registered: bool, blocks: int) -> None:
+        """Set the users; patch pyKLIP for the first and restore it after the last."""
+        in_use = registered or blocks > 0
         if in_use and self.patches is None:
             patches = _Patches()
             patches.apply()
@@ -91,6 +91,7 @@ class _Registry:
         elif not in_use and self.patches is not None:
             self.patches.restore()
             self.patches = None
+        self.registered, self.blocks = registered, blocks
 
 
 _registry = _Registry()
@@ -134,13 +135,8 @@ def register(opd: OPDLike | None = None, model: Any = None, **options: Any) -> N
     """
     settings = DiffrenderSettings(opd=opd, model=model, **options)
     with _registry.lock:
+        _registry.use(True, _registry.blocks)
         _registry.defaults = settings.over(_registry.defaults)
-        _registry.registered = True
-        try:
-            _registry.update()
-        except BaseException:
-            _registry.registered = False
-            raise
 
 
 def unregister() -> None:
@@ -149,9 +145,8 @@ def unregister() -> None:
     Inside a `backend` block, pyKLIP is restored when the block ends.
     """
     with _registry.lock:
-        _registry.registered = False
         _registry.defaults = DiffrenderSettings()
-        _registry.update()
+        _registry.use(False, _registry.blocks)
 
 
 @contextlib.contextmanager
@@ -190,20 +185,14 @@ def backend(
     outer, _ = _block.get()
     settings = DiffrenderSettings(opd=opd, model=model, **options).over(outer)
     with _registry.lock:
-        _registry.blocks += 1
-        try:
-            _registry.update()
-        except BaseException:
-            _registry.blocks -= 1
-            raise
+        _registry.use(_registry.registered, _registry.blocks + 1)
     token = _block.set((settings, force))
     try:
         yield
     finally:
         _block.reset(token)
         with _registry.lock:
-            _registry.blocks -= 1
-            _registry.update()
+            _registry.use(_registry.registered, _registry.blocks - 1)
 
 
 def _is_ours(algo: Any) -> bool:
