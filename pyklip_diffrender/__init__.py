@@ -6,7 +6,6 @@ Every public name is loaded when it is first used, so that ``import pyklip_diffr
 
 from __future__ import annotations
 
-import warnings
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
@@ -86,47 +85,29 @@ __all__ = [
     "unregister",
 ]
 
-_MODULE_OF = {
-    "Reduction": "reduction",
-    "reduce": "reduction",
-    "Adam": "refinement",
-    "GaussNewton": "refinement",
-    "Sequence": "scene.sequence",
-    "Systematics": "refinement",
-    "known_systematics": "refinement",
-    "learn_systematics": "refinement",
-    "model_for": "scene.real_frames",
-    "Detection": "detection",
-    "DiffrenderSettings": "pyklip_backend",
-    "LinearModel": "linear.model",
-    "Observation": "scene.observation",
-    "OpticalSystem": "optics.system",
-    "Plan": "planning",
-    "Planet": "scene.objects",
-    "Refinement": "refinement",
-    "Scene": "scene.objects",
-    "Star": "scene.objects",
-    "Status": "refinement",
-    "WavefrontPrior": "wavefront.priors",
-    "backend": "pyklip_backend",
-    "contrast_curve": "detection",
-    "detect": "detection",
-    "drift": "wavefront.opd",
-    "from_poppy": "bridges",
-    "from_webbpsf": "bridges",
-    "learn_prior": "wavefront.priors",
-    "measure": "detection",
-    "nircam_coronagraph": "instrument.nircam",
-    "observation_from_dataset": "pyklip_backend",
-    "plan": "planning",
-    "random_opd": "wavefront.opd",
-    "read_opd": "wavefront.opd",
-    "refine": "refinement",
-    "register": "pyklip_backend",
-    "simulate": "scene.simulation",
-    "unregister": "pyklip_backend",
+_NAMES = {
+    "bridges": "from_poppy from_webbpsf",
+    "detection": "Detection contrast_curve detect measure",
+    "instrument.nircam": "nircam_coronagraph",
+    "linear.model": "LinearModel",
+    "optics.system": "OpticalSystem",
+    "planning": "Plan plan",
+    "pyklip_backend": "DiffrenderSettings backend observation_from_dataset register unregister",
+    "reduction": "Reduction reduce",
+    "refinement": (
+        "Adam GaussNewton Refinement Status Systematics known_systematics learn_systematics refine"
+    ),
+    "scene.objects": "Planet Scene Star",
+    "scene.observation": "Observation",
+    "scene.real_frames": "model_for",
+    "scene.sequence": "Sequence",
+    "scene.simulation": "simulate",
+    "wavefront.opd": "drift random_opd read_opd",
+    "wavefront.priors": "WavefrontPrior learn_prior",
 }
-"""The module each public name lives in."""
+"""Public names by the module they are in."""
+
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 try:
     __version__ = version("pyklip-diffrender")
@@ -135,23 +116,7 @@ except PackageNotFoundError:
     __version__ = "0+unknown"
 
 
-_REMOVED = {
-    "keep_freed_memory": (
-        "it has no effect any more; set the environment variables MALLOC_MMAP_MAX_=0 and "
-        "MALLOC_TRIM_THRESHOLD_=2147483647 before the program starts instead"
-    ),
-}
-"""Public names that stay importable for one release, and what to do without them."""
-
-
 def __getattr__(name: str) -> Any:
-    if name in _REMOVED:
-        warnings.warn(
-            f"pyklip_diffrender.{name} is deprecated: {_REMOVED[name]}",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return lambda: False
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

@@ -57,10 +57,10 @@ class DemoResult:
     Attributes
     ----------
     images : dict of str to ndarray
-        Star-subtracted frames, photons: "initial", "KLIP", "refined", "detected" (the star once
-        more, with what was detected in the model), "optimal".
+        Star-subtracted frames, photons: "initial", "KLIP", "refined", "detected" (refined again
+        with the detected planets in the model), "optimal".
     table : Table
-        One row an image: annulus SNR, planet throughput, star-model error, seconds.
+        One row per image: annulus SNR, planet throughput, star-model error, seconds.
     detection : Detection
         Point sources with the wavefront integrated out instead of subtracted.
     """
@@ -78,7 +78,7 @@ class DemoResult:
 
 
 def simulate_references(model: OpticalSystem, opd: Image, *, seed: int) -> Image:
-    """Nine dithered frames of the reference star, scaled to nothing, (9, ny, nx) photons."""
+    """Nine dithered frames of the reference star, unscaled, (9, ny, nx) photons."""
     scene = Scene(star=Star(w2_magnitude=ALPHA_PICTORIS_W2, exposure=400.0))
     frames = []
     for k, (x, y) in enumerate(DITHERS):
@@ -101,13 +101,13 @@ def run_demo(
     Parameters
     ----------
     contrast, separation, position_angle : float
-        Of the planet; arcsec and degrees.
+        The planet, in arcsec and degrees.
     hours : float
         Age of the wavefront map.
     seed : int
-        Of wavefront, drift and noise.
+        Random seed of wavefront, drift and noise.
     progress : bool
-        Show bars.
+        Show progress bars.
     """
     model = nircam_coronagraph(
         "F444W", monochromatic=4.5e-6, fov_pixels=80, segment_gap=PAPER_SEGMENT_GAP
@@ -128,8 +128,7 @@ def run_demo(
     fit = refine(model, observation, measured, seed=seed, progress=progress)
     seconds["refined"] = fit.seconds
     began = time.perf_counter()
-    found = detect(fit, progress=progress)
-    without_star = found.subtracted[0]
+    detection = detect(fit, progress=progress)
     seconds["detected"] = fit.seconds + time.perf_counter() - began
     drift_later = measured.data + random_drift(seed + 1000, hours + 3).data
     references = simulate_references(model, drift_later, seed=seed + 2000)
@@ -142,7 +141,7 @@ def run_demo(
         "initial": frame - outdated,
         "KLIP": klip,
         "refined": fit.frames[0].residual[0],
-        "detected": without_star,
+        "detected": detection.subtracted[0],
         "optimal": frame - star,
     }
     ny, nx = frame.shape
@@ -155,7 +154,7 @@ def run_demo(
             name,
             annulus_snr(image, position, center),
             throughput(image, faint, noise, position),
-            # What is left of the star: the subtracted frame less noise and planet.
+            # The residual of the star: the subtracted frame minus noise and planet.
             star_model_error(
                 np.nan_to_num(images["optimal"] - image), np.zeros_like(star), noise, center,
                 radius - 1.5, radius + 1.5,
@@ -172,7 +171,7 @@ def run_demo(
         table[name].format = form
     table.meta = {"contrast": contrast, "separation": separation, "hours": hours, "seed": seed}
     return DemoResult(
-        model, scene, observation, measured, true_opd, fit, images, noise, table, found
+        model, scene, observation, measured, true_opd, fit, images, noise, table, detection
     )
 
 
@@ -193,14 +192,11 @@ def write_demo(result: DemoResult, folder: Path) -> list[Path]:
         hdus.append(hdu)
     for hdu in hdus[1 : 2 + len(result.images)]:
         hdu.header["BUNIT"] = "photon"
-    hdu = fits.ImageHDU(result.detection.snr.astype(np.float32), name="SNR")
-    hdus.append(hdu)
+    hdus.append(fits.ImageHDU(result.detection.snr.astype(np.float32), name="SNR"))
     images = folder / "demo.fits"
     write_fits(hdus, images)
-    table = folder / "demo.ecsv"
-    with replacing(table) as temporary:
-        result.table.write(temporary, format="ascii.ecsv", overwrite=True)
-    candidates = folder / "candidates.ecsv"
-    with replacing(candidates) as temporary:
-        result.detection.table.write(temporary, format="ascii.ecsv", overwrite=True)
-    return [images, table, candidates]
+    tables = {"demo.ecsv": result.table, "candidates.ecsv": result.detection.table}
+    for name, table in tables.items():
+        with replacing(folder / name) as temporary:
+            table.write(temporary, format="ascii.ecsv", overwrite=True)
+    return [images, *(folder / name for name in tables)]

@@ -275,11 +275,6 @@ def test_public_name_resolves(name: str) -> None:
     assert name in dir(dr)
 
 
-def test_a_removed_name_says_what_to_do_instead() -> None:
-    with pytest.warns(DeprecationWarning, match="MALLOC_MMAP_MAX_"):
-        assert dr.keep_freed_memory() is False
-
-
 def test_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="no attribute 'klip'"):
         _ = dr.klip

@@ -30,7 +30,9 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
-from pyklip_diffrender.optics.planes import EntrancePupil, PupilStop
+from pyklip_diffrender.optics.orientation import Orientation
+from pyklip_diffrender.optics.planes import EntrancePupil
+from pyklip_diffrender.optics.sampled_planes import PupilOptic
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.optics.zernike import zernike_basis
 
@@ -281,7 +283,15 @@ def test_the_embedded_coronagraph_has_the_orientation_of_stpsf(
             chromatic_reference=3.35e-6,
         )
         entrance = EntrancePupil(torch.from_numpy(pupil(NPIX)), JWST_DIAMETER, torch.float64)
-        stop = PupilStop(torch.from_numpy(lyot_stop(NPIX)), JWST_DIAMETER, torch.float64, "stop")
+        stop = PupilOptic(
+            {4.5e-6: torch.from_numpy(lyot_stop(NPIX)).to(torch.complex128)},
+            NPIX,
+            JWST_DIAMETER,
+            torch.float64,
+            torch.device("cpu"),
+            "stop",
+            Orientation(),
+        )
         planes = (base.planes[0], stop, base.planes[2])
         system = OpticalSystem(entrance, planes, base.detector, base.bandpass)
         return system(from_webbpsf(instrument, **FAST).entrance.opd, star_offset=offset)

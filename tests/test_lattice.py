@@ -9,14 +9,16 @@ import pytest
 import torch
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.instrument.nircam import SIAF_PIXELSCALE, SIAF_SHEAR, nircam_coronagraph
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.fast import path as route
 from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.opd import random_opd
 
 WAVELENGTH = 4.5e-6
-SIAF: dict[str, Any] = {"pixelscale": SIAF_PIXELSCALE, "shear": SIAF_SHEAR}
+MASK = ROUND_MASKS["MASK335R"]
+SIAF: dict[str, Any] = {"pixelscale": MASK.siaf_pixelscale, "shear": MASK.siaf_shear}
 MOVED: dict[str, Any] = {
     "detector_shift": (0.011, -0.02),
     "lyot_shift": (0.003, -0.002),

@@ -26,7 +26,7 @@ def test_there_are_eight() -> None:
     assert len(set(TURNS)) == 8
     assert {first.then(second) for first, second in product(TURNS, TURNS)} == set(TURNS)
     for turn in TURNS:
-        assert turn.then(turn.inverse).is_identity
+        assert turn.then(turn.inverse) == Orientation()
         assert turn.sense == turn.inverse.sense
 
 

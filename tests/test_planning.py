@@ -186,7 +186,7 @@ def test_drifts_have_the_deviations_of_the_prior() -> None:
 
 def test_what_a_fit_leaves_is_that_of_ridge_regression(rng: np.random.Generator) -> None:
     slopes, seen = rng.normal(size=(7, 4, 5)), rng.normal(size=(4, 5))
-    found = RidgeResidual(torch.from_numpy(slopes)).left(torch.from_numpy(seen), 5)
+    found = RidgeResidual(torch.from_numpy(slopes)).residual(torch.from_numpy(seen), 5)
     rows = slopes[:5].reshape(5, -1)
     expected = np.linalg.solve(np.eye(20) + rows.T @ rows, seen.ravel()).reshape(seen.shape)
     # Both are solved in double precision.

@@ -1,10 +1,9 @@
-"""The planes of a poppy `OpticalSystem`, one by one, as planes of ours."""
+"""Convert the planes of a poppy `OpticalSystem`, one by one, to planes of this package."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from pyklip_diffrender.bridges.sampling import (
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, native_float64, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
+from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.masks import (
     BoxPart,
     FourierMask,
@@ -38,19 +38,27 @@ from pyklip_diffrender.optics.rotation import FreeRotation
 from pyklip_diffrender.optics.sampled_planes import (
     Gain,
     MovableStop,
-    OffsetDetector,
     OrientedPupil,
     PupilOptic,
 )
 
-__all__ = ["Converted", "Converter"]
+__all__ = ["Conversion"]
 
 Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class Converted:
-    """A poppy system as planes of ours.
+class Conversion:
+    """The planes of a poppy system as planes of this package.
+
+    Parameters
+    ----------
+    osys : poppy.OpticalSystem
+        A system that passes `poppy.check_supported`.
+    recipe : dict
+        Arguments of `from_poppy`.
+    kinds : mapping of str to type, optional
+        Names of pupil planes that become a subclass of `PupilOptic`. The first stop behind a mask
+        becomes a `MovableStop`, unless it is trainable.
 
     Attributes
     ----------
@@ -62,32 +70,8 @@ class Converted:
         For every plane of poppy's, from its frame to the frame of the system's pupils.
     sampling : float
         Samples per lambda/D in image planes.
-    fixed : frozenset of str
-        Settings that cannot be changed without making it another system.
-    """
-
-    entrance: OrientedPupil
-    planes: list[Plane]
-    detector: OffsetDetector
-    bandpass: Bandpass
-    propagation: dict[str, str]
-    frames: list[Orientation]
-    sampling: float
-    fixed: frozenset[str]
-
-
-class Converter:
-    """One pass over the planes of a poppy system.
-
-    Parameters
-    ----------
-    osys : poppy.OpticalSystem
-        One that `poppy.check_supported` lets pass.
-    recipe : dict
-        Arguments of `from_poppy`.
-    kinds : mapping of str to type, optional
-        Names of pupil planes that become a special kind of `PupilOptic`. The first stop behind a
-        mask always becomes a `MovableStop`, unless it is trainable.
+    fixed : set of str
+        Settings that cannot be changed without changing what the system computes.
 
     Raises
     ------
@@ -101,17 +85,18 @@ class Converter:
         recipe: dict[str, Any],
         kinds: Mapping[str, type[PupilOptic]] | None = None,
     ) -> None:
-        self.osys, self.recipe = osys, recipe
-        self.kinds = kinds or {}
+        self.osys, self.recipe, self.kinds = osys, recipe, kinds or {}
         self.dtype: torch.dtype = recipe["dtype"]
         self.device = torch.device(recipe["device"])
         wavelengths = np.atleast_1d(to_metres(recipe["wavelength"], "wavelength"))
         weights = recipe["weights"]
-        given = np.ones(len(wavelengths)) if weights is None else native_float64(weights)
-        self.bandpass = Bandpass(tuple(wavelengths.tolist()), tuple(np.atleast_1d(given).tolist()))
+        weights = np.ones(len(wavelengths)) if weights is None else native_float64(weights)
+        self.bandpass = Bandpass(
+            tuple(wavelengths.tolist()), tuple(np.atleast_1d(weights).tolist())
+        )
         first = osys.input_wavefront(wavelengths[0] * u.m)
         self.sampled = int(first.wavefront.shape[0])
-        """Samples across the pupil where poppy's optics are evaluated."""
+        """Samples across the pupil at which poppy's optics are evaluated."""
         self.npix = int(recipe["npix"] or self.sampled)
         if self.npix < 1 or self.sampled % self.npix:
             raise IncompatibleSetupError(
@@ -123,69 +108,60 @@ class Converter:
         sampling = float(recipe["occulter_sampling"] or osys.oversample)
         # A whole number of samples across the image of the pupil array, rounding aside.
         self.sampling = math.ceil(self.npix * sampling - 1e-9) / self.npix
-        self.used: dict[str, str] = {}
-        self.has_stop = False
+        self.propagation: dict[str, str] = {}
         self.fixed: set[str] = {"npix", "device"} if recipe["trainable"] else set()
+        self._has_stop = False
+        turns = self._turns_behind()
+        self.frames = [self._to_system(turn) for turn in turns]
+        self.planes = self._convert_planes(turns)
+        self.entrance = self._entrance()
+        self.detector = self._detector()
 
-    def convert(self) -> Converted:
-        """Go through the planes in order."""
+    def _convert_planes(self, turns: list[Orientation]) -> list[Plane]:
+        """All planes between the entrance pupil and the detector, in order."""
         planes: list[Plane] = []
-        after = self._turns_behind()
         centred = "array_center"
         stack: list[Any] = []
-        for k, (optic, turn) in enumerate(zip(self.osys.planes, after, strict=True)):
-            if k == 0 or optic is self.osys.planes[-1]:
-                continue
+        for k in range(1, len(self.osys.planes) - 1):
+            optic, turn = self.osys.planes[k], turns[k]
             if optic.planetype == PlaneType.inversion:
                 planes.append(Gain(optic.name))
             elif optic.planetype == PlaneType.rotation:
-                whole = round(optic.angle / 90) * 90 == optic.angle
-                angle = optic.angle * turn.sense * -1  # The system's frame is a mirror of poppy's.
+                angle = -optic.angle * turn.sense  # The system's frame is a mirror of poppy's.
                 planes.append(
                     Gain(optic.name)
-                    if whole
+                    if _is_quarter_turn(optic)
                     else FreeRotation(angle, self.npix, self.diameter, optic.name)
                 )
             elif optic.planetype == PlaneType.pupil:
-                plane, centred = self._pupil(k, turn, centred)
+                plane, centred = self._pupil(k, centred)
                 planes.append(plane)
             elif self.osys.planes[k + 1].planetype == PlaneType.image:
-                # Masks one behind the other in one image act as one.
+                # Successive masks in one image act as one.
                 stack.append(optic)
                 planes.append(Gain(optic.name))
             else:
                 planes.append(self._image(MaskStack.of([*stack, optic]), turn, centred))
                 stack = []
-        return Converted(
-            self._entrance(after[0]),
-            planes,
-            self._detector(),
-            self.bandpass,
-            self.used,
-            [self._to_system(turn) for turn in after],
-            self.sampling,
-            frozenset(self.fixed),
-        )
+        return planes
 
     def _turns_behind(self) -> list[Orientation]:
-        """For every plane, all quarter turns and inversions that come after it."""
+        """For every plane, the product of all quarter turns and inversions behind it."""
         turns, turn = [], Orientation()
         for optic in reversed(self.osys.planes):
             turns.append(turn)
             if optic.planetype == PlaneType.inversion:
                 turn = Orientation.inversion(optic.axis).then(turn)
-            elif optic.planetype == PlaneType.rotation and round(optic.angle / 90) * 90 == (
-                optic.angle
-            ):
+            elif _is_quarter_turn(optic):
                 turn = Orientation.quarter_turns(round(optic.angle / 90)).then(turn)
         return turns[::-1]
 
     def _to_system(self, turn: Orientation) -> Orientation:
-        """From the frame of a pupil plane to the system's, see `propagation`: y is inverted."""
+        """From the frame of a pupil plane to the system's, in which y is inverted."""
         return turn.then(Orientation.inversion("y"))
 
     def _between_masks(self, index: int) -> bool:
-        """Whether light beside the pupil, as a mask scatters it there, may reach another mask."""
+        """Whether a plane lies between masks, where light scattered beyond the pupil matters."""
         kinds = [plane.planetype for plane in self.osys.planes]
         return PlaneType.image in kinds[:index] and PlaneType.image in kinds[index:]
 
@@ -201,23 +177,17 @@ class Converter:
             wave.ispadded = True
         return wave
 
-    def _entrance(self, turn: Orientation) -> OrientedPupil:
+    def _entrance(self) -> OrientedPupil:
         optic = self.osys.planes[0]
         shape = (self.sampled, self.sampled)
-        amplitude, opds = None, {}
+        opds: dict[float, Array] = {}
         for wavelength in self.bandpass.wavelengths:
-            wave = self._wave(wavelength)
-            phasor, opd = pupil_phasor(optic, wave)
-            if amplitude is None:
+            phasor, opd = pupil_phasor(optic, self._wave(wavelength))
+            if not opds:
                 amplitude = np.broadcast_to(np.abs(phasor), shape)
             opds[wavelength] = self._averaged(np.broadcast_to(opd, shape))
         base = opds[self.bandpass.wavelengths[0]]
-        chromatic = {
-            w: torch.from_numpy(opd - base) for w, opd in opds.items() if (opd != base).any()
-        }
-        assert amplitude is not None
         r, theta = float(self.osys.source_offset_r), np.deg2rad(self.osys.source_offset_theta)
-        pointing = complex(-r * np.sin(theta), r * np.cos(theta))
         return OrientedPupil(
             torch.from_numpy(native_float64(self._averaged(amplitude))),
             torch.from_numpy(native_float64(base)),
@@ -225,15 +195,17 @@ class Converter:
             self.dtype,
             self.device,
             optic.name,
-            self._to_system(turn),
-            (pointing.real, pointing.imag),
-            chromatic,
+            self.frames[0],
+            pointing=(float(-r * np.sin(theta)), float(r * np.cos(theta))),
+            chromatic={
+                w: torch.from_numpy(opd - base) for w, opd in opds.items() if (opd != base).any()
+            },
             turned=self._free_turn(),
             collected=float((amplitude**2).sum()) / self.block**2,
         )
 
     def _averaged(self, array: Array) -> Array:
-        """Mean over the blocks of an array that reaches equally far on all sides of the pupil."""
+        """Block means of an array that extends equally far beyond the pupil on all sides."""
         if self.block == 1:
             return array
         beside = (len(array) - self.sampled) // 2
@@ -245,18 +217,16 @@ class Converter:
 
     def _free_turn(self) -> float:
         """Rotation of the image by planes that turn by other than right angles, degrees."""
-        total = 0.0
-        sense = 1
+        total, sense = 0.0, 1
         for optic in reversed(self.osys.planes):
             if optic.planetype == PlaneType.inversion and optic.axis != "both":
                 sense = -sense
-            elif optic.planetype == PlaneType.rotation and round(optic.angle / 90) * 90 != (
-                optic.angle
-            ):
+            elif optic.planetype == PlaneType.rotation and not _is_quarter_turn(optic):
                 total += optic.angle * sense
         return total
 
-    def _pupil(self, index: int, turn: Orientation, centred: str) -> tuple[Plane, str]:
+    def _pupil(self, index: int, centred: str) -> tuple[Plane, str]:
+        """A pupil plane, and where poppy centres the next image."""
         optic, padded = self.osys.planes[index], self._between_masks(index)
         phasors: dict[float, Tensor] = {}
         latest: Array | None = None
@@ -264,29 +234,22 @@ class Converter:
             wave = self._wave(wavelength, padded)
             wave._image_centered = centred
             phasor, _ = pupil_phasor(optic, wave)
-            if latest is not None and np.array_equal(phasor, latest):
-                phasors[wavelength] = phasors[self.bandpass.wavelengths[len(phasors) - 1]]
-            else:
-                whole = np.broadcast_to(phasor, wave.shape)
-                phasors[wavelength] = torch.from_numpy(
-                    np.array(self._averaged(whole), dtype=np.complex128)
-                )
-            latest = phasor
+            if latest is None or not np.array_equal(phasor, latest):
+                averaged = self._averaged(np.broadcast_to(phasor, wave.shape))
+                tensor = torch.from_numpy(np.array(averaged, dtype=np.complex128))
+            phasors[wavelength], latest = tensor, phasor
         assert latest is not None
+        centred = wave._image_centered
         trainable = optic.name in self.recipe["trainable"]
-        # The last loop's wave says where the next image plane has its middle.
-        if (
-            not trainable
-            and (latest.size == 1 or np.ptp(latest) == 0)
-            and len({id(p) for p in phasors.values()}) == 1
-        ):
-            return Gain(optic.name, complex(latest.flat[0])), wave._image_centered
+        uniform = latest.size == 1 or np.ptp(latest) == 0
+        if uniform and not trainable and len({id(p) for p in phasors.values()}) == 1:
+            return Gain(optic.name, complex(latest.flat[0])), centred
         kind = self.kinds.get(optic.name, PupilOptic)
         behind_mask = any(p.planetype == PlaneType.image for p in self.osys.planes[:index])
-        if kind is PupilOptic and behind_mask and not (self.has_stop or trainable):
-            # An optic that leaves the amplitude alone is not a stop.
-            self.has_stop = bool(np.ptp(np.abs(latest)) > 1e-9)
-            kind = MovableStop if self.has_stop else PupilOptic
+        if kind is PupilOptic and behind_mask and not (self._has_stop or trainable):
+            # An optic with a constant amplitude is not a stop.
+            self._has_stop = bool(np.ptp(np.abs(latest)) > 1e-9)
+            kind = MovableStop if self._has_stop else PupilOptic
         plane = kind(
             phasors,
             self.npix,
@@ -294,58 +257,50 @@ class Converter:
             self.dtype,
             self.device,
             optic.name,
-            self._to_system(turn),
+            self.frames[index],
             trainable,
         )
-        return plane, wave._image_centered
+        return plane, centred
 
     def _image(self, optic: Any, turn: Orientation, centred: str) -> Plane:
         if isinstance(optic, poppy.ScalarTransmission):
             return Gain(optic.name, complex(optic.transmission))
-        wanted = self.recipe["propagation"]
-        if not isinstance(wanted, str):
-            wanted = wanted.get(optic.name, "auto")
-        if wanted not in ("auto", "compact", "fft"):
+        way = self.recipe["propagation"]
+        if not isinstance(way, str):
+            way = way.get(optic.name, "auto")
+        if way not in ("auto", "compact", "fft"):
             raise IncompatibleSetupError(
-                f"propagation: got {wanted!r} for {optic.name!r}, expected 'auto', 'compact' or "
-                "'fft'"
+                f"propagation: got {way!r} for {optic.name!r}, expected 'auto', 'compact' or 'fft'"
             )
-        parts = None
-        if wanted != "fft" and centred != "corner":
-            parts = self._parts(optic, turn)
+        parts = None if way == "fft" or centred == "corner" else self._parts(optic, turn)
+        if parts is None and way == "compact":
+            raise IncompatibleSetupError(
+                f"plane {optic.name!r} ({type(optic).__name__}) is not known to block only a "
+                f"bounded part of the image; those known are {COMPACT_OPTICS}. Use "
+                "propagation='fft'"
+            )
         if parts is None:
-            if wanted == "compact":
-                raise IncompatibleSetupError(
-                    f"plane {optic.name!r} ({type(optic).__name__}) is not known to block a "
-                    f"bounded part of the image only; those known are {COMPACT_OPTICS}. Use "
-                    "propagation='fft'"
-                )
-            self.used[optic.name] = "fft"
+            self.propagation[optic.name] = "fft"
             return self._fourier(optic, turn, centred)
-        self.used[optic.name] = "compact"
+        self.propagation[optic.name] = "compact"
         return SampledOcculter(parts, self.sampling, self.diameter, optic.name)
 
     def _parts(self, optic: Any, turn: Orientation) -> list[MaskPart] | None:
         spacing = max(self.bandpass.wavelengths) / self.diameter / self.sampling / ARCSEC
-        found = complement_box(optic, margin=2 * spacing)
-        if found is None:
+        mask_parts = complement_box(optic, margin=2 * spacing)
+        if mask_parts is None:
             return None
         back = turn.inverse
         parts: list[MaskPart] = []
-        for part in found:
+        for part in mask_parts:
             if part.box is None:
                 along_x = _turned_factor(part.along_x, part.along_y, back, 0)
                 along_y = _turned_factor(part.along_x, part.along_y, back, 1)
                 parts.append(SeparablePart(along_x, along_y, self.sampling))
                 continue
             left, right, bottom, top = part.box
-            corners = turn.positions(torch.tensor([left, right]), torch.tensor([bottom, top]))
-            box = (
-                float(corners[0].min()),
-                float(corners[0].max()),
-                float(corners[1].min()),
-                float(corners[1].max()),
-            )
+            x, y = turn.positions(torch.tensor([left, right]), torch.tensor([bottom, top]))
+            box = (float(x.min()), float(x.max()), float(y.min()), float(y.max()))
             parts.append(BoxPart(self._complement(part.optic, back), box))
         return parts
 
@@ -356,12 +311,12 @@ class Converter:
 
         def complement(x: Tensor, y: Tensor, wavelength: float) -> Tensor:
             local_x, local_y = back.positions(*torch.broadcast_tensors(x, y))
-            crossed = back.matrix[0][0] == 0
-            if crossed:  # Optics expect x to grow along the second axis of the array.
+            transposed = back.matrix[0][0] == 0
+            if transposed:  # Optics expect x to grow along the second axis of the array.
                 local_x, local_y = local_x.T, local_y.T
             wave = ImageSamples(wavelength, diameter, oversample, local_x, local_y)
             blocked = torch.from_numpy(1 - np.asarray(optic.get_phasor(wave), dtype=complex))
-            return blocked.T if crossed else blocked
+            return blocked.T if transposed else blocked
 
         return complement
 
@@ -396,7 +351,7 @@ class Converter:
 
         return FourierMask(transmission, padding, self.npix, diameter, optic.name)
 
-    def _detector(self) -> OffsetDetector:
+    def _detector(self) -> Detector:
         detector = self.osys.planes[-1]
         scale = detector.pixelscale
         if not scale.unit.is_equivalent(u.arcsec / u.pix):
@@ -405,13 +360,13 @@ class Converter:
                 "that converts to 'arcsec / pix'"
             )
         arcsec = float(np.atleast_1d(scale.to_value(u.arcsec / u.pix))[0])
-        wanted = self.recipe["fov_pixels"]
-        shape = tuple(np.broadcast_to(detector.shape if wanted is None else wanted, 2).tolist())
+        pixels = self.recipe["fov_pixels"]
+        shape = np.broadcast_to(detector.shape if pixels is None else pixels, 2)
         if min(shape) < 1:
-            raise IncompatibleSetupError(f"fov_pixels: got {wanted}, expected at least 1")
+            raise IncompatibleSetupError(f"fov_pixels: got {pixels}, expected at least 1")
         samples = arcsec / detector.oversample
         offset = (0.0, 0.0) if detector.offset is None else tuple(detector.offset)
-        return OffsetDetector(
+        return Detector(
             shape=(int(shape[0]), int(shape[1])),
             pixelscale=(arcsec, arcsec),
             oversample=int(detector.oversample),
@@ -423,6 +378,13 @@ class Converter:
         )
 
 
+def _is_quarter_turn(optic: Any) -> bool:
+    """Whether a plane rotates by a multiple of 90 degrees."""
+    return bool(
+        optic.planetype == PlaneType.rotation and round(optic.angle / 90) * 90 == optic.angle
+    )
+
+
 def _turned_factor(
     along_x: Callable[[Tensor], Tensor] | None,
     along_y: Callable[[Tensor], Tensor] | None,
@@ -432,7 +394,4 @@ def _turned_factor(
     """The factor of a separable part along one axis of the final image."""
     column = (back.matrix[0][axis], back.matrix[1][axis])
     factor, sign = (along_x, column[0]) if column[0] else (along_y, column[1])
-    if factor is None:
-        return None
-    chosen = factor
-    return lambda positions: chosen(sign * positions)
+    return None if factor is None else lambda positions: factor(sign * positions)

@@ -1,4 +1,4 @@
-"""The settings and the detector of a user's stpsf instrument, read without changing it."""
+"""Read the settings and the detector of an stpsf instrument without changing it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
+from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.detector_effects import (
+    ChainDetector,
     Effect,
     GaussianBlur,
     LinearResampling,
@@ -31,7 +33,7 @@ __all__ = [
     "kernel_files_left_open",
     "oversampling",
     "private_copy",
-    "stpsf_effects",
+    "with_effects",
 ]
 
 Array = NDArray[np.float64]
@@ -71,16 +73,16 @@ def oversampling(recipe: Mapping[str, Any]) -> tuple[int, int]:
         )
     if both is None and fine is None and pixels is None:
         both = 4
-    found = (fine if fine is not None else both, pixels if pixels is not None else both)
-    if None in found:
+    image, detector = both if fine is None else fine, both if pixels is None else pixels
+    if image is None or detector is None:
         raise IncompatibleSetupError(
             f"fft_oversample={fine}, detector_oversample={pixels}: give both, or oversample"
         )
-    return int(found[0]), int(found[1])
+    return int(image), int(detector)
 
 
 def band(instrument: Any, recipe: Mapping[str, Any]) -> tuple[list[float], list[float]]:
-    """Wavelengths (m) and weights: those of a `Bandpass`, otherwise those that stpsf chooses.
+    """Wavelengths (m) and weights: those of a `Bandpass`, otherwise the choice of stpsf.
 
     Parameters
     ----------
@@ -98,10 +100,10 @@ def band(instrument: Any, recipe: Mapping[str, Any]) -> tuple[list[float], list[
     DiffrenderWarning
         For a single wavelength outside the filter.
     """
-    given: Bandpass | None = recipe["bandpass"]
+    bandpass: Bandpass | None = recipe["bandpass"]
     monochromatic = None
-    if given is not None:
-        wavelengths, weights = given.wavelengths, given.weights
+    if bandpass is not None:
+        wavelengths, weights = bandpass.wavelengths, bandpass.weights
     else:
         if recipe["monochromatic"] is not None:
             monochromatic = float(to_metres(recipe["monochromatic"], "monochromatic"))
@@ -126,7 +128,7 @@ def _warn_outside(instrument: Any, wavelength: float) -> None:
     """Warn of a wavelength outside the filter, which stpsf accepts silently."""
     path = instrument._filters[instrument.filter].filename
     if not os.path.exists(path):
-        return  # stpsf needs the curve for broadband PSFs only.
+        return  # stpsf needs the curve only for broadband PSFs.
     table = fits.getdata(path, 1)
     used = np.asarray(table["THROUGHPUT"], dtype=float)
     passed = np.asarray(table["WAVELENGTH"], dtype=float)[used > 1e-3 * used.max()] * 1e-10
@@ -141,7 +143,7 @@ def _warn_outside(instrument: Any, wavelength: float) -> None:
 
 @contextmanager
 def data_errors() -> Iterator[None]:
-    """Turn stpsf's errors about missing files into one that names its data directory."""
+    """Replace stpsf's errors about missing files by one that names its data directory."""
     try:
         yield
     except (FileNotFoundError, OSError, RuntimeError) as error:
@@ -162,40 +164,18 @@ def kernel_files_left_open() -> Iterator[None]:
         yield
 
 
-def stpsf_effects(
-    instrument: Any,
-    *,
-    shape: tuple[int, int],
-    oversample: int,
-    fft_oversample: int,
-    pixelscale: float,
-    distortion: bool,
-) -> tuple[tuple[Effect, ...], tuple[Effect, ...]]:
-    """The detector effects of an instrument, as functions of torch images.
-
-    Parameters
-    ----------
-    instrument : stpsf.NIRCam
-    shape : tuple of int
-        Pixels (ny, nx).
-    oversample, fft_oversample : int
-        Oversampling of the detector and of the image planes.
-    pixelscale : float
-        arcsec per pixel.
-    distortion : bool
-        Include all effects up to DET_DIST; otherwise jitter only, as in DET_SAMP.
-
-    Returns
-    -------
-    on_samples, on_pixels : tuple of Effect
-        Effects that act on the samples of the image, and on the pixels after binning.
+def with_effects(
+    detector: Detector, instrument: Any, fft_oversample: int, distortion: bool
+) -> ChainDetector:
+    """A detector with the effects of an instrument: all up to DET_DIST, or jitter only.
 
     Raises
     ------
     IncompatibleSetupError
         For a kind of jitter that is not supported.
     """
-    scale = pixelscale / oversample
+    oversample, shape = detector.oversample, detector.shape
+    scale = detector.pixelscale[0] / oversample
     on_samples: list[Effect] = []
     jitter = instrument.options.get("jitter")
     if jitter is not None:
@@ -205,20 +185,28 @@ def stpsf_effects(
             )
         sigma = instrument.options.get("jitter_sigma")
         on_samples.append(GaussianBlur((_JITTER if sigma is None else sigma) / scale))
-    if not distortion:
-        return tuple(on_samples), ()
-    header = _header(instrument, shape, oversample, fft_oversample, scale)
-    aperture = instrument.siaf.apertures[header["APERNAME"].upper()]
-    samples = (shape[0] * oversample, shape[1] * oversample)
-    on_samples.append(SplineRotation(aperture.V3IdlYAngle, samples))
-    on_samples.append(_distortion(aperture, header, samples, scale))
-    diffusion = _charge_diffusion(instrument, header)
-    if diffusion:
-        on_samples.append(GaussianBlur(diffusion / scale))
     on_pixels: list[Effect] = []
-    if instrument.options.get("add_ipc", True):
-        on_pixels += [PixelCrosstalk(kernel) for kernel in _crosstalk(instrument, header)]
-    return tuple(on_samples), tuple(on_pixels)
+    if distortion:
+        header = _header(instrument, shape, oversample, fft_oversample, scale)
+        aperture = instrument.siaf.apertures[header["APERNAME"].upper()]
+        samples = (shape[0] * oversample, shape[1] * oversample)
+        on_samples.append(SplineRotation(aperture.V3IdlYAngle, samples))
+        on_samples.append(_distortion(aperture, header, samples, scale))
+        diffusion = _charge_diffusion(instrument, header)
+        if diffusion:
+            on_samples.append(GaussianBlur(diffusion / scale))
+        if instrument.options.get("add_ipc", True):
+            on_pixels += [PixelCrosstalk(kernel) for kernel in _crosstalk(instrument, header)]
+    return ChainDetector(
+        shape=shape,
+        pixelscale=detector.pixelscale,
+        oversample=oversample,
+        dtype=detector.dtype,
+        device=detector.device,
+        name=detector.name,
+        on_samples=tuple(on_samples),
+        on_pixels=tuple(on_pixels),
+    )
 
 
 def _header(

@@ -1,4 +1,4 @@
-"""Fields between the planes, as poppy's own objects."""
+"""The fields at all planes as `poppy.Wavefront` objects."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def intermediate_wavefronts(
 ) -> list[poppy.Wavefront]:
     """Fields as poppy's own objects, one per plane, weighted and summed as poppy does.
 
-    Image planes: the field behind the mask, on that part of the image where it was sampled.
+    For an image plane, the field behind the mask on the sampled part of the image.
 
     Parameters
     ----------
     system : OpticalSystem
     orientations : sequence of Orientation
-        Of every plane, the entrance pupil first, relative to poppy's.
+        Orientation of every plane relative to poppy's, the entrance pupil first.
     normalize : str
         Only "first".
     only_last : bool
@@ -57,8 +57,8 @@ def intermediate_wavefronts(
                 summed.append(wave)
             elif summed[k].shape == wave.shape:
                 summed[k].wavefront = summed[k].wavefront + wave.wavefront
-            # Otherwise the samples of an image plane, which scale with the wavelength, differ
-            # in number; those of the first wavelength are kept.
+            # Otherwise an image plane, sampled in proportion to the wavelength, has another number
+            # of samples; that of the first wavelength is kept.
     return summed
 
 
@@ -67,36 +67,36 @@ def _wavefronts(
 ) -> list[poppy.Wavefront]:
     values = system.values({})
     full = system.entrance.full
-    found = []
+    waves = []
     with torch.no_grad():
         wavefront = system.pupil_field(system.opd(None), wavelength, values)
-        onto = system.windows(values)
+        windows = system.windows(values)
         planes: list[Any] = [system.entrance, *system.planes]
         for k, plane in enumerate(planes):
-            back = orientations[k].inverse
+            to_poppy = orientations[k].inverse
             if isinstance(plane, SampledOcculter | FourierMask):
                 field, spacing = plane.focal_sample(wavefront)
                 wave = _wave_of(field, wavelength, full.diameter, spacing / ARCSEC)
                 if isinstance(plane, FourierMask):
-                    field = back.apply_to_lattice(field)
+                    field = to_poppy.apply_to_lattice(field)
                 else:
-                    # On the image the inversion of y is undone, see `propagation`.
-                    field = Orientation.inversion("y").then(back).apply(field)
+                    # On the image the inversion of y is undone.
+                    field = Orientation.inversion("y").then(to_poppy).apply(field)
                 wave.wavefront = _numpy(field)
             if k > 0:
-                wavefront = system.planes[k - 1].apply(wavefront, values, onto[k - 1])
+                wavefront = system.planes[k - 1].apply(wavefront, values, windows[k - 1])
             if not isinstance(plane, SampledOcculter | FourierMask):
-                whole = back.apply(wavefront.grid.crop(wavefront.field, full)) * full.spacing
-                wave = _wave_of(whole, wavelength, full.diameter, None)
+                pupil = to_poppy.apply(wavefront.grid.crop(wavefront.field, full)) * full.spacing
+                wave = _wave_of(pupil, wavelength, full.diameter, None)
             wave.location = f"after {plane.name}"
-            found.append(wave)
+            waves.append(wave)
         detector = system.detector
         final = detector.field(wavefront, values)
     scale = detector.pixelscale[0] / detector.oversample
     last = _wave_of(final, wavelength, full.diameter, scale)
     last.oversample = detector.oversample
     last.location = f"at {detector.name}"
-    return [last] if only_last else [*found, last]
+    return [last] if only_last else [*waves, last]
 
 
 def _numpy(field: Tensor) -> Array:

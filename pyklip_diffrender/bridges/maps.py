@@ -1,4 +1,4 @@
-"""Wavefront maps on their way in and out: plausibility checks, and HDULists for poppy and stpsf."""
+"""Plausibility checks of wavefront maps, and their export as HDULists for poppy and stpsf."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["check_opd", "opd_to_hdus"]
 Array = NDArray[np.float64]
 
 LARGEST_RMS = 2e-5
-"""m; a telescope whose wavefront is worse than this makes no image in the infrared."""
+"""m; with a worse wavefront a telescope makes no image in the infrared."""
 
 _TURNS: dict[str, Any] = {
     "as it is": lambda a: a,
@@ -30,7 +30,7 @@ _TURNS: dict[str, Any] = {
 
 
 def check_opd(opd: Array, amplitude: Array, name: str) -> None:
-    """Check the size of a map's values, and where its blank samples are.
+    """Check the size of a map's values and the position of its blank samples.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def check_opd(opd: Array, amplitude: Array, name: str) -> None:
     amplitude : ndarray, (npix, npix)
         Transmission of the pupil in the orientation that the map should have.
     name : str
-        What the map is, for the message.
+        Name of the map, for messages.
 
     Raises
     ------
@@ -62,10 +62,10 @@ def check_opd(opd: Array, amplitude: Array, name: str) -> None:
             "be in metres; those of the wavefront-sensing software are in microns. Give it as a "
             "Quantity, or set BUNIT in the file"
         )
-    drawn = (opd != 0) & np.isfinite(opd)
-    if drawn.all() or not drawn.any():
+    filled = (opd != 0) & np.isfinite(opd)
+    if filled.all() or not filled.any():
         return
-    mismatch = {turn: float(np.mean(act(drawn) != inside)) for turn, act in _TURNS.items()}
+    mismatch = {turn: float(np.mean(act(filled) != inside)) for turn, act in _TURNS.items()}
     best = min(mismatch, key=lambda turn: mismatch[turn])
     if mismatch[best] < 0.5 * mismatch["as it is"]:
         warnings.warn(
@@ -78,12 +78,12 @@ def check_opd(opd: Array, amplitude: Array, name: str) -> None:
 
 
 def opd_to_hdus(opd: Any, diameter: float = JWST_DIAMETER) -> fits.HDUList:
-    """An OPD in the form that poppy's and stpsf's readers take, for ``nircam.pupilopd`` or a file.
+    """An OPD as an HDUList that poppy and stpsf read, for ``nircam.pupilopd`` or a file.
 
     Parameters
     ----------
     opd : OPDMap, Tensor, Quantity or array, (npix, npix)
-        Bare numbers are metres. The origin of an `OPDMap` goes into the header.
+        Bare numbers are metres. The header records the origin of an `OPDMap`.
     diameter : float
         Side of the array, m.
 

@@ -1,10 +1,10 @@
-"""`from_poppy`: a differentiable system from a user's poppy `OpticalSystem`, and the way back."""
+"""`from_poppy`: make a differentiable system of a poppy `OpticalSystem`, and export wavefronts."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import poppy
@@ -14,33 +14,32 @@ from poppy.poppy_core import PlaneType
 from poppy.sub_sampled_optics import Subapertures
 from torch import Tensor
 
-from pyklip_diffrender.bridges.convert import Converted, Converter
+from pyklip_diffrender.bridges.convert import Conversion
 from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.grid import resample
-from pyklip_diffrender.optics.orientation import Orientation
 from pyklip_diffrender.optics.psf_file import poppy_psf
 from pyklip_diffrender.optics.sampled_planes import PupilOptic
 from pyklip_diffrender.optics.system import OpticalSystem
 
-__all__ = ["PoppySystem", "check_supported", "from_poppy", "opd_to_poppy"]
+__all__ = ["PoppySystem", "check_supported", "from_poppy", "opd_to_poppy", "refuse_saving"]
 
 _POPPY_OPTIONS = ("display_intermediates", "progressbar")
 
 _COPIES = 4
-"""Systems with other settings that are kept: a fit asks for the same ones again and again."""
+"""How many copies with other settings are cached; a fit asks for the same ones repeatedly."""
 
 _SUPPORTED = (
-    "pupil and image planes of any optic that gives a transmission and an OPD, coordinate "
+    "pupil and image planes of any optic with a transmission and an OPD, coordinate "
     "inversions and rotations in pupils, and a Detector at the end"
 )
 
 
 class PoppySystem(OpticalSystem):
-    """What `from_poppy` makes: an `OpticalSystem` that keeps poppy's names and interface.
+    """An `OpticalSystem` made from poppy's, with its plane names and interface.
 
     Attributes
     ----------
@@ -50,45 +49,38 @@ class PoppySystem(OpticalSystem):
         For every plane of poppy's, from its frame to the frame of this system's pupils.
     """
 
-    propagation: dict[str, str]
-    frames: list[Orientation]
     _sources: ClassVar[tuple[str, ...]] = ("osys", "trainable")
-    """Arguments that make it another system, not the same one with other settings."""
+    """Arguments that define the system, as opposed to settings of it."""
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {
         **OpticalSystem._replaced,
         "wavelength": ("weights",),
     }
-    _fixed: frozenset[str]
-    _copies: dict[frozenset[tuple[str, Any]] | None, OpticalSystem]
 
-    @classmethod
-    def of(
-        cls,
-        converted: Converted,
+    def __init__(
+        self,
+        conversion: Conversion,
         recipe: dict[str, Any],
         remake: Callable[..., OpticalSystem],
         detector: Detector | None = None,
-    ) -> Self:
-        """Put converted planes together."""
-        system = cls(
-            converted.entrance,
-            converted.planes,
-            detector or converted.detector,
-            converted.bandpass,
-            recipe={**recipe, "occulter_sampling": converted.sampling},
+    ) -> None:
+        super().__init__(
+            conversion.entrance,
+            conversion.planes,
+            detector or conversion.detector,
+            conversion.bandpass,
+            recipe={**recipe, "occulter_sampling": conversion.sampling},
             remake=remake,
         )
-        system.propagation, system.frames = converted.propagation, converted.frames
-        system._fixed = converted.fixed
-        system._copies = {}
-        return system
+        self.propagation, self.frames = conversion.propagation, conversion.frames
+        self._fixed = conversion.fixed
+        self._copies: dict[frozenset[tuple[str, Any]] | None, OpticalSystem] = {}
 
     @property
     def adjustable(self) -> frozenset[str]:
         """See `OpticalSystem.adjustable`.
 
-        "npix" is not among them if planes are trainable, nor "occulter_sampling" if a mask
-        depends on poppy's own sampling of the image (four-quadrant masks).
+        Without "npix" if planes are trainable, and without "occulter_sampling" if a mask depends
+        on poppy's own sampling of the image (four-quadrant masks).
         """
         return frozenset({*self.recipe, "bandpass"} - {*self._sources, *self._fixed})
 
@@ -97,30 +89,33 @@ class PoppySystem(OpticalSystem):
         return {"wavelength": list(bandpass.wavelengths), "weights": list(bandpass.weights)}
 
     def at_wavelengths(self, bandpass: Bandpass) -> OpticalSystem:
-        """See `OpticalSystem.at_wavelengths`; optics are evaluated anew where they have to be."""
+        """See `OpticalSystem.at_wavelengths`; optics are evaluated at new wavelengths."""
         if set(bandpass.wavelengths) <= set(self.bandpass.wavelengths):
             return super().at_wavelengths(bandpass)
         return self._remade(self._band(bandpass))
 
     def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
-        # By name and value; arrays and other things that cannot be looked up are not kept.
-        key = frozenset(changes.items()) if _hashable(changes) else None
+        key: frozenset[tuple[str, Any]] | None
+        try:
+            key = frozenset(changes.items())
+        except TypeError:
+            key = None  # Arrays, for example, cannot be looked up.
         if key in self._copies:
             return self._copies[key]
-        made = super()._remade(changes)
-        assert isinstance(made, PoppySystem)
+        system = super()._remade(changes)
+        assert isinstance(system, PoppySystem)
         for name, (opd, transmission) in self.trainable.items():
-            # The same tensors: what has been trained, and what will be, holds for both.
-            plane = made.plane(name)
+            # Share the tensors, so that training one system trains the other.
+            plane = system.plane(name)
             plane.opd, plane.transmission = opd, transmission
         if key is not None:
             while len(self._copies) >= _COPIES:
                 del self._copies[next(iter(self._copies))]
-            self._copies[key] = made
-        return made
+            self._copies[key] = system
+        return system
 
     def plane(self, name: str) -> Any:
-        """The plane of this name.
+        """The plane with this name.
 
         Raises
         ------
@@ -187,11 +182,7 @@ class PoppySystem(OpticalSystem):
         -------
         HDUList, or (HDUList, list of Wavefront)
         """
-        if save_intermediates:
-            raise IncompatibleSetupError(
-                "save_intermediates: this system writes no files on its own; pass "
-                "return_intermediates=True and call .writeto() on the wavefronts"
-            )
+        refuse_saving(save_intermediates)
         if source is not None:
             wavelength, weight = source["wavelengths"], source["weights"]
         system: Any = self
@@ -206,12 +197,13 @@ class PoppySystem(OpticalSystem):
         )
 
 
-def _hashable(changes: Mapping[str, Any]) -> bool:
-    try:
-        hash(frozenset(changes.items()))
-    except TypeError:
-        return False
-    return True
+def refuse_saving(save_intermediates: bool) -> None:
+    """Raise for poppy's option to write every intermediate plane to a file."""
+    if save_intermediates:
+        raise IncompatibleSetupError(
+            "save_intermediates: this system writes no files on its own; pass "
+            "return_intermediates=True and call .writeto() on the wavefronts"
+        )
 
 
 def from_poppy(
@@ -269,8 +261,7 @@ def from_poppy(
     Raises
     ------
     IncompatibleSetupError
-        For a plane that is not supported (the message names it, and what is), or a setting that
-        does not fit.
+        For a plane that is not supported, or a setting that does not fit.
     """
     recipe = {k: v for k, v in locals().items() if k != "osys"}
     check_supported(osys)
@@ -278,8 +269,8 @@ def from_poppy(
 
 
 def _from_private(**recipe: Any) -> PoppySystem:
-    """As `from_poppy`, with a system that nobody else changes."""
-    return PoppySystem.of(Converter(recipe["osys"], recipe).convert(), recipe, _from_private)
+    """As `from_poppy`, for a system that is not shared with the caller."""
+    return PoppySystem(Conversion(recipe["osys"], recipe), recipe, _from_private)
 
 
 def opd_to_poppy(opd: Any, osys: poppy.OpticalSystem) -> poppy.OpticalSystem:
@@ -288,8 +279,8 @@ def opd_to_poppy(opd: Any, osys: poppy.OpticalSystem) -> poppy.OpticalSystem:
     Parameters
     ----------
     opd : Tensor, Quantity or array, (n, n)
-        m, frame of the first plane: for instance a refined wavefront. It is resampled to the
-        pixels of the first plane.
+        m, frame of the first plane; for example a refined wavefront. It is resampled to the pixels
+        of that plane.
     osys : poppy.OpticalSystem
         Not changed.
 
@@ -314,10 +305,7 @@ def opd_to_poppy(opd: Any, osys: poppy.OpticalSystem) -> poppy.OpticalSystem:
 
 
 def check_supported(osys: Any) -> None:
-    """Raise `IncompatibleSetupError` for a poppy system that cannot be converted.
-
-    The message names the first plane that is not supported, and what is.
-    """
+    """Raise `IncompatibleSetupError` for a poppy system that cannot be converted."""
     if isinstance(osys, poppy.FresnelOpticalSystem):
         raise IncompatibleSetupError(
             f"{osys.name}: Fresnel propagation is not supported. Supported are Fraunhofer "

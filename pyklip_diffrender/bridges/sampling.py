@@ -1,4 +1,4 @@
-"""Asking poppy's optics for their values where we want them."""
+"""Evaluate poppy's optics at chosen positions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ COMPACT_OPTICS = (
 
 
 class ImageSamples(poppy.Wavefront):
-    """A wavefront without a field, at image positions of our choice, to evaluate optics on.
+    """A wavefront without a field, at given image positions, on which optics are evaluated.
 
     Parameters
     ----------
@@ -51,14 +51,14 @@ class ImageSamples(poppy.Wavefront):
             oversample=oversample,
             pixelscale=spacing * u.arcsec / u.pix,
         )
-        # Only its shape is looked at, so it takes no memory.
+        # Only its shape is used, so it needs no memory.
         self.wavefront = np.broadcast_to(np.complex128(1), tuple(x.shape))
         self.planetype = PlaneType.image
         self._last_transform_type = "FFT"
         self._positions = (y, x)
 
     def coordinates(self) -> tuple[Array, Array]:
-        """Fresh arrays of y and x, which optics shift and turn in place."""
+        """Copies of y and x, because optics shift and rotate them in place."""
         return self._positions[0].numpy().copy(), self._positions[1].numpy().copy()
 
 
@@ -76,7 +76,7 @@ class MaskStack:
 
     @classmethod
     def of(cls, optics: list[Any]) -> Any:
-        """The one mask that there is, or a stack of those that do something."""
+        """A stack, or the mask itself if there is only one."""
         return optics[0] if len(optics) == 1 else cls(optics)
 
     def get_phasor(self, wave: poppy.Wavefront) -> Array:
@@ -90,8 +90,8 @@ class MaskStack:
 def pupil_phasor(optic: Any, wave: poppy.Wavefront) -> tuple[Array, Array]:
     """Complex transmission and OPD (m) of a pupil optic, arrays of the wave's shape or scalars.
 
-    Some optics tilt the wave that they are asked about, rather than return an OPD; that is part
-    of the transmission.
+    Some optics tilt the given wave instead of returning an OPD; the tilt then is part of the
+    transmission.
     """
     phasor = np.asarray(optic.get_phasor(wave), dtype=np.complex128)
     changed = np.asarray(wave.wavefront)
@@ -101,19 +101,19 @@ def pupil_phasor(optic: Any, wave: poppy.Wavefront) -> tuple[Array, Array]:
     if opd.size == 1:
         opd = opd.reshape(())
     elif opd.shape != phasor.shape:
-        # poppy resampled the optic to the wave; its phase is all there is.
+        # poppy resampled the optic to the wave, so only its phase is known.
         opd = np.angle(phasor) * wave.wavelength.to_value(u.m) / (2 * np.pi)
     return (phasor.reshape(()) if phasor.size == 1 else phasor), opd
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of what a mask blocks: an optic inside a box, or a product along the axes.
+    """A part of a mask's complement: an optic inside a box, or a product along the axes.
 
     Attributes
     ----------
     box : Box or None
-        Where `optic` is not clear, in arcsec, frame of the plane.
+        Extent of the part of `optic` that is not clear, arcsec, frame of the plane.
     optic : object
         Evaluated inside the box.
     along_x, along_y : callable or None
@@ -136,12 +136,12 @@ def complement_box(optic: Any, margin: float) -> list[Part] | None:
         arcsec to add for anti-aliased edges.
     """
     if isinstance(optic, MaskStack):
-        boxes = [complement_box(part, margin) for part in optic.optics]
-        whole = [found[0].box for found in boxes if found is not None and len(found) == 1]
-        edges = [box for box in whole if box is not None]
-        if len(edges) < len(boxes):
+        parts = [complement_box(mask, margin) for mask in optic.optics]
+        boxes = [part[0].box for part in parts if part is not None and len(part) == 1]
+        bounded = [box for box in boxes if box is not None]
+        if len(bounded) < len(parts):
             return None
-        left, right, bottom, top = zip(*edges, strict=True)
+        left, right, bottom, top = zip(*bounded, strict=True)
         return [Part((min(left), max(right), min(bottom), max(top)), optic)]
     if getattr(optic, "rotation", 0) or any(hasattr(optic, f"inclination_{axis}") for axis in "xy"):
         return None
@@ -190,10 +190,10 @@ def _between(low: float, high: float, offset: float) -> Callable[[Tensor], Tenso
 
 
 def _nircam_parts(optic: Any) -> list[Part]:
-    """NIRCam's occulters: the mask itself, then what stpsf puts around it.
+    """NIRCam's occulters: the mask itself, then what stpsf draws around it.
 
-    Squares, holder and glass edge are cut along the axes without anti-aliasing, and none overlaps
-    another: their complements add up.
+    Squares, holder and glass edge have sharp edges along the axes and do not overlap, so their
+    complements add up.
     """
     bare = copy.copy(optic)
     bare.nd_squares = False
@@ -237,7 +237,7 @@ def _surroundings(
     density = 1 - float(np.sqrt(1e-3))
 
     def held(x: Tensor) -> Tensor:
-        """Where the side of the holder is, along x."""
+        """1 along x where the side of the holder is."""
         if edge is None:
             return torch.zeros_like(x)
         return (((x - x0) - edge[0]) * edge[1] > 0).double()
@@ -264,5 +264,5 @@ def _surroundings(
 
 
 def _side(y: Tensor) -> Tensor:
-    """Rows that the side of the holder covers and nothing else does."""
+    """Rows that only the side of the holder covers."""
     return ((y > -11.5) & ~(y > 10)).double()

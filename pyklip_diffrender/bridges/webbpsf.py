@@ -1,4 +1,4 @@
-"""`from_webbpsf`: NIRCam's coronagraphs from a user's stpsf (webbpsf) object, and the way back."""
+"""`from_webbpsf`: make a system of an stpsf (webbpsf) NIRCam object, and export wavefronts."""
 
 from __future__ import annotations
 
@@ -10,23 +10,21 @@ import numpy as np
 import torch
 from astropy.io import fits
 
-from pyklip_diffrender.bridges.convert import Converter
+from pyklip_diffrender.bridges.convert import Conversion
 from pyklip_diffrender.bridges.instrument import (
     band,
     data_errors,
     kernel_files_left_open,
     oversampling,
     private_copy,
-    stpsf_effects,
+    with_effects,
 )
 from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
 from pyklip_diffrender.bridges.maps import check_opd, opd_to_hdus
-from pyklip_diffrender.bridges.poppy import PoppySystem, check_supported
+from pyklip_diffrender.bridges.poppy import PoppySystem, check_supported, refuse_saving
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
-from pyklip_diffrender.optics.detector import Detector
-from pyklip_diffrender.optics.detector_effects import ChainDetector
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.psf_file import poppy_psf, save
 from pyklip_diffrender.optics.sampled_planes import AberrationOptic
@@ -36,12 +34,12 @@ __all__ = ["WebbSystem", "from_webbpsf", "opd_to_webbpsf"]
 
 
 class WebbSystem(PoppySystem):
-    """What `from_webbpsf` makes.
+    """A `PoppySystem` made from an stpsf instrument by `from_webbpsf`.
 
     Attributes
     ----------
     instrument : stpsf.NIRCam
-        The model's own copy, as it was when it was converted.
+        The model's own copy, as of its conversion.
     si_wfe_flipped : bool or None
         Whether the map of the instrument's internal wavefront error is flipped vertically, as
         stpsf does from 2.2.0 on; None without one.
@@ -73,7 +71,7 @@ class WebbSystem(PoppySystem):
         if {"fft_oversample", "detector_oversample"} <= changes.keys():
             changes = {"oversample": None, **changes}
         if changes.keys().isdisjoint(("bandpass", "monochromatic", "nlambda", "source")):
-            # stpsf need not work out the wavelengths once more.
+            # So that stpsf does not compute the wavelengths again.
             changes = {"bandpass": self.bandpass, **changes}
         return super()._remade(changes)
 
@@ -115,12 +113,8 @@ class WebbSystem(PoppySystem):
         HDUList, or (HDUList, list of poppy.Wavefront)
             OVERSAMP, DET_SAMP, OVERDIST and DET_DIST, the last two with `add_distortion`.
         """
-        if save_intermediates:
-            raise IncompatibleSetupError(
-                "save_intermediates: this system writes no files on its own; pass "
-                "return_intermediates=True and call .writeto() on the wavefronts"
-            )
-        changes = {
+        refuse_saving(save_intermediates)
+        arguments = {
             "source": source,
             "nlambda": nlambda,
             "monochromatic": monochromatic,
@@ -130,7 +124,7 @@ class WebbSystem(PoppySystem):
             "detector_oversample": detector_oversample,
             "fft_oversample": fft_oversample,
         }
-        changes = {name: value for name, value in changes.items() if value is not None}
+        changes = {name: value for name, value in arguments.items() if value is not None}
         system: Any = self.with_fidelity(**changes)
         result = poppy_psf(system, normalize, opd, **parameters)
         instrument = system.instrument
@@ -190,17 +184,17 @@ def from_webbpsf(
     Parameters
     ----------
     nircam : stpsf.NIRCam
-        It is not changed, and later changes to it do not reach the model.
+        Not changed; later changes to it do not affect the model.
     fov_pixels, fov_arcsec, oversample, detector_oversample, fft_oversample, monochromatic,
     nlambda, source
         As in stpsf's `calc_psf`, with its defaults.
     bandpass : Bandpass, optional
         Wavelengths and weights, in place of `monochromatic`, `nlambda` and `source`.
     add_distortion : bool
-        Include what stpsf adds up to DET_DIST: rotation, distortion, charge diffusion, IPC, PPC.
+        Include the effects in stpsf's DET_DIST: rotation, distortion, charge diffusion, IPC, PPC.
     flip_si_wfe : bool, optional
-        Whether to flip the coronagraph's internal wavefront error vertically; default as the
-        installed stpsf does (stpsf flips it from 2.2.0 on). ``model.si_wfe_flipped`` says which.
+        Whether to flip the coronagraph's internal wavefront error vertically; default as in the
+        installed stpsf, which flips it from 2.2.0 on. See ``model.si_wfe_flipped``.
     propagation, occulter_sampling, npix, trainable, dtype, device
         See `from_poppy`; the default sampling is `fft_oversample`, the default `npix` that of
         ``nircam.pupil``.
@@ -214,7 +208,7 @@ def from_webbpsf(
     IncompatibleSetupError
         For another instrument, a mask that is not supported, or a wavelength outside the channel.
     CorruptFileError
-        If stpsf misses a file of its data directory.
+        If a file of stpsf's data is missing.
     """
     recipe = {k: v for k, v in locals().items() if k != "recipe"}
     if getattr(nircam, "name", None) != "NIRCam" or not hasattr(nircam, "get_optical_system"):
@@ -236,20 +230,20 @@ def from_webbpsf(
         )
     check_supported(osys)
     first = osys.planes[0]
-    # As it was given: the field dependence has values beside the pupil, too.
-    given = getattr(first, "_opd_original", first.opd)
-    check_opd(np.asarray(given), np.asarray(first.amplitude), "pupilopd")
+    # Before stpsf adds the field dependence, which is not blank outside the pupil.
+    original = getattr(first, "_opd_original", first.opd)
+    check_opd(np.asarray(original), np.asarray(first.amplitude), "pupilopd")
     aberrations = _aberrations(osys)
     flipped = None if aberrations is None else _set_flip(aberrations, flip_si_wfe)
-    converter = Converter(
+    conversion = Conversion(
         osys,
-        # The detector has the field of view already.
+        # The field of view is already that of the detector.
         {**recipe, "wavelength": wavelengths, "weights": weights, "fov_pixels": None},
         {} if aberrations is None else {aberrations.name: AberrationOptic},
     )
-    converted = converter.convert()
-    detector = _with_effects(converted.detector, instrument, sampling, add_distortion)
-    system = WebbSystem.of(converted, recipe, from_webbpsf, detector)
+    with data_errors():
+        detector = with_effects(conversion.detector, instrument, sampling, add_distortion)
+    system = WebbSystem(conversion, recipe, from_webbpsf, detector)
     system.instrument, system.si_wfe_flipped = instrument, flipped
     return system
 
@@ -263,37 +257,13 @@ def _aberrations(osys: Any) -> Any:
 
 
 def _set_flip(plane: Any, wanted: bool | None) -> bool:
-    """Flip the map of internal aberrations if wanted; return whether it is flipped."""
+    """Flip the map of internal aberrations if wanted; return whether it is now flipped."""
     flipped = bool(getattr(plane, "_is_OPD_flipped_for_NRC_coron", False))
     if wanted is None or wanted == flipped:
         return flipped
     # The map alone: focus and tilt, which depend on the wavelength, are added to it later.
     plane.opd = plane.opd[::-1].copy()
     return wanted
-
-
-def _with_effects(
-    detector: Detector, instrument: Any, sampling: int, distortion: bool
-) -> ChainDetector:
-    with data_errors():
-        on_samples, on_pixels = stpsf_effects(
-            instrument,
-            shape=detector.shape,
-            oversample=detector.oversample,
-            fft_oversample=sampling,
-            pixelscale=detector.pixelscale[0],
-            distortion=distortion,
-        )
-    return ChainDetector(
-        shape=detector.shape,
-        pixelscale=detector.pixelscale,
-        oversample=detector.oversample,
-        dtype=detector.dtype,
-        device=detector.device,
-        name=detector.name,
-        on_samples=on_samples,
-        on_pixels=on_pixels,
-    )
 
 
 def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:
@@ -305,7 +275,7 @@ def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:
     Parameters
     ----------
     opd : Tensor, Quantity or array, (n, n)
-        m, entrance-pupil orientation: for instance a refined wavefront. It is resampled to the
+        m, entrance-pupil orientation; for example a refined wavefront. It is resampled to the
         pixels of ``nircam.pupil``.
     nircam : stpsf.NIRCam
         Not changed. Set its ``pupilopd`` to the result.
@@ -317,9 +287,9 @@ def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:
     Raises
     ------
     UnitError, NonFiniteError, ShapeError
-        If the map cannot be right.
+        For a map that cannot be a wavefront in metres.
     CorruptFileError
-        If stpsf misses a file of its data directory.
+        If a file of stpsf's data is missing.
     """
     instrument = private_copy(nircam)
     with data_errors():

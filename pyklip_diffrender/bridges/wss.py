@@ -1,8 +1,8 @@
-"""Maps of JWST's wavefront-sensing software (WSS) as MAST archives them.
+"""Maps of JWST's wavefront-sensing software (WSS) as archived by MAST.
 
 The steps are those of stpsf's `load_wss_opd`: fill the gaps, interpolate, convert microns, mask,
-and subtract what is not the telescope's common wavefront: the internal aberration of the sensing
-camera and the telescope's field dependence, both at the sensing field point.
+and subtract the internal aberration of the sensing camera and the telescope's field dependence,
+both at the sensing field point.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
+from pyklip_diffrender.io.headers import card_error
 from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.units import native_float64, require_shape
 
@@ -42,7 +43,7 @@ Array = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
 EXTENSION = "RESULT_PHASE"
-"""Name of the extension that holds the map; no other kind of file has one."""
+"""Name of the extension that holds the map; only these files have one."""
 
 _TARGET_PHASES = {
     "NRCA3_FP1": "wss_target_phase_fp1.fits",
@@ -64,24 +65,24 @@ def load_wss_opd(
     path : path
         File as MAST has it, such as ``R2022081102-NRCA3_FP1-1.fits``.
     npix : int, optional
-        Samples across the map. To subtract the sensing terms, stpsf's data must hold a pupil with
-        as many. Default 1024, or as many as the finest pupil in stpsf's data has.
+        Samples across the map. To subtract the sensing terms, stpsf's data must include a pupil
+        with as many. Default that of the finest pupil in stpsf's data, else 1024.
     backout_si_wfe : bool, optional
         Subtract the sensing camera's aberration and the telescope's field dependence at the
         sensing field point, with stpsf's models. False keeps the measured sum. By default they
-        are subtracted where stpsf and its data are installed (``STPSF_PATH``); otherwise the sum
-        is kept, with a warning.
+        are subtracted if stpsf and its data are installed (``STPSF_PATH``); otherwise the sum is
+        kept, with a warning.
 
     Returns
     -------
     OPDMap
-        The telescope's wavefront common to the field; stpsf adds the field dependence at the
-        position of an instrument when it is used there. 0 outside the pupil.
+        The telescope's wavefront without its field dependence, which stpsf adds for the position
+        of each instrument. 0 outside the pupil.
 
     Raises
     ------
     CorruptFileError
-        If it is not such a file, or stpsf's data are incomplete.
+        If it is not a wavefront-sensing file, or stpsf's data are incomplete.
     IncompatibleSetupError
         If its unit is not a length, or stpsf is needed and not installed.
     UnitError, NonFiniteError
@@ -124,7 +125,7 @@ def load_wss_opd(
         f"{path.name} sha256 {sha256(path)}",
         f"gaps filled, interpolated from {len(coarse)} to {npix} samples, {unit} to m, masked",
     ]
-    check_opd(np.where(_drawn(coarse, npix), opd, 0), pupil, str(path))
+    check_opd(np.where(_has_values(coarse, npix), opd, 0), pupil, str(path))
     opd = opd * pupil
     if backout_si_wfe is not False:
         try:
@@ -167,11 +168,11 @@ def load_wss_opd_by_date(
     ----------
     date : str (ISO, UTC) or Time
     choice : "closest", "before", "after" or "interpolate"
-        Which measurement; the last interpolates linearly between the two around the date.
+        Measurement to take; the last interpolates linearly between the two around the date.
     npix, backout_si_wfe
         See `load_wss_opd`.
     folder : path, optional
-        Where downloads are kept; default stpsf's own cache.
+        Folder for downloads; default stpsf's own cache.
 
     Returns
     -------
@@ -197,7 +198,7 @@ def load_wss_opd_by_date(
             mast_wss.get_opd_at_time(when, choice=which, output_path=cache) for which in choices
         ]
     except (OSError, RuntimeError, ValueError, LookupError, TypeError) as error:
-        # No network, a proxy's answer in place of the service's, no map within a week.
+        # No network, an answer from a proxy instead of the service, or no map within a week.
         raise MissingOPDError(
             f"no wavefront map for {when.isot} from MAST ({type(error).__name__}: {error}). "
             "Where the network does not allow it, download the file elsewhere "
@@ -218,7 +219,7 @@ def interpolate_wss(before: OPDMap, after: OPDMap, date: str | Time) -> OPDMap:
     Warns
     -----
     DiffrenderWarning
-        Always: segments move in steps, and nobody measured this wavefront.
+        Always: this wavefront was not measured, and segments move in steps.
     """
     when = Time(date)
     if before.date is None or after.date is None:
@@ -232,7 +233,7 @@ def interpolate_wss(before: OPDMap, after: OPDMap, date: str | Time) -> OPDMap:
     share = float((when - before.date).jd / (after.date - before.date).jd)
     warnings.warn(
         f"the wavefront of {when.isot} is an interpolation, {1 - share:.0%} of {before.name} and "
-        f"{share:.0%} of {after.name}: not a measurement, and blind to steps in between",
+        f"{share:.0%} of {after.name}: not a measurement, and without steps in between",
         DiffrenderWarning,
         stacklevel=2,
     )
@@ -264,19 +265,18 @@ def _gaps_filled(opd: Array) -> Array:
 
 
 def _interpolated(opd: Array, npix: int) -> Array:
-    """Interpolate to `npix` samples by a cubic spline, placed as stpsf places them.
+    """Interpolate to `npix` samples by a cubic spline, with the shift that stpsf has.
 
-    Output sample i is taken at ``i dim / npix`` on the input's index, not at the same place in the
-    pupil: the map moves by (1 - dim / npix) / 2 input samples. stpsf's maps have that shift, and
-    maps that are compared with them need it.
+    Output sample i is at ``i dim / npix`` of the input's index and not at the same position in the
+    pupil: the map moves by (1 - dim / npix) / 2 input samples, as in stpsf, for maps to agree.
     """
     index = np.arange(len(opd), dtype=float)
-    wanted = np.arange(npix) * (len(opd) / npix)
-    return native_float64(RectBivariateSpline(index, index, opd)(wanted, wanted))
+    fine = np.arange(npix) * (len(opd) / npix)
+    return native_float64(RectBivariateSpline(index, index, opd)(fine, fine))
 
 
-def _drawn(coarse: Array, npix: int) -> NDArray[np.bool_]:
-    """Where the map has values, on the samples of the output."""
+def _has_values(coarse: Array, npix: int) -> NDArray[np.bool_]:
+    """Samples of the output at which the map has values."""
     index = (np.arange(npix) * len(coarse)) // npix
     return (coarse != 0)[np.ix_(index, index)]
 
@@ -303,12 +303,12 @@ def _finest_pupil() -> int:
     """Samples across the finest pupil in stpsf's data; 1024 without such data."""
     folder = _data_folder()
     names = [] if folder is None else [path.name for path in folder.glob("jwst_pupil_RevW_npix*")]
-    found = [re.search(r"npix(\d+)\.fits", name) for name in names]
-    return max((int(each[1]) for each in found if each), default=1024)
+    matches = [re.search(r"npix(\d+)\.fits", name) for name in names]
+    return max((int(match[1]) for match in matches if match), default=1024)
 
 
 def _pupil(npix: int, required: bool) -> Array:
-    """1 inside the pupil: stpsf's where its data are, otherwise the embedded outlines."""
+    """1 inside the pupil: that of stpsf's data if available, otherwise of the embedded outlines."""
     folder = _data_folder()
     for ending in ("fits.gz", "fits"):
         path = None if folder is None else folder / f"jwst_pupil_RevW_npix{npix}.{ending}"
@@ -324,7 +324,7 @@ def _pupil(npix: int, required: bool) -> Array:
 
 
 def _sensing_terms(aperture: str, opd: Array, npix: int, name: str) -> tuple[Array, str]:
-    """The sensing camera's aberration and the telescope's field dependence, m, and its source."""
+    """Sum of the camera's aberration and the telescope's field dependence (m), and its source."""
     if not aperture:
         raise CorruptFileError(
             f"{name}: no APERNAME in the primary header, so the sensing camera is not known. Pass "
@@ -362,18 +362,17 @@ def _sensing_terms(aperture: str, opd: Array, npix: int, name: str) -> tuple[Arr
 
 
 def _date(header: fits.Header, name: str) -> Time | None:
-    """When the wavefront was measured: from the header, or to the day from the file's name."""
+    """Date of the measurement, from the header or (to the day) from the file's name."""
     if "DATE-OBS" in header:
         date = f"{header['DATE-OBS']}T{header.get('TIME-OBS', '00:00:00')}"
         try:
             return Time(date, scale="utc")
         except ValueError as error:
-            raise CorruptFileError(
-                f"{name}: DATE-OBS and TIME-OBS are {date!r}, expected such as "
-                "'2022-08-11T01:02:03'. Correct the header, or fetch the file again"
+            raise card_error(
+                name, "DATE-OBS with TIME-OBS", date, "a date such as '2022-08-11T01:02:03'"
             ) from error
-    found = re.match(r"[A-Z](\d{4})(\d{2})(\d{2})\d{2}-", name)
-    if found is None:
+    match = re.match(r"[A-Z](\d{4})(\d{2})(\d{2})\d{2}-", name)
+    if match is None:
         _LOG.warning("%s: no DATE-OBS, and no date in its name", name)
         return None
-    return Time("-".join(found.groups()), scale="utc")
+    return Time("-".join(match.groups()), scale="utc")

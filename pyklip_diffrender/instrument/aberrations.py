@@ -1,7 +1,7 @@
-"""NIRCam's internal wavefront error behind the Lyot stop, and how it depends on wavelength.
+"""NIRCam's internal wavefront error behind the Lyot stop, and its dependence on wavelength.
 
-Tables are in the orientation of the exit pupil, y inverted with respect to the entrance pupil. What
-this module returns has the orientation of the entrance pupil.
+Tables are in the orientation of the exit pupil, in which y is inverted. Functions return the
+orientation of the entrance pupil.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _TABULATED_AT = (2.12, 3.23)
 
 
 class ChromaticAberration:
-    """Focus and wedge tilt that come on top of the tabulated wavefront error.
+    """Focus and wedge tilt in addition to the tabulated wavefront error.
 
     In the exit pupil the additional OPD is ``-(focus(lambda) - focus(tabulated)) Z4 +
     (tilt(lambda) - tilt(reference)) Z3``; y is inverted in the entrance pupil, which changes the
@@ -48,7 +48,7 @@ class ChromaticAberration:
     reference : float
         Wavelength at which the tilt is zero, m.
     short_wave : bool
-        Of the short-wave channel.
+        Whether the mask is in the short-wave channel.
     """
 
     def __init__(self, reference: float, short_wave: bool = False) -> None:
@@ -72,9 +72,8 @@ def internal_wavefront_error(mask: str = "MASK335R", flip: bool = True) -> Tenso
     mask : str
         A name of `ROUND_MASKS`.
     flip : bool
-        stpsf from 2.2.0 on flips the coronagraphic map vertically before it uses it, because that
-        matches images in flight better; True does the same. False takes the table's orientation,
-        the exit pupil's, at its word, as stpsf did before.
+        Flip the map vertically, as stpsf does from 2.2.0 on, because that matches images in flight
+        better. False uses the tabulated orientation, that of the exit pupil, as stpsf did before.
 
     Returns
     -------
@@ -87,12 +86,12 @@ def internal_wavefront_error(mask: str = "MASK335R", flip: bool = True) -> Tenso
 
 @lru_cache(maxsize=3)
 def _table(mask: str) -> tuple[float, ...]:
-    """The tabulated coefficients, nm; reading the table takes longer than an image."""
+    """The tabulated coefficients, nm; cached because reading them takes longer than an image."""
     return tuple(embedded_table("nircam_si_zernikes")[mask].tolist())
 
 
 def parity_in_y(count: int) -> Tensor:
-    """-1 for the Zernikes that change sign with y (Noll sines: odd indices with m > 0)."""
+    """-1 for the Zernikes that change sign with y (the sines), otherwise 1."""
     return torch.tensor(
         [-1.0 if noll_indices(j)[1] < 0 else 1.0 for j in range(1, count + 1)],
         dtype=torch.float64,

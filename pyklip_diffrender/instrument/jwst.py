@@ -1,4 +1,4 @@
-"""The JWST primary mirror and NIRCam's Lyot stop: outlines from the embedded tables.
+"""The JWST primary mirror and NIRCam's Lyot stop, from embedded tables of their outlines.
 
 Orientation: entrance pupil, x along +V2 and y along +V3 (see `pyklip_diffrender.optics.grid`).
 """
@@ -54,18 +54,18 @@ def jwst_pupil(npix: int, segment_gap: float | None = None, pupil: str = "design
     npix : int
         Samples across 6.603464 m.
     segment_gap : float, optional
-        Width of the gaps between the segments, m, by moving all segment edges alike. The
-        embedded outlines have 7.7 mm.
+        Width of the gaps between the segments, m, set by moving all segment edges equally. Default
+        that of the embedded outlines, 7.7 mm.
     pupil : "design" or "flight"
         Obscurations by the struts of the secondary mirror: as designed (stpsf's pupil "RevW"), or
-        as NIRCam's pupil images show them ("Flight V1": the vertical strut is 7 % narrower, hinges
-        stand out beside all three). Behind MASK335R in F444W the star's image differs by 0.6 to
-        1.3 % of its local intensity; a map of 1024 samples and these outlines by 0.1 to 0.2 %.
+        as in NIRCam's pupil images ("Flight V1": the vertical strut is 7 % narrower, and all three
+        have hinges). Behind MASK335R in F444W the star's image differs by 0.6 to 1.3 % of its local
+        intensity; a map of 1024 samples and these outlines differ by 0.1 to 0.2 %.
 
     Returns
     -------
     Tensor, (npix, npix), float64
-        Pixels cut by an edge hold the covered fraction of their area.
+        Covered fraction of the area of each pixel.
 
     Raises
     ------
@@ -75,8 +75,8 @@ def jwst_pupil(npix: int, segment_gap: float | None = None, pupil: str = "design
     kinds = {"design": "strut", "flight": "flight_strut"}
     if pupil not in kinds:
         raise IncompatibleSetupError(f"pupil: got {pupil!r}, expected 'design' or 'flight'")
-    # Struts cross segment edges inside single pixels, where a product of coverages is only
-    # approximate: small arrays are averaged from a fine one.
+    # Where struts cross segment edges inside a pixel, the product of coverages is approximate, so
+    # small arrays are averages of a fine one.
     fine = npix * max(1, -(-1024 // npix))
     grid = PupilGrid.full(fine)
     outlines = list(jwst_segments().values())

@@ -23,7 +23,7 @@ LONG_WAVE = (
 
 @dataclass(frozen=True)
 class RoundMask:
-    """A round occulter of NIRCam's module A with the channel that it is made for.
+    """A round occulter of NIRCam's module A and its channel.
 
     Its amplitude transmission is ``t = 1 - (2 J1(s) / s)^2`` with ``s = sigma r`` up to the second
     zero of J1, and 1 beyond (Krist et al., "The JWST/NIRCam coronagraph: mask design and
@@ -91,13 +91,13 @@ ROUND_MASKS = {
 
 
 def require_mask_and_filter(mask: str | None, name: str) -> RoundMask:
-    """The mask of a legal combination of image mask and filter.
+    """Check a combination of image mask and filter, and return the mask.
 
     Parameters
     ----------
     mask : str or None
-        Image mask; None stands for the mask that is usual in the filter's channel (MASK210R or
-        MASK335R), whose geometry then applies without the mask.
+        Image mask. None gives the usual mask of the filter's channel (MASK210R or MASK335R), for
+        its geometry.
     name : str
         Filter, in any case.
 

@@ -1,4 +1,4 @@
-"""NIRCam's round coronagraph from embedded tables: no download needed."""
+"""NIRCam's round coronagraph from embedded tables, without downloads."""
 
 from __future__ import annotations
 
@@ -36,22 +36,14 @@ from pyklip_diffrender.optics.system import OpticalSystem, Value
 __all__ = [
     "FLIGHT_ALIGNMENT",
     "NIRCAM_LW_PIXELSCALE",
-    "SIAF_PIXELSCALE",
-    "SIAF_SHEAR",
     "nircam_coronagraph",
 ]
 
 NIRCAM_LW_PIXELSCALE = ROUND_MASKS["MASK335R"].pixelscale
 """arcsec per pixel at MASK335R, the square scale that stpsf 2.2.0 uses before distortion."""
 
-SIAF_PIXELSCALE = ROUND_MASKS["MASK335R"].siaf_pixelscale
-"""arcsec per pixel in x and y at MASK335R, see `RoundMask`."""
-
-SIAF_SHEAR = ROUND_MASKS["MASK335R"].siaf_shear
-"""Growth of the ideal y with the ideal x at MASK335R, see `RoundMask`."""
-
 FLIGHT_ALIGNMENT: dict[str, Any] = {"lyot_shift": (-0.0127, 0.0068), "lyot_rotation": 0.567}
-"""How the stop MASKRND stands in flight in the long-wave channel, for the argument `defaults`.
+"""Alignment of the stop MASKRND in flight in the long-wave channel, for the argument `defaults`.
 
 The shift is a fraction of the pupil's diameter, the rotation in degrees, both as the parameters of
 `OpticalSystem`, in entrance-pupil orientation. K. Lawson's values for frames behind MASK335R, of
@@ -130,32 +122,32 @@ def nircam_coronagraph(
     shear : float
         See `Detector`; `RoundMask.siaf_shear` for real frames.
     crosstalk : bool
-        Couple neighbouring pixels as the detector NRCA5 does (interpixel capacitance and
-        post-pixel coupling). Calibrated JWST frames contain it: the pipeline does not take it off.
+        Couple neighbouring pixels as in the detector NRCA5 (interpixel capacitance and post-pixel
+        coupling), which the pipeline does not remove from calibrated JWST frames.
     image_mask : str or None
-        "MASK335R" or "MASK430R" with long-wave filters, "MASK210R" with short-wave ones. None
-        leaves the occulter out (a planet far from the star).
+        "MASK335R" or "MASK430R" with long-wave filters, "MASK210R" with short-wave ones, or None
+        for no occulter (a planet far from the star).
     pupil_mask : "MASKRND" or None
     pupil : "design" or "flight"
         Obscurations of the primary mirror, see `jwst_pupil`.
     segment_gap : float, optional
         Width of the gaps between mirror segments, m; default that of the embedded outlines.
     si_wfe : bool or (36,) array
-        Include the instrument's internal wavefront error at the mask, or these Noll coefficients
-        (m, orientation of the exit pupil, for the wavelength 3.23 um; short wave 2.12 um).
+        Include the instrument's internal wavefront error at the mask, or Noll coefficients for it
+        (m, orientation of the exit pupil, for a wavelength of 3.23 um; short wave 2.12 um).
     flip_si_wfe : bool
         See `internal_wavefront_error`.
     chromatic_reference : float, optional
-        Wavelength (m) at which the wedge's tilt is zero: default the mean wavelength, so that the
-        star stays on the axis. stpsf has 3.35 um (short wave 2.10 um).
+        Wavelength (m) at which the wedge's tilt is zero. Default the mean wavelength, so that the
+        star is on the axis; in stpsf 3.35 um (short wave 2.10 um).
     defaults : mapping of str to value, optional
-        Values of parameters where a call does not give them, such as `FLIGHT_ALIGNMENT`; see
+        Values of parameters for calls that do not give them, such as `FLIGHT_ALIGNMENT`; see
         `OpticalSystem`.
     npix : int
         Samples across the pupil.
     occulter_sampling : float, optional
-        Cells per lambda/D in the occulter's disc: at least so many by the route "lattice" (2
-        unless given), just so many by the route "planes" (4 unless given).
+        Cells per lambda/D in the occulter's disc: the minimum for the route "lattice" (default 2),
+        the exact number for the route "planes" (default 4).
     route : "auto", "lattice" or "planes"
         See `OpticalSystem`.
     dtype : torch.dtype
@@ -169,11 +161,11 @@ def nircam_coronagraph(
     Raises
     ------
     IncompatibleSetupError
-        For a filter, mask or wavelength that does not go with this coronagraph, or a field so wide
-        that the image of a pupil of `npix` samples repeats inside it.
+        For an incompatible filter, mask or wavelength, or a field so wide that the image of a pupil
+        of `npix` samples repeats inside it.
     """
     recipe: dict[str, Any] = {k: v for k, v in locals().items() if k != "recipe"}
-    recipe["defaults"] = dict(defaults or {})  # A copy, for the caller may change theirs.
+    recipe["defaults"] = dict(defaults or {})  # A copy, because the caller may change theirs.
     mask = require_mask_and_filter(image_mask, filter)
     if pupil_mask not in ("MASKRND", None):
         raise IncompatibleSetupError(
@@ -230,8 +222,9 @@ def nircam_coronagraph(
     if si_wfe is not False:
         coefficients = internal_wavefront_error(mask.name, flip_si_wfe)
         if si_wfe is not True:
-            given = torch.as_tensor(si_wfe, dtype=torch.float64)
-            coefficients = given if flip_si_wfe else given * parity_in_y(len(given))
+            coefficients = torch.as_tensor(si_wfe, dtype=torch.float64)
+            if not flip_si_wfe:
+                coefficients = coefficients * parity_in_y(len(coefficients))
         chromatic = ChromaticAberration(
             chromatic_reference or bandpass.mean_wavelength, mask.short_wave
         )

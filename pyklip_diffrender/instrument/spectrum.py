@@ -70,16 +70,16 @@ def filter_bandpass(
 ) -> Bandpass:
     """Divide a filter into `nlambda` equal intervals and weight each by its detected photons.
 
-    Every wavelength is the photon-weighted mean of its interval, so that few wavelengths do as
-    well as they can.
+    Every wavelength is the photon-weighted mean of its interval, for the best accuracy with few
+    wavelengths.
 
     Parameters
     ----------
     name : str
         Filter.
     nlambda : int
-        Number of intervals between the wavelengths where the throughput passes 1 % of its peak;
-        one without any light is left out.
+        Number of intervals between the wavelengths at which the throughput is 1 % of its peak;
+        intervals without light are omitted.
     source : float or (wavelengths, flux)
         Temperature of a blackbody in K (default as in stpsf), or a spectrum: wavelengths in m
         and photons per unit wavelength.
@@ -87,12 +87,12 @@ def filter_bandpass(
     Raises
     ------
     IncompatibleSetupError
-        Unknown filter, or a spectrum that does not cover it or has no light in it.
+        For an unknown filter, or a spectrum that does not cover it or has no light in it.
     """
     if nlambda < 1:
         raise ValueError(f"nlambda: got {nlambda}, expected at least 1")
     wavelength, throughput = filter_throughput(name)
-    # The table has few points: where it passes 1 % may be anywhere between two of them.
+    # The table has few points, so the throughput is interpolated to find where it passes 1 %.
     dense = np.linspace(wavelength[0], wavelength[-1], 20_001)
     used = dense[np.interp(dense, wavelength, throughput) > 0.01 * throughput.max()]
     fine = np.linspace(used[0], used[-1], 200 * nlambda + 1)

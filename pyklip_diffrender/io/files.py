@@ -1,4 +1,4 @@
-"""Files: FITS read with a clear error, products written so that nothing is half there."""
+"""Read FITS files with clear errors, and write files completely or not at all."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ _GZIP = b"\x1f\x8b"
 
 @contextmanager
 def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
-    """Open a FITS file (gzipped or not) and read all of it before anything is used.
+    """Open a FITS file (gzipped or not) and read all of it.
 
     Raises
     ------
     CorruptFileError
         If the file is missing, truncated, or not FITS, if a card cannot be read, or if data do
-        not have the sum that DATASUM promises.
+        not match DATASUM.
 
     Warns
     -----
     DiffrenderWarning
-        If only a header differs from its CHECKSUM: that is what many an editor of headers leaves
-        behind, and the data are whole.
+        If only a header does not match its CHECKSUM, as after editing it without an update of the
+        checksum.
     """
     path = Path(path)
     if not path.is_file():
@@ -49,10 +49,10 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
     try:
         content = path.read_bytes()
         if content.startswith(_GZIP):
-            # Not left to astropy, which takes an early end of the stream for the last HDU.
+            # Not by astropy, which mistakes a truncated stream for the end of the file.
             content = gzip.decompress(content)
         with warnings.catch_warnings():
-            # Data that end too early are only a warning to astropy; here they are an error.
+            # Astropy only warns of truncated data.
             warnings.filterwarnings(
                 "error", message="(?s).*(truncated|corrupt)", category=AstropyUserWarning
             )
@@ -73,8 +73,8 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
 
 
 def _require_sound(hdu: Any, number: int, path: Path) -> None:
-    """Look at all of an HDU once: its cards, its sums, its data."""
-    # What astropy takes for a damaged or foreign HDU has no data, or no sums.
+    """Check the cards, the checksums and the data of an HDU."""
+    # Damaged HDUs and those of unknown type have no data or no checksums.
     if not (hasattr(type(hdu), "data") and hasattr(hdu, "verify_datasum")):
         raise CorruptFileError(
             f"{path}: extension {number} does not start as one (XTENSION, SIMPLE). Fetch it again"
@@ -87,7 +87,7 @@ def _require_sound(hdu: Any, number: int, path: Path) -> None:
                 f"{path}: extension {number} has a card that cannot be read: "
                 f"{card.image.strip()!r}. Correct it, or fetch the file again"
             ) from error
-    # Before the data are scaled: the sums are of the bytes.
+    # Before the data are scaled, because the checksums are those of the bytes.
     if hdu.verify_datasum() == 0:
         raise CorruptFileError(
             f"{path}: the data of extension {number} do not have the checksum in its header "
@@ -105,18 +105,18 @@ def _require_sound(hdu: Any, number: int, path: Path) -> None:
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path that takes the place of `path` only when the block succeeds.
+    """Temporary path for a file that replaces `path` if the block succeeds.
 
-    The temporary file lies in the same folder, so that the replacement is one step, and keeps
-    the suffix, so that writers which look at it (``.fits.gz``, ``.png``) do as usual. The product
-    has the permissions of the file that it replaces, or those of any new file.
+    It is in the same folder, so that the replacement is one step, and has the same suffix, on which
+    some writers depend (``.fits.gz``, ``.png``). The product has the permissions of the file that
+    it replaces, or those of any new file.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     suffix = "".join(path.suffixes)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{suffix}")
-    # Not `tempfile`, whose files only their owner can read: the mode of a plain new file follows
-    # from the umask, which cannot be read without changing it for all threads.
+    # Files of `tempfile` can only be read by their owner. The mode of a plain new file follows from
+    # the umask, which cannot be read without changing it for all threads.
     temporary.touch(exist_ok=False)
     try:
         yield temporary
@@ -128,7 +128,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_fits(hdus: fits.HDUList, path: str | os.PathLike[str]) -> None:
-    """Write a FITS file in one step: the old file, or the new one, never a part."""
+    """Write a FITS file in one step, so that it is never incomplete."""
     with replacing(path) as temporary:
         hdus.writeto(temporary, overwrite=True)
 

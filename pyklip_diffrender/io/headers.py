@@ -1,4 +1,4 @@
-"""Values of FITS headers, checked: a card is text that anybody may have typed."""
+"""Read values of FITS headers with checks, because headers are often edited by hand."""
 
 from __future__ import annotations
 
@@ -11,22 +11,18 @@ from astropy.time import Time
 
 from pyklip_diffrender.errors import CorruptFileError
 
-__all__ = ["header_date", "header_number", "header_text", "merged_header"]
+__all__ = ["card_error", "header_date", "header_number", "header_text", "merged_header"]
 
 
 def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fits.Header:
-    """Cards of the primary header, and those of an extension, which win.
+    """Cards of the primary header, replaced and completed by those of an extension.
 
-    Parameters
-    ----------
-    primary, extension : Header
-    name : str
-        The file's, for the message.
+    `name` is the name of the file in messages.
 
     Raises
     ------
     CorruptFileError
-        If a card cannot be read, or has characters that no card may have.
+        If a card cannot be read, or has invalid characters.
     """
     merged = primary.copy()
     try:
@@ -39,62 +35,57 @@ def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fi
     return merged
 
 
+def card_error(name: str, card: str, value: Any, expected: str) -> CorruptFileError:
+    """Error for a card that does not hold what is expected."""
+    return CorruptFileError(
+        f"{name}: {card} is {value!r}, expected {expected}. Correct the header, or fetch the file "
+        "again"
+    )
+
+
 def _value(header: fits.Header, key: str) -> Any:
-    """None for a card that is not there, and for one without a value."""
+    """Value of a card; None if it is missing or undefined."""
     value = header.get(key)
     return None if isinstance(value, fits.card.Undefined) else value
 
 
 def header_number(header: fits.Header, key: str, name: str) -> float | None:
-    """Finite number on a card, None if there is none.
-
-    Parameters
-    ----------
-    header : Header
-    key : str
-    name : str
-        The file's, for the message.
+    """Finite number of a card, None if there is none; `name` is that of the file.
 
     Raises
     ------
     CorruptFileError
-        If something else is on the card.
+        If the card holds something else.
     """
     value = _value(header, key)
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
-        raise CorruptFileError(
-            f"{name}: {key} is {value!r}, expected a finite number. Correct the header, or fetch "
-            "the file again"
-        )
+        raise card_error(name, key, value, "a finite number")
     return float(value)
 
 
 def header_text(header: fits.Header, key: str, name: str) -> str | None:
-    """Word on a card, None if there is none or it is empty.
+    """Text of a card, None if it is missing or empty; `name` is that of the file.
 
     Raises
     ------
     CorruptFileError
-        If something else is on the card.
+        If the card holds something else.
     """
     value = _value(header, key)
     if value is not None and not isinstance(value, str):
-        raise CorruptFileError(
-            f"{name}: {key} is {value!r}, expected text. Correct the header, or fetch the file "
-            "again"
-        )
+        raise card_error(name, key, value, "text")
     return value or None
 
 
 def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time | None:
-    """Date (UTC) on the first card of some that has one.
+    """Date (UTC) of the first of several cards that has one; `name` is that of the file.
 
     Raises
     ------
     CorruptFileError
-        If that is no date.
+        If the card does not hold a date.
     """
     for key in keys:
         text = header_text(header, key, name)
@@ -103,8 +94,5 @@ def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time |
         try:
             return Time(text, scale="utc")
         except ValueError as error:
-            raise CorruptFileError(
-                f"{name}: {key} is {text!r}, expected a date such as '2022-08-11T01:02:03'. "
-                "Correct the header, or fetch the file again"
-            ) from error
+            raise card_error(name, key, text, "a date such as '2022-08-11T01:02:03'") from error
     return None

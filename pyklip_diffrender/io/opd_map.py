@@ -19,17 +19,17 @@ class OPDMap:
     Attributes
     ----------
     data : ndarray, (npix, npix), float64
-        m, OTE entrance-pupil orientation; 0 where the file had no value.
+        m, OTE entrance-pupil orientation; 0 where the file has no value.
     date : Time or None
         When the wavefront was sensed.
     name : str
-        File name, or what made the map.
+        Name of the file, or of the function that made the map.
     sha256 : str
         Hash of the file, or of the data.
     aperture : str
-        Field point at which the wavefront was sensed, empty if not known.
+        Field point at which the wavefront was sensed, empty if unknown.
     history : tuple of str
-        What was done to the map on reading.
+        Processing steps on reading.
     """
 
     data: NDArray[np.float64] = field(repr=False)

@@ -1,7 +1,7 @@
-"""The one gate between the outside world and the float64 SI arrays inside.
+"""Convert input to float64 arrays in SI units or arcsec, and check it.
 
-`torch.as_tensor(1 * u.um)` is 1.0 and `torch.from_numpy` refuses big-endian arrays, so
-nothing from outside reaches torch but through these functions. Inputs are never modified.
+All input goes through these functions before it reaches torch, because `torch.as_tensor(1 * u.um)`
+is 1.0 and `torch.from_numpy` refuses big-endian arrays. Inputs are never modified.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 _PLAUSIBLE_RMS = (1e-9, 2e-6)
-"""Of a wavefront of JWST, m."""
+"""Plausible rms of a wavefront of JWST, m."""
 
 ARCSEC = float((1 * u.arcsec).to_value(u.rad))
 """One arcsecond in radians."""
@@ -44,36 +44,19 @@ def native_float64(value: Any) -> NDArray[np.float64]:
 
 
 def to_metres(value: Any, name: str) -> NDArray[np.float64]:
-    """Convert a length to metres; a bare number or array is taken to be in metres already.
-
-    Parameters
-    ----------
-    value : Quantity, array or float
-        A length.
-    name : str
-        What it is, for the message.
-
-    Raises
-    ------
-    UnitError
-        If the unit is not a length.
-    """
+    """Convert a length to metres; see `to_unit`."""
     return to_unit(value, u.m, name)
 
 
 def to_arcsec(value: Any, name: str) -> NDArray[np.float64]:
-    """Convert an angle to arcseconds; a bare number or array is taken to be in arcseconds.
-
-    Raises
-    ------
-    UnitError
-        If the unit is not an angle.
-    """
+    """Convert an angle to arcsec; see `to_unit`."""
     return to_unit(value, u.arcsec, name)
 
 
 def to_unit(value: Any, unit: str | u.UnitBase, name: str) -> NDArray[np.float64]:
-    """Convert a Quantity, or a sequence of them, to a unit; bare numbers are in it already.
+    """Convert a Quantity, or a sequence of them, to a unit; bare numbers already have it.
+
+    `name` is the name of the value in messages.
 
     Raises
     ------
@@ -93,7 +76,7 @@ def to_unit(value: Any, unit: str | u.UnitBase, name: str) -> NDArray[np.float64
 
 
 def require_shape(array: NDArray[Any], shape: tuple[int | None, ...], name: str, fix: str) -> None:
-    """Raise `ShapeError` unless `array` has `shape`, where None stands for any length."""
+    """Raise `ShapeError` unless `array` has `shape`, in which None matches any length."""
     good = len(array.shape) == len(shape) and all(
         want is None or got == want for got, want in zip(array.shape, shape, strict=True)
     )
@@ -103,7 +86,7 @@ def require_shape(array: NDArray[Any], shape: tuple[int | None, ...], name: str,
 
 
 def require_finite(array: NDArray[Any], name: str, where: NDArray[np.bool_] | None = None) -> None:
-    """Raise `NonFiniteError` with the count and the first index of what is not finite."""
+    """Raise `NonFiniteError` with the number and the first index of values that are not finite."""
     bad = ~np.isfinite(array)
     if where is not None:
         bad &= where
@@ -116,17 +99,17 @@ def require_finite(array: NDArray[Any], name: str, where: NDArray[np.bool_] | No
 
 
 def warn_of_rms(rms: float, name: str, stacklevel: int, *, small: bool = True) -> None:
-    """Warn of a wavefront whose rms, in m, looks like one in another unit.
+    """Warn of a wavefront rms (m) that suggests another unit.
 
     Parameters
     ----------
     rms : float
     name : str
-        What it is, for the message.
+        Name of the wavefront in the message.
     stacklevel : int
-        As of `warnings.warn`, counted from this function.
+        As in `warnings.warn`, counted from this function.
     small : bool
-        Whether it may be too small, too; 0 never is.
+        Also warn of an rms that is too small, but not of 0.
     """
     low, high = _PLAUSIBLE_RMS
     if rms == 0 or (low if small else 0.0) < rms < high:

@@ -30,7 +30,7 @@ class Bandpass:
         if len(self.wavelengths) != len(self.weights) or not self.wavelengths:
             raise ShapeError(
                 f"got {len(self.wavelengths)} wavelengths and {len(self.weights)} weights, "
-                "expected as many of one as of the other, and at least one"
+                "expected equal numbers, at least one"
             )
         if min(self.wavelengths) <= 0 or min(self.weights) < 0 or sum(self.weights) <= 0:
             raise ValueError(
@@ -41,20 +41,20 @@ class Bandpass:
         object.__setattr__(self, "weights", tuple(w / total for w in self.weights))
 
     def thinned(self, count: int) -> tuple[tuple[int, ...], Bandpass]:
-        """Keep some of the wavelengths, evenly spread, with the weights of those left out.
+        """Keep some of the wavelengths, evenly spread, and redistribute the weights of the others.
 
-        The weight of a wavelength that is left out goes to its two neighbours as in linear
-        interpolation, so that integrals of functions that are linear between them stay the same.
+        The weight of an omitted wavelength goes to its two neighbours as in linear interpolation,
+        which preserves integrals of functions that are linear between them.
 
         Parameters
         ----------
         count : int
-            As many as there are, or more, keep all.
+            Number to keep.
 
         Returns
         -------
         indices : tuple of int
-            Of the wavelengths that are kept.
+            Indices of the wavelengths kept.
         bandpass : Bandpass
         """
         total = len(self.wavelengths)
@@ -67,13 +67,10 @@ class Bandpass:
         kept = np.sort(order[np.round(np.linspace(0, total - 1, count)).astype(int)])
         nodes = np.array(self.wavelengths)[kept]
         ascending = np.argsort(nodes)
-        shares = np.stack(
-            [
-                np.interp(self.wavelengths, nodes[ascending], np.eye(count)[k][ascending])
-                for k in range(count)
-            ]
-        )
-        weights = shares @ np.array(self.weights)
+        shares = [
+            np.interp(self.wavelengths, nodes[ascending], unit[ascending]) for unit in np.eye(count)
+        ]
+        weights = np.array(shares) @ np.array(self.weights)
         return tuple(kept.tolist()), Bandpass(tuple(nodes.tolist()), tuple(weights.tolist()))
 
     @property

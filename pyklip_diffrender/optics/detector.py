@@ -1,4 +1,4 @@
-"""The pixel array: where the field is sampled, and how samples become pixel values."""
+"""The pixel array: sampling of the field, and pixel values from the samples."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import Values, Wavefront
 
-__all__ = ["Detector"]
+__all__ = ["Detector", "mirrored_convolution"]
 
 
 @dataclass
@@ -30,7 +30,9 @@ class Detector:
         Samples per pixel along each axis; a pixel's value is the mean of its samples times the
         pixel's area, so with 1 it is the intensity at the pixel's centre.
     shear : float
-        Growth of y with x on the sky, arcsec per arcsec (0 for square axes).
+        Increase of y with x on the sky, arcsec per arcsec (0 for square axes).
+    centre : tuple of float
+        x, y of the middle of the array on the image, arcsec.
     """
 
     shape: tuple[int, int]
@@ -40,8 +42,9 @@ class Detector:
     device: torch.device
     shear: float = 0.0
     name: str = "detector"
+    centre: tuple[float, float] = (0.0, 0.0)
     parameters: tuple[str, ...] = ("detector_shift", "blur")
-    # Not for `dataclasses.replace` to hand on: a changed detector has other transforms.
+    # Not copied by `dataclasses.replace`, because a changed detector has other transforms.
     _transforms: dict[tuple[float, PupilGrid], MatrixFourier] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -56,7 +59,7 @@ class Detector:
             axis = (index - (samples - 1) / 2) * (scale / self.oversample)
             if shift is not None:
                 axis = axis - shift[..., k].to(self.device)
-            axes.append(axis * ARCSEC)
+            axes.append(axis * ARCSEC + self.centre[k] * ARCSEC)
         return axes[0], axes[1]
 
     def field(self, wavefront: Wavefront, values: Values) -> Tensor:
@@ -78,7 +81,7 @@ class Detector:
 
     @property
     def per_sample(self) -> float:
-        """Square root of a sample's solid angle, radians: from field per radian to sample."""
+        """Square root of a sample's solid angle, radians: the field on it per field per radian."""
         return math.sqrt(self.pixelscale[0] * self.pixelscale[1]) * ARCSEC / self.oversample
 
     def image(self, intensity: Tensor, values: Values) -> Tensor:
@@ -103,17 +106,17 @@ def _blur(image: Tensor, sigma: Tensor, axis: int) -> Tensor:
     reach = 16
     frequency = (torch.arange(64, dtype=torch.float64, device=image.device) + 0.5) / 128
     gain = torch.exp(-2 * (math.pi * sigma.to(image.device) * frequency) ** 2)
-    lag = torch.arange(reach + 1, dtype=torch.float64, device=image.device)
+    lag = torch.arange(-reach, reach + 1, dtype=torch.float64, device=image.device)
     kernel = (gain * torch.cos(2 * math.pi * frequency * lag[:, None])).mean(dim=1)
-    kernel = kernel / (kernel[0] + 2 * kernel[1:].sum())
-    count = image.shape[axis]
-    position = torch.arange(-reach, count + reach, device=image.device)
-    folded = position % (2 * count)
+    matrix = mirrored_convolution(kernel / kernel.sum(), image.shape[axis]).to(image.dtype)
+    return image @ matrix.T if axis == -1 else matrix @ image
+
+
+def mirrored_convolution(kernel: Tensor, count: int) -> Tensor:
+    """Matrix (count, count) of the convolution with a symmetric kernel, mirrored at the edges."""
+    reach, device = len(kernel) // 2, kernel.device
+    lag = torch.arange(-reach, reach + 1, device=device)
+    folded = (torch.arange(count, device=device)[:, None] + lag) % (2 * count)
     mirrored = torch.where(folded < count, folded, 2 * count - 1 - folded)
-    distance = (torch.arange(count, device=image.device)[:, None] - position).abs()
-    weight = torch.where(distance <= reach, kernel[distance.clamp(max=reach)], 0.0)
-    matrix = torch.zeros(count, count, dtype=torch.float64, device=image.device)
-    matrix = matrix.index_add(1, mirrored, weight).to(image.dtype)
-    if axis == -1:
-        return image @ matrix.T
-    return matrix @ image
+    matrix = torch.zeros(count, count, dtype=torch.float64, device=device)
+    return matrix.scatter_add(1, mirrored, kernel.expand(count, -1))

@@ -1,7 +1,7 @@
-"""What the detector does to an image, as linear torch functions: blur, geometry, crosstalk.
+"""Detector effects as linear, differentiable torch functions: blur, geometry, crosstalk.
 
-Each repeats the numerics of stpsf, kernels cut where scipy cuts them, so that chains of them agree
-with stpsf's to rounding; each passes gradients on.
+Each follows the numerics of stpsf, with kernels cut as in scipy, so that chains of them agree with
+stpsf to rounding.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.units import native_float64
+from pyklip_diffrender.optics.detector import Detector, mirrored_convolution
 from pyklip_diffrender.optics.planes import Values
-from pyklip_diffrender.optics.sampled_planes import OffsetDetector
 
 __all__ = ["ChainDetector", "Effect", "GaussianBlur", "LinearResampling", "PixelCrosstalk"]
 
@@ -25,10 +25,10 @@ Effect = Callable[[Tensor], Tensor]
 
 
 class GaussianBlur:
-    """Convolution with a Gaussian as `scipy.ndimage.gaussian_filter` does it.
+    """Convolution with a Gaussian as in `scipy.ndimage.gaussian_filter`.
 
     The kernel is sampled and ends at four standard deviations, rounded to whole samples: widths
-    below an eighth of a sample do nothing. The image is mirrored at its edges.
+    below an eighth of a sample have no effect. The image is mirrored at its edges.
 
     Parameters
     ----------
@@ -42,17 +42,12 @@ class GaussianBlur:
     def _matrix(self, count: int, like: Tensor) -> Tensor:
         reach = int(4 * float(self.sigma.detach()) + 0.5)
         if reach == 0:
-            # Not the kernel's limit: scipy leaves the image alone, and so must the derivative.
+            # As in scipy, the image is unchanged, and so the derivative must be zero.
             return torch.eye(count, dtype=like.dtype, device=like.device)
         lag = torch.arange(-reach, reach + 1, dtype=torch.float64)
         kernel = torch.exp(-0.5 * (lag / self.sigma.cpu()) ** 2)
         kernel = kernel / kernel.sum()
-        position = torch.arange(count)[:, None] + torch.arange(-reach, reach + 1)[None, :]
-        folded = position % (2 * count)
-        folded = torch.where(folded < count, folded, 2 * count - 1 - folded)
-        matrix = torch.zeros(count, count, dtype=torch.float64)
-        matrix = matrix.scatter_add(1, folded, kernel.expand(count, -1))
-        return matrix.to(like.device, like.dtype)
+        return mirrored_convolution(kernel, count).to(like.device, like.dtype)
 
     def __call__(self, image: Tensor) -> Tensor:
         """Blur (..., rows, columns)."""
@@ -67,9 +62,9 @@ class LinearResampling:
     Parameters
     ----------
     rows, columns : array_like, (ny, nx)
-        Where each sample of the result lies in the image, in samples.
+        Position in the image of each sample of the result, in samples.
     shape : tuple of int
-        Of the image.
+        Shape of the image.
     """
 
     def __init__(self, rows: ArrayLike, columns: ArrayLike, shape: tuple[int, int]) -> None:
@@ -107,7 +102,7 @@ class PixelCrosstalk:
     Parameters
     ----------
     kernel : array_like, (odd, odd)
-        Where the signal of a pixel goes, the pixel itself in the middle.
+        Distribution of the signal of the middle pixel.
     """
 
     def __init__(self, kernel: ArrayLike) -> None:
@@ -118,7 +113,7 @@ class PixelCrosstalk:
 
     def __call__(self, image: Tensor) -> Tensor:
         """Convolve (..., rows, columns)."""
-        # What torch calls a convolution is a correlation: with the kernel turned, it is one.
+        # Torch correlates, so the kernel is flipped.
         turned = self.kernel.flip(0, 1).to(image)[None, None]
         padding = (self.kernel.shape[0] // 2, self.kernel.shape[1] // 2)
         images = image.reshape(-1, 1, *image.shape[-2:])
@@ -126,7 +121,7 @@ class PixelCrosstalk:
 
 
 @dataclass
-class ChainDetector(OffsetDetector):
+class ChainDetector(Detector):
     """A detector with effects, before and after the samples are binned to pixels.
 
     Attributes
@@ -139,11 +134,11 @@ class ChainDetector(OffsetDetector):
     on_pixels: tuple[Effect, ...] = ()
 
     def image(self, intensity: Tensor, values: Values) -> Tensor:
-        """See `Detector.image`; the blur, where it is free, comes before the other effects."""
+        """See `Detector.image`; a free blur comes before the other effects."""
         if "blur" in values:
-            # On samples only: binning comes last.
+            # Blur the samples without binning them.
             shape, oversample = self.shape, self.oversample
-            fine = OffsetDetector(
+            fine = Detector(
                 (shape[0] * oversample, shape[1] * oversample),
                 (self.pixelscale[0] / oversample, self.pixelscale[1] / oversample),
                 1,

@@ -1,4 +1,4 @@
-"""What takes part in differentiation, and what merely stands where it is and may be kept."""
+"""Tell tensors that are being differentiated from constants, whose results may be cached."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ Key = TypeVar("Key", bound=Hashable)
 Made = TypeVar("Made")
 
 Position = tuple[tuple[str, float], ...]
-"""Named values as plain numbers, for the key of what is computed from them."""
+"""Named values as plain numbers, as a key for results computed from them."""
 
 
 def has_memory(tensor: Tensor) -> bool:
-    """Whether a tensor is itself, and takes part in no transform of `torch.func`.
+    """Whether a tensor is not wrapped by a transform of `torch.func`, nor a dual number.
 
-    Those of reverse mode by `backward` or `torch.autograd.grad` do, whether they need it or not.
+    Tensors in reverse mode by `backward` or `torch.autograd.grad` are not wrapped.
     """
     try:
         tensor.data_ptr()
     except RuntimeError:
-        return False  # It stands for others, and has no memory of its own.
+        return False  # A wrapper without memory of its own.
     return unpack_dual(tensor).tangent is None
 
 
@@ -36,16 +36,16 @@ def is_plain(tensor: Tensor) -> bool:
 
 
 def position_of(values: Mapping[str, Tensor], names: Iterable[str]) -> Position | None:
-    """Where the named parameters stand, or None if one of them is being differentiated.
+    """Values of the named parameters, or None if one of them is being differentiated.
 
-    Names without a value are left out.
+    Names without a value are omitted.
     """
-    found = []
+    position = []
     for name in sorted(set(names) & set(values)):
         if not is_plain(values[name]):
             return None
-        found += [(name, number) for number in values[name].flatten().tolist()]
-    return tuple(found)
+        position += [(name, number) for number in values[name].flatten().tolist()]
+    return tuple(position)
 
 
 def kept(
@@ -54,19 +54,21 @@ def kept(
     position: Position | None,
     make: Callable[[], Made],
 ) -> Made:
-    """What was made last for a key, if it was made for the same position, else a new one.
+    """The stored result for a key if it was made at the same position, else a new one.
+
+    Only the latest result for each key is stored. Nothing is stored while differentiating
+    (position None), nor within a transform of `torch.func`, which wraps all results: wrapped
+    tensors cannot be copied after it has ended.
 
     Parameters
     ----------
     store : dict
-        Of the latest for each key. Nothing is stored of what is being differentiated (position
-        None), nor within a transform of `torch.func`, which wraps all results: wrapped tensors
-        cannot be copied when it is over.
+        Results by key.
     key : hashable
     position : Position or None
         See `position_of`.
     make : callable
-        Makes a new one.
+        Makes a new result.
     """
     if position is None:
         return make()

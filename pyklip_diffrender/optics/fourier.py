@@ -32,7 +32,7 @@ def centred(grid: PupilGrid) -> PupilGrid:
 def kernel(image: Tensor, pupil: Tensor, wavelength: float, sign: int) -> Tensor:
     """``exp(sign 2 pi i image pupil / wavelength)``, (image, pupil), in double precision."""
     turns = image[:, None] * pupil[None, :] / wavelength
-    # Whole turns are dropped before the cosine: the phase stays small, whatever the field.
+    # Whole turns are dropped before the cosine, to keep the phase small for any field.
     angle = sign * 2 * math.pi * (turns - torch.round(turns.detach()))
     return torch.complex(torch.cos(angle), torch.sin(angle))
 
@@ -61,7 +61,7 @@ def tilt_phases(offset: Tensor, grid: PupilGrid, wavelength: float) -> tuple[Ten
 class RowTransform:
     """The kernel ``exp(sign 2 pi i q p / lambda)`` between positions q and p, along axis -2.
 
-    Where the positions lie symmetrically about zero, as cells and centred pixels do, the kernel
+    If the positions are symmetric about zero, as for cells and centred pixels, the kernel
     splits into a cosine that is even and a sine that is odd: two real products of half the size,
     and a quarter of it where both kinds of position are symmetric.
     """
@@ -123,7 +123,7 @@ def _fold(field: Tensor) -> tuple[Tensor, Tensor]:
     half = field.shape[-2] // 2
     upper, lower = field[..., half:, :], field[..., :half, :].flip(-2)
     if field.shape[-2] % 2:
-        # The middle is its own mirror image: it counts once, and has no odd part.
+        # The middle is its own mirror image: it counts once and has no odd part.
         middle, above = upper[..., :1, :], upper[..., 1:, :]
         return (
             torch.cat([middle, above + lower], dim=-2),
@@ -164,10 +164,10 @@ class MatrixFourier:
     dtype : torch.dtype
         complex128 or complex64.
     shear : float
-        How much y grows with x on the image: the true y of pixel (i, j) is ``y[i] + shear x[j]``.
+        Increase of y with x on the image: the true y of pixel (i, j) is ``y[i] + shear x[j]``.
     fold : bool
-        Use the symmetry of the positions about zero, if there is any. False for positions that
-        are differentiated: they may leave it.
+        Use a symmetry of the positions about zero. False for positions that are differentiated,
+        because their changes may break it.
     """
 
     def __init__(
@@ -194,7 +194,7 @@ class MatrixFourier:
         """Pupil field (..., rows, columns), per m, to image field (..., y, x), per radian."""
         if self._shear is None:
             return self._scale * self._columns.forward(self._rows.forward(field).mT).mT
-        # Along x first: only then does every column have its own shift in y.
+        # Along x first, so that every column can have its own shift in y.
         return self._scale * self._rows.forward(self._columns.forward(field.mT).mT * self._shear)
 
     def inverse(self, field: Tensor, cell: float) -> Tensor:

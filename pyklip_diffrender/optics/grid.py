@@ -100,7 +100,7 @@ class PupilGrid:
         )
 
     def crop(self, array: Tensor, to: PupilGrid) -> Tensor:
-        """Cut the window `to` out of an array on this window, with zeros where it sticks out.
+        """Cut the window `to` out of an array on this window, with zeros outside.
 
         Parameters
         ----------
@@ -114,14 +114,14 @@ class PupilGrid:
         left, right = to.columns[0] - self.columns[0], self.columns[1] - to.columns[1]
         height, width = self.shape
         if top >= height or bottom >= height or left >= width or right >= width:
-            return array.new_zeros((*array.shape[:-2], *to.shape))  # They do not meet.
+            return array.new_zeros((*array.shape[:-2], *to.shape))  # No overlap.
         if min(top, bottom, left, right) < 0:
             return torch.nn.functional.pad(array, (-left, -right, -top, -bottom))
         return array[..., top : top + to.shape[0], left : left + to.shape[1]]
 
 
 def samples_for_field(field: float, wavelength: float, diameter: float = JWST_DIAMETER) -> int:
-    """Fewest samples across a pupil whose image does not repeat itself inside a field.
+    """Smallest number of pupil samples for which the image does not repeat inside a field.
 
     Parameters
     ----------
@@ -137,8 +137,8 @@ def resample(opd: NDArray[np.float64], npix: int, name: str = "opd") -> NDArray[
     """Resample square pupil maps to another number of pixels across the same pupil.
 
     Blocks are averaged where the numbers of pixels divide; otherwise the map is interpolated
-    bilinearly, after smoothing if the new pixels are larger. A map that has the wanted size
-    already is returned as it is, not copied.
+    bilinearly, after smoothing if the new pixels are larger. A map that already has the right size
+    is returned without a copy.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def resample(opd: NDArray[np.float64], npix: int, name: str = "opd") -> NDArray[
         Real values.
     npix : int
     name : str
-        What the map is, for the message.
+        Name of the map, for messages.
 
     Returns
     -------
@@ -196,7 +196,7 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
     """
     rows, columns = grid.shape
     origin = torch.tensor([grid.columns[0], grid.rows[0]], dtype=torch.float64)
-    # All polygons at once: in forward mode every operation costs a third of a millisecond.
+    # All polygons at once, because in forward mode every operation takes 0.3 ms.
     sizes = torch.tensor([len(polygon) for polygon in polygons])
     owner = torch.repeat_interleave(torch.arange(len(polygons)), sizes)
     first = (sizes.cumsum(0) - sizes)[owner]
@@ -209,7 +209,7 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
 
     edge, fraction = _border_crossings(start, end)
     begin = start[edge] + fraction[:-1, None] * (end - start)[edge]
-    # Within one edge a piece ends where the next begins; at a change of edge it ends at 1.
+    # A piece ends where the next on the same edge begins; the last of an edge ends at 1.
     last = torch.ones(len(edge), dtype=torch.bool)
     last[:-1] = edge[1:] != edge[:-1]
     stop_fraction = torch.where(last, torch.ones_like(fraction[1:]), fraction[1:])
@@ -218,7 +218,7 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
     middle = (begin + finish) / 2
     column, row = torch.floor(middle.detach()).to(torch.int64).unbind(dim=1)
     height = -(finish - begin)[:, 1] * sense[edge]
-    # A piece left of the window fills all of its row, one right of it nothing.
+    # A piece left of the window fills its whole row, one on the right nothing.
     beyond = column < 0
     inside_x = torch.where(beyond, torch.zeros_like(height), middle[:, 0] - column)
     column = column.clamp(0, columns)
@@ -228,19 +228,19 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
     accumulated = accumulated.index_add(0, flat, (height * (1 - inside_x))[kept])
     accumulated = accumulated.index_add(0, flat + 1, (height * inside_x)[kept])
     covered = accumulated.reshape(rows, columns + 2).cumsum(dim=1)[:, :columns]
-    # Sums of exact areas leave rounding errors of 1e-14 to the right of a polygon.
+    # Rounding leaves 1e-14 to the right of a polygon.
     return torch.where(covered.detach().abs() < 1e-11, torch.zeros_like(covered), covered)
 
 
 def _border_crossings(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-    """Where edges cross integer x or y, as fractions of the edge; every edge also has its 0.
+    """Crossings of edges with integer x or y, as fractions of the edge, and the start of each edge.
 
     Returns
     -------
     edge : Tensor, (pieces,), int64
-        Which edge each piece belongs to, ascending.
+        Index of the edge of each piece, ascending.
     fraction : Tensor, (pieces + 1,)
-        Where each piece begins on its edge, ascending within an edge (and one spare element).
+        Start of each piece on its edge, ascending within an edge, and one spare element.
     """
     edges = [torch.arange(len(start))]
     fractions = [torch.zeros(len(start), dtype=torch.float64)]
@@ -284,6 +284,6 @@ def widen_polygon(polygon: Tensor, distance: float) -> Tensor:
     normal = sense * torch.stack([edge[:, 1], -edge[:, 0]], dim=1)
     normal = normal / normal.norm(dim=1, keepdim=True)
     before = normal.roll(1, dims=0)
-    # A corner moves along the bisector, far enough that both its edges move by the distance.
+    # A corner moves along the bisector so far that both its edges move by the distance.
     bisector = (before + normal) / (1 + (before * normal).sum(dim=1, keepdim=True))
     return polygon + distance * bisector

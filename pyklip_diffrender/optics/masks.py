@@ -1,8 +1,8 @@
-"""Image-plane masks of any shape: in a box, along the axes, or all over a padded FFT.
+"""Image-plane masks of any shape: in a box, separable, or by FFTs of the padded pupil.
 
 All sample the image on the same lattice: multiples of ``lambda / diameter / sampling`` about the
-axis. What a mask takes away is computed where it takes something away; the three ways differ in
-speed, not in what they compute, to rounding.
+axis. The light that a mask removes is computed only where it removes any. The three methods differ
+in speed, but not in their result, apart from rounding.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ Box = tuple[float, float, float, float]
 def _lattice(low: float, high: float, spacing: float, limit: float) -> Tensor:
     """Multiples of `spacing` that cover an interval, all in radians.
 
-    A sampled pupil repeats its image beyond the field that its samples resolve, from ``-limit``
-    to `limit`: nothing may be taken away there twice.
+    A sampled pupil repeats its image outside the range from ``-limit`` to `limit`, so light must
+    not be removed there a second time.
     """
     edge = round(limit / spacing)
     first = max(math.floor(low / spacing), -edge)
@@ -41,7 +41,7 @@ def _lattice(low: float, high: float, spacing: float, limit: float) -> Tensor:
 
 
 class MaskPart(Protocol):
-    """A part of a mask: what it takes from the field, seen in the pupil behind."""
+    """A part of a mask, as its effect on the field in the pupil behind it."""
 
     def removed(self, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
         """Field to subtract on the window `onto`; `spacing` of the lattice in radians."""
@@ -103,8 +103,7 @@ class SeparablePart:
     Parameters
     ----------
     along_x, along_y : callable or None
-        Positions in arcsec, image orientation, to that factor of ``1 - t``; None for one
-        everywhere.
+        From positions in arcsec, image orientation, to the factor of ``1 - t``; None for 1.
     sampling : float
         Lattice points per lambda/diameter. As in an FFT of the pupil padded by this factor, the
         lattice ends at ``npix / 2`` lambda/diameter.
@@ -120,7 +119,7 @@ class SeparablePart:
         self._spectra: dict[tuple[str, float, PupilGrid, PupilGrid, torch.dtype], Tensor] = {}
 
     def _spectrum(self, axis: str, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
-        """Transform of the kernel that takes the window in front to the one behind, one axis."""
+        """Transform of the kernel from the window in front to the one behind, along one axis."""
         key = (axis, wavefront.wavelength, wavefront.grid, onto, wavefront.field.dtype)
         if key not in self._spectra:
             grid = wavefront.grid
@@ -129,8 +128,8 @@ class SeparablePart:
             count = round(grid.npix * self.sampling)
             index = torch.arange(count) - count // 2
             values = factor(index * spacing / ARCSEC).to(torch.float64)
-            # Pupil samples whose distance is d see the d-th Fourier coefficient of the factor;
-            # the sign of the exponent is that of `propagation`, opposite in y.
+            # Pupil samples at a distance d are coupled by the d-th Fourier coefficient of the
+            # factor; the sign of the exponent is that of `fourier`, opposite in y.
             coefficients = torch.fft.fft(torch.fft.ifftshift(values)) / count
             if axis == "y":
                 coefficients = coefficients.conj()
@@ -164,7 +163,7 @@ class SeparablePart:
 
 
 class SampledOcculter:
-    """A mask that is clear but for its parts, each taken away on the common lattice.
+    """A mask that is clear except for its parts, which share a lattice.
 
     Parameters
     ----------
@@ -188,18 +187,11 @@ class SampledOcculter:
         self.sampling, self.diameter = sampling, diameter
 
     def window(self, values: Values) -> None:
-        """Takes what comes."""
+        """See `Plane`: the whole field passes."""
         return None
 
     def _spacing(self, wavelength: float) -> float:
         return wavelength / self.diameter / self.sampling
-
-    def focal_field(self, wavefront: Wavefront) -> Tensor:
-        """The field in front of the first part that has a box, on its cells."""
-        for part in self.parts:
-            if isinstance(part, BoxPart):
-                return part.focal_field(wavefront, self._spacing(wavefront.wavelength))
-        raise IncompatibleSetupError(f"{self.name} has no part in a box to look at")
 
     def focal_sample(self, wavefront: Wavefront) -> tuple[Tensor, float]:
         """The field behind the mask inside the first box, and the lattice's spacing (radians)."""
@@ -236,7 +228,7 @@ class SampledOcculter:
         )
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
-        """Subtract what every part takes away."""
+        """Subtract the light that each part removes."""
         field = wavefront.grid.crop(wavefront.field, onto)
         for part in self.parts:
             field = field - part.removed(wavefront, self._spacing(wavefront.wavelength), onto)
@@ -244,7 +236,7 @@ class SampledOcculter:
 
 
 class FourierMask:
-    """A mask of any kind by FFTs of the padded pupil, as poppy does it.
+    """A mask of any kind by FFTs of the padded pupil, as in poppy.
 
     Parameters
     ----------
@@ -268,29 +260,29 @@ class FourierMask:
     ) -> None:
         self.name = name
         self.transmission, self.padding = transmission, padding
-        # poppy pads by whole samples on both sides and puts the odd one, if any, behind.
+        # poppy pads by whole samples on both sides, with the odd one, if any, at the end.
         first = -((npix * (padding - 1)) // 2)
         limits = (first, first + npix * padding)
         self.grid = PupilGrid(npix, diameter, limits, limits)
         self._latest: tuple[float, torch.dtype, Tensor] | None = None
 
     def window(self, values: Values) -> PupilGrid:
-        """All of the padded pupil: light beside the pupil reaches the next mask."""
+        """The padded pupil, because light beside the pupil reaches the next mask."""
         return self.grid
 
     def _lattice_transmission(self, wavefront: Wavefront) -> Tensor:
-        # One wavelength at a time: at eight points per lambda/D one is a gigabyte. Looked at once,
-        # for another thread may put its own there at any moment.
+        # One wavelength at a time: at eight points per lambda/D one is a gigabyte. Read only once,
+        # because another thread may replace it at any moment.
         latest = self._latest
-        wanted = (wavefront.wavelength, wavefront.field.dtype)
-        if latest is None or latest[:2] != wanted:
+        key = (wavefront.wavelength, wavefront.field.dtype)
+        if latest is None or latest[:2] != key:
             lattice = torch.fft.ifftshift(self.transmission(wavefront.wavelength))
-            latest = (*wanted, lattice.to(wavefront.field))
+            latest = (*key, lattice.to(wavefront.field))
             self._latest = latest
         return latest[2]
 
     def focal_sample(self, wavefront: Wavefront) -> tuple[Tensor, float]:
-        """The field behind the mask on all of the lattice, and its spacing (radians)."""
+        """The field behind the mask on the whole lattice, and its spacing (radians)."""
         field = wavefront.grid.crop(wavefront.field, self.grid) * wavefront.grid.spacing
         image = torch.fft.ifft2(field, norm="ortho") * self._lattice_transmission(wavefront)
         spacing = wavefront.wavelength / wavefront.grid.diameter / self.padding

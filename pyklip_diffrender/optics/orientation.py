@@ -55,11 +55,6 @@ class Orientation:
         ((a, b), (c, d)) = self.matrix
         return a * d - b * c
 
-    @property
-    def is_identity(self) -> bool:
-        """Whether nothing changes."""
-        return self.matrix == ((1, 0), (0, 1))
-
     def positions(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """New positions of points."""
         ((a, b), (c, d)) = self.matrix
@@ -72,7 +67,7 @@ class Orientation:
     def apply_to_lattice(self, array: Tensor) -> Tensor:
         """Turn an array (..., n, n) whose middle is sample n // 2, as after an FFT, n even.
 
-        The samples at ``-n / 2`` have no partner; they stay, as they are periodic.
+        The samples at ``-n / 2`` have no mirror image and stay, because they are periodic.
         """
         return self._turn(array, roll=1)
 

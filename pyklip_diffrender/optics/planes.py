@@ -47,9 +47,9 @@ __all__ = [
     "InternalAberration",
     "LyotStop",
     "Plane",
-    "PupilStop",
     "Values",
     "Wavefront",
+    "phase_factor",
 ]
 
 Values = Mapping[str, Tensor]
@@ -66,7 +66,7 @@ class Wavefront:
     wavelength : float
         m.
     grid : PupilGrid
-        Where the samples are.
+        The window of the samples.
     """
 
     field: Tensor
@@ -75,16 +75,22 @@ class Wavefront:
 
 
 class Plane(Protocol):
-    """What an `OpticalSystem` needs of its planes after the first."""
+    """Interface of the planes of an `OpticalSystem` behind the entrance pupil."""
 
     name: str
     parameters: tuple[str, ...]
 
     def window(self, values: Values) -> PupilGrid | None:
-        """The part of the pupil that this plane passes on; None if it takes what comes."""
+        """The part of the pupil that this plane passes on; None for all of it."""
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Propagate; `onto` is the window that the planes behind need."""
+
+
+def phase_factor(opd: Tensor, wavelength: float, dtype: torch.dtype) -> Tensor:
+    """``exp(2 pi i OPD / wavelength)``, from float64 to a real type `dtype`."""
+    phase = ((2 * math.pi / wavelength) * opd).to(dtype)
+    return torch.polar(torch.ones_like(phase), phase)
 
 
 class EntrancePupil:
@@ -102,7 +108,7 @@ class EntrancePupil:
 
     parameters: tuple[str, ...] = ("star_offset",)
     opd: Tensor | None = None
-    """The OPD of a system that is called without one, (npix, npix) in m; None for a flat one."""
+    """The OPD for calls without one, (npix, npix) in m; None for a flat wavefront."""
 
     def __init__(
         self, amplitude: Tensor, diameter: float, dtype: torch.dtype, name: str = "entrance pupil"
@@ -116,7 +122,7 @@ class EntrancePupil:
         power = (amplitude**2).sum() * full.spacing**2
         self.amplitude = full.crop(amplitude / torch.sqrt(power), self.grid).to(dtype)
         self.lit = amplitude > 0
-        """Where light passes, (npix, npix)."""
+        """Samples that transmit light, (npix, npix)."""
 
     def on_window(self, maps: Tensor) -> Tensor:
         """OPD maps (..., npix, npix) on the samples of the field, (..., rows, columns)."""
@@ -144,49 +150,16 @@ class EntrancePupil:
         if star_offset is not None:
             x, y = tilt_phases(star_offset * ARCSEC, self.grid, wavelength)
             phase = phase + (x[..., None, :] + y[..., :, None]).to(self.dtype)
-        # torch.polar does the same in 1.6 times the time (1024 x 1024, two cores).
+        # torch.polar takes 1.6 times as long (1024 x 1024, two cores).
         field = torch.complex(amplitude * torch.cos(phase), amplitude * torch.sin(phase))
         return Wavefront(field, wavelength, self.grid)
-
-
-class PupilStop:
-    """A fixed amplitude stop, with an optional OPD, in a pupil plane."""
-
-    parameters: tuple[str, ...] = ()
-
-    def __init__(
-        self,
-        amplitude: Tensor,
-        diameter: float,
-        dtype: torch.dtype,
-        name: str,
-        opd: Tensor | None = None,
-    ) -> None:
-        self.name = name
-        full = PupilGrid.full(amplitude.shape[-1], diameter)
-        self.grid = full.around(amplitude)
-        self.amplitude = full.crop(amplitude, self.grid).to(dtype)
-        self.opd = None if opd is None else full.crop(opd, self.grid).to(dtype)
-
-    def window(self, values: Values) -> PupilGrid:
-        return self.grid
-
-    def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
-        field = wavefront.grid.crop(wavefront.field, self.grid)
-        if self.opd is None:
-            field = field * self.amplitude
-        else:
-            field = field * torch.polar(
-                self.amplitude, (2 * math.pi / wavefront.wavelength) * self.opd
-            )
-        return replace(wavefront, field=field, grid=self.grid)
 
 
 class LyotStop:
     """A stop made of polygonal openings that can be shifted and turned, exactly.
 
-    The openings are rasterised anew wherever they lie (`polygon_coverage`), so that the image is
-    a smooth function of shift and rotation with the true derivative.
+    The openings are rasterised at every position (`polygon_coverage`), so that the image is a
+    smooth function of shift and rotation with the true derivative.
 
     Parameters
     ----------
@@ -216,8 +189,8 @@ class LyotStop:
         self.diameter = diameter
         self.dtype, self.device = dtype, device
         full = PupilGrid.full(npix, diameter)
-        # Symmetric about the axis, for then transforms are half as large. Windows are just these
-        # two, for whatever else is kept is kept for each.
+        # Symmetric about the axis, which halves the transforms. Only these two windows occur,
+        # because other results are cached for each window.
         self._tight = centred(full.around(polygon_coverage(openings, full)))
         self._wide = self._tight.widened(self.margin * diameter)
         self._latest: dict[PupilGrid, tuple[Position, Tensor]] = {}
@@ -299,8 +272,7 @@ class InternalAberration:
         phasor = self._phasors.get(key)
         if phasor is None or "si_zernikes" in values:
             opd = self.opd(wavefront.wavelength, wavefront.grid, values)
-            phase = ((2 * math.pi / wavefront.wavelength) * opd).to(self.dtype)
-            phasor = torch.polar(torch.ones_like(phase), phase)
+            phasor = phase_factor(opd, wavefront.wavelength, self.dtype)
             if "si_zernikes" not in values:
                 self._phasors[key] = phasor
         return replace(wavefront, field=wavefront.field * phasor)
@@ -315,8 +287,8 @@ class CompactOcculter:
     Parameters
     ----------
     complement : callable
-        (x, y) angles in arcsec, arrays, to the amplitude 1 - t. Evaluated in double precision
-        as a constant: 1 - t must be computed without forming t, which would cancel.
+        From angles (x, y) in arcsec to the amplitude 1 - t, computed directly in double precision
+        because 1 - t from t would lose digits by cancellation.
     radius : float
         arcsec; `complement` vanishes beyond.
     sampling : float, optional

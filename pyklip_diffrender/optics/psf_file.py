@@ -5,7 +5,8 @@ from __future__ import annotations
 import datetime
 import os
 import warnings
-from typing import Any, Protocol
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 from pyklip_diffrender import __version__
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import write_fits
+from pyklip_diffrender.optics.propagation import Propagation
 
 __all__ = ["instrument_psf", "poppy_psf", "save"]
 
@@ -25,36 +27,7 @@ Array = NDArray[np.float64]
 _NORMALIZATIONS = ("first", "last", "exit_pupil", "none")
 
 
-class System(Protocol):
-    """The part of `optics.system.OpticalSystem` that is used here."""
-
-    entrance: Any
-    planes: tuple[Any, ...]
-    detector: Any
-    bandpass: Any
-    recipe: dict[str, Any]
-
-    @property
-    def setup(self) -> dict[str, str]:
-        """Filter and masks."""
-
-    def opd(self, opd: Any) -> Tensor:
-        """OPD as a tensor."""
-
-    def values(self, given: dict[str, Any]) -> dict[str, Tensor]:
-        """Parameters as tensors."""
-
-    def fields(self, opd: Any = None, **parameters: Any) -> list[Tensor]:
-        """Field on the detector's samples at each wavelength."""
-
-    def pupil_field(self, opd: Tensor, wavelength: float, values: Any) -> Any:
-        """Field behind the entrance pupil."""
-
-    def windows(self, values: Any) -> list[Any]:
-        """Windows of the planes."""
-
-
-def _samples(system: System, normalize: str, opd: Any, parameters: dict[str, Any]) -> Array:
+def _samples(system: Propagation, normalize: str, opd: Any, parameters: dict[str, Any]) -> Array:
     """Light on the detector's samples, before binning, (oversample ny, oversample nx).
 
     `normalize` says what adds up to 1 at every wavelength: the light behind the "first" plane, on
@@ -86,7 +59,7 @@ def _samples(system: System, normalize: str, opd: Any, parameters: dict[str, Any
 
 
 def _exit_light(
-    system: System, opd: Tensor, wavelength: float, parameters: dict[str, Any]
+    system: Propagation, opd: Tensor, wavelength: float, parameters: dict[str, Any]
 ) -> Tensor:
     """Share of the light that reaches the last pupil."""
     values = system.values(parameters)
@@ -97,14 +70,13 @@ def _exit_light(
     return light
 
 
-def _propagations(system: System) -> str:
-    used = getattr(system, "propagation", None)
-    if used:
-        return ", ".join(f"{name}: {kind}" for name, kind in used.items())
-    return "compact"
+def _propagations(system: Propagation) -> str:
+    """For systems made from poppy's, how each image plane is passed."""
+    used = getattr(system, "propagation", None) or {}
+    return ", ".join(f"{name}: {kind}" for name, kind in used.items()) or "compact"
 
 
-def _header(system: System, normalize: str, header: fits.Header) -> None:
+def _header(system: Propagation, normalize: str, header: fits.Header) -> None:
     detector, entrance = system.detector, system.entrance
     scale = detector.pixelscale[0] / detector.oversample
     waves, weights = system.bandpass.wavelengths, system.bandpass.weights
@@ -144,7 +116,7 @@ def _header(system: System, normalize: str, header: fits.Header) -> None:
 
 
 def poppy_psf(
-    system: System, normalize: str = "first", opd: Any = None, **parameters: Any
+    system: Propagation, normalize: str = "first", opd: Any = None, **parameters: Any
 ) -> fits.HDUList:
     """The return value of `poppy.OpticalSystem.calc_psf`: one oversampled image.
 
@@ -162,10 +134,10 @@ def poppy_psf(
 
 
 def instrument_psf(
-    system: System,
+    system: Propagation,
+    setup: Mapping[str, str],
+    sampling: float | None,
     normalize: str = "first",
-    outfile: str | os.PathLike[str] | None = None,
-    overwrite: bool = True,
     opd: Any = None,
     **parameters: Any,
 ) -> fits.HDUList:
@@ -174,11 +146,12 @@ def instrument_psf(
     Parameters
     ----------
     system : OpticalSystem
+    setup : mapping of str to str
+        See `OpticalSystem.setup`.
+    sampling : float, optional
+        Cells per lambda/D on the occulter, for the header.
     normalize : "first", "last", "exit_pupil" or "none"
         As in poppy.
-    outfile : path, optional
-        Write the result there.
-    overwrite : bool
     opd, **parameters
         As in a call of the system.
 
@@ -186,13 +159,6 @@ def instrument_psf(
     -------
     HDUList
         Extensions OVERSAMP and DET_SAMP.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For another normalisation.
-    FileExistsError
-        If the file exists and must not be overwritten.
     """
     factor = system.detector.oversample
     primary = fits.PrimaryHDU(_samples(system, normalize, opd, parameters))
@@ -202,12 +168,11 @@ def instrument_psf(
     now = datetime.datetime.now(datetime.UTC)
     header["DATE"] = (f"{now:%Y-%m-%dT%H:%M:%S}", "Date of calculation")
     for name, (key, comment) in _SETUP_KEYWORDS.items():
-        if key in system.setup:
-            header[name] = (system.setup[key], comment)
-    sampling = system.recipe.get("occulter_sampling")
+        if key in setup:
+            header[name] = (setup[key], comment)
     if sampling is not None:
         header["OVERSAMP"] = (sampling, "Oversampling factor for FFTs in computation")
-    if "filter" in system.setup:
+    if "filter" in setup:
         header["INSTRUME"] = ("NIRCam", "Instrument")
     header["PUPILOPD"] = ("NONE - perfect telescope! " if opd is None else "OPD of the call",
                           "Pupil OPD source")  # fmt: skip
@@ -218,9 +183,7 @@ def instrument_psf(
     detector.header["OVERSAMP"] = (1, "These data are rebinned to detector pixels")
     detector.header["CALCSAMP"] = (factor, "This much oversampling used in calculation")
     detector.header["PIXELSCL"] *= factor
-    hdus = fits.HDUList([primary, detector])
-    save(hdus, outfile, overwrite)
-    return hdus
+    return fits.HDUList([primary, detector])
 
 
 _SETUP_KEYWORDS = {

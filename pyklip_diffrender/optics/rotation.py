@@ -1,4 +1,4 @@
-"""Rotation of a pupil field by any angle, on the pixels, as poppy does it."""
+"""Rotation of a sampled pupil field by any angle, as in poppy."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class SplineRotation:
         return taps
 
     def __call__(self, array: Tensor) -> Tensor:
-        """Rotate (..., rows, columns), real or complex; what comes from outside is zero."""
+        """Rotate (..., rows, columns), real or complex, with zeros outside the array."""
         kind = array.dtype
         real = torch.float32 if kind in (torch.float32, torch.complex64) else torch.float64
         device = array.device
@@ -80,7 +80,7 @@ class SplineRotation:
 
 
 class FreeRotation:
-    """A rotation of the field in a pupil by an angle that is no multiple of 90 deg.
+    """A rotation of the field in a pupil by any angle.
 
     Parameters
     ----------
@@ -91,15 +91,15 @@ class FreeRotation:
     parameters: tuple[str, ...] = ()
 
     def __init__(self, angle: float, npix: int, diameter: float, name: str) -> None:
-        self.name, self.angle = name, angle
+        self.name = name
         self._full = PupilGrid.full(npix, diameter)
         self._rotation = SplineRotation(-angle, (npix, npix))
 
     def window(self, values: Values) -> PupilGrid:
-        """All of the pupil."""
+        """The whole pupil."""
         return self._full
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
-        """Rotate, on the array of the pupil alone."""
+        """Rotate the field on the array of the pupil."""
         field = self._rotation(wavefront.grid.crop(wavefront.field, self._full))
         return replace(wavefront, field=self._full.crop(field, onto), grid=onto)

@@ -1,7 +1,7 @@
-"""Planes made from arrays that somebody else sampled, in whatever frame they come.
+"""Planes made from sampled arrays in any orientation.
 
-Inside a system every pupil array has the frame in which `propagation` makes the final image. The
-planes here take arrays in the frame of their own plane and turn them.
+Inside a system all pupil arrays have the frame in which `fourier` makes the final image. The planes
+here take arrays in the frame of their own plane and turn them.
 """
 
 from __future__ import annotations
@@ -9,24 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.detector import Detector
-from pyklip_diffrender.optics.differentiation import is_plain
+from pyklip_diffrender.optics.differentiation import Position, kept, position_of
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.orientation import Orientation
-from pyklip_diffrender.optics.planes import EntrancePupil, Values, Wavefront
+from pyklip_diffrender.optics.planes import EntrancePupil, Values, Wavefront, phase_factor
 from pyklip_diffrender.optics.zernike import zernike_basis
+from pyklip_diffrender.parameters import parameter
 
 __all__ = [
     "AberrationOptic",
     "Gain",
     "MovableStop",
-    "OffsetDetector",
     "OrientedPupil",
     "PupilOptic",
 ]
@@ -38,21 +36,21 @@ class OrientedPupil(EntrancePupil):
     Parameters
     ----------
     amplitude, opd : Tensor, (npix, npix)
-        Amplitude transmission and OPD (m), frame of the entrance pupil. The OPD is what the
-        system has when it is called without one.
+        Amplitude transmission and OPD (m), frame of the entrance pupil. The OPD is used in calls
+        without one.
     orientation : Orientation
         From the frame of the entrance pupil to that of the system.
     pointing : tuple of float
         x, y in arcsec on the image, added to every star offset.
     chromatic : mapping of float to Tensor
-        Wavelength (m) to an OPD (m) that is added whatever the OPD of the call, frame of the
-        entrance pupil.
+        Wavelength (m) to an OPD (m) that is added to that of every call, frame of the entrance
+        pupil.
     turned : float
-        How far planes behind turn the image, degrees counter-clockwise; a source is tilted the
-        other way, so that it ends up where it was asked for.
+        Rotation of the image by planes behind, degrees counter-clockwise; sources are rotated the
+        other way, so that they appear at their star offset.
     collected : float, optional
-        Sum of the squared amplitude of the true pupil, in units of a sample's area. By default
-        that of `amplitude`; samples that are means over partly blocked areas have less.
+        Sum of the squared amplitude of the true pupil, in units of a sample's area. Default that of
+        `amplitude`, which is smaller if samples are means over partly blocked areas.
     """
 
     def __init__(
@@ -76,7 +74,7 @@ class OrientedPupil(EntrancePupil):
             self.total = collected
         self.opd = opd.to(device, torch.float64)
         self.lit = (amplitude > 0).to(device)
-        """Where light passes, (npix, npix), in the frame of the OPD."""
+        """Samples that transmit light, (npix, npix), in the frame of the OPD."""
         self.orientation = orientation
         self.pointing = torch.tensor(pointing, dtype=torch.float64, device=device)
         self.chromatic = {w: extra.to(device) for w, extra in (chromatic or {}).items()}
@@ -114,7 +112,7 @@ class PupilOptic:
         From the frame of this plane to that of the system.
     trainable : bool
         Make the leaf tensors `opd` (m, added) and `transmission` (a factor), both (npix, npix) in
-        the frame of this plane, for whoever wants their gradients.
+        the frame of this plane, to optimise by their gradients.
     """
 
     parameters: tuple[str, ...] = ()
@@ -150,19 +148,19 @@ class PupilOptic:
             self.transmission = torch.ones_like(self.opd).requires_grad_()
 
     def window(self, values: Values) -> PupilGrid:
-        """Where it lets light through at some wavelength."""
+        """The window with all samples that transmit light at some wavelength."""
         return self.grid
 
     def _turned(self, array: Tensor) -> Tensor:
         return self._full.crop(self.orientation.apply(array), self.grid).to(self._dtype)
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
-        """Multiply by the phasor, and by what is being trained."""
+        """Multiply by the phasor and the trainable factors."""
         field = wavefront.grid.crop(wavefront.field, self.grid)
         field = field * self._phasors[wavefront.wavelength]
         if self.opd is not None and self.transmission is not None:
-            phase = (2 * math.pi / wavefront.wavelength) * self._turned(self.opd)
-            field = field * torch.polar(torch.ones_like(phase), phase)
+            opd = self._turned(self.opd)
+            field = field * phase_factor(opd, wavefront.wavelength, self._dtype)
             field = field * self._turned(self.transmission)
         return replace(wavefront, field=field, grid=self.grid)
 
@@ -170,66 +168,63 @@ class PupilOptic:
 class MovableStop(PupilOptic):
     """A stop known from its samples only, that can be shifted and turned.
 
-    At rest the samples are taken as they are. Elsewhere they are interpolated by cubic convolution
-    (R. Keys, IEEE Trans. Acoust. Speech Signal Process. 29, 1153, 1981), which shifts by whole
-    samples leave exact. Parameters as of `planes.LyotStop`.
+    At rest the samples are used directly. Elsewhere they are interpolated by cubic convolution
+    (R. Keys, IEEE Trans. Acoust. Speech Signal Process. 29, 1153, 1981), which is exact for shifts
+    by whole samples. Parameters as for `planes.LyotStop`.
     """
 
     parameters = ("lyot_shift", "lyot_rotation")
     margin = 0.06
     """Room for shifts and rotations, as a fraction of the diameter."""
-    _latest: tuple[Any, Tensor] | None = None
+
+    @cached_property
+    def _latest(self) -> dict[tuple[int, PupilGrid], tuple[Position, Tensor]]:
+        return {}
 
     def _moves(self, values: Values) -> bool:
         return any(name in values for name in self.parameters)
 
     def window(self, values: Values) -> PupilGrid:
-        """See `PupilOptic.window`; with a margin if the stop may move."""
+        """See `PupilOptic.window`; with a margin if the stop is moved."""
         if not self._moves(values):
             return self.grid
         return self.grid.widened(self.margin * self._full.diameter)
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
-        """Multiply by the stop where it is."""
+        """Multiply by the stop at its position."""
         if not self._moves(values):
             return super().apply(wavefront, values, onto)
         window = self.window(values)
         field = wavefront.grid.crop(wavefront.field, window)
-        stop = self._moved(self._phasors[wavefront.wavelength], window, values)
+        phasor = self._phasors[wavefront.wavelength]
+        stop = kept(
+            self._latest,
+            (id(phasor), window),
+            position_of(values, self.parameters),
+            lambda: self._moved(phasor, window, values),
+        )
         return replace(wavefront, field=field * stop, grid=window)
 
     def _moved(self, phasor: Tensor, window: PupilGrid, values: Values) -> Tensor:
-        """The stop on a window; kept for the values that it was last computed with."""
-        moving = [value for name in self.parameters if (value := values.get(name)) is not None]
-        key = None
-        if all(is_plain(value) for value in moving):
-            numbers = tuple(tuple(value.flatten().tolist()) for value in moving)
-            key = (id(phasor), window, "lyot_shift" in values, numbers)
-            # Looked at once, for another thread may put its own there at any moment.
-            latest = self._latest
-            if latest is not None and latest[0] == key:
-                return latest[1]
+        """The shifted and rotated stop on a window."""
         zero = torch.zeros(2, dtype=torch.float64, device=phasor.device)
         shift = values.get("lyot_shift", zero) * self._full.diameter
         angle = torch.deg2rad(values.get("lyot_rotation", zero[:1])).reshape(())
         x = window.x.to(phasor.device)[None, :] - shift[0]
         y = window.y.to(phasor.device)[:, None] - shift[1]
-        # From where each sample of the moved stop comes: the motion backwards.
+        # The position in the stop at rest of each sample: the inverse motion.
         from_x = torch.cos(angle) * x + torch.sin(angle) * y
         from_y = -torch.sin(angle) * x + torch.cos(angle) * y
         spacing = self.grid.spacing
         rows = (from_y - float(self.grid.y[0])) / spacing
         columns = (from_x - float(self.grid.x[0])) / spacing
-        found = _cubic(phasor, rows, columns)
-        if key is not None:
-            self._latest = (key, found)
-        return found
+        return _cubic(phasor, rows, columns)
 
 
 def _cubic(array: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     """Values of an array at positions in samples, by cubic convolution; zero outside.
 
-    Made of operations that have derivatives of both modes, unlike torch's `grid_sample`.
+    Differentiable in forward and reverse mode, unlike torch's `grid_sample`.
 
     Parameters
     ----------
@@ -237,7 +232,7 @@ def _cubic(array: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     rows, columns : Tensor, (...)
     """
     ny, nx = array.shape
-    edge = 4  # Positions far outside are moved here, where all four samples are zero.
+    edge = 4  # Positions far outside are clamped to this margin of zeros.
     flat = torch.nn.functional.pad(array, (edge,) * 4).flatten()
     taps = []
     for position, count in ((rows, ny), (columns, nx)):
@@ -263,36 +258,29 @@ def _cubic(array: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
 
 
 class AberrationOptic(PupilOptic):
-    """An aberration known from its samples, plus free Zernikes as `planes.InternalAberration`."""
+    """A sampled aberration plus free Zernikes as in `planes.InternalAberration`."""
 
     parameters = ("si_zernikes",)
-    _known: tuple[PupilGrid, Tensor] | None = None
 
-    def _basis(self, count: int, wavefront: Wavefront) -> Tensor:
-        grid = wavefront.grid
-        # Looked at once, for another thread may put its own there at any moment.
-        known = self._known
-        if known is None or known[0] != grid or len(known[1]) != count:
-            basis = zernike_basis(count, grid.x, grid.y, grid.diameter / 2)
-            known = (grid, basis.to(wavefront.field.device))
-            self._known = known
-        return known[1]
+    @cached_property
+    def _zernikes(self) -> Tensor:
+        count = parameter("si_zernikes").size
+        basis = zernike_basis(count, self.grid.x, self.grid.y, self.grid.diameter / 2)
+        return basis.to(next(iter(self._phasors.values())).device)
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
-        """Multiply by the phasor, and by that of the Zernikes."""
+        """Multiply by the phasors of the samples and of the Zernikes."""
         wavefront = super().apply(wavefront, values, onto)
         if "si_zernikes" not in values:
             return wavefront
-        coefficients = values["si_zernikes"]
-        opd = torch.tensordot(coefficients, self._basis(len(coefficients), wavefront), dims=1)
-        phase = ((2 * math.pi / wavefront.wavelength) * opd).to(self._dtype)
-        phasor = torch.polar(torch.ones_like(phase), phase)
-        return replace(wavefront, field=wavefront.field * phasor)
+        opd = torch.tensordot(values["si_zernikes"], self._zernikes, dims=1)
+        factor = phase_factor(opd, wavefront.wavelength, self._dtype)
+        return replace(wavefront, field=wavefront.field * factor)
 
 
 @dataclass
 class Gain:
-    """A uniform factor; 1 for a plane that is there in name only.
+    """A uniform factor; 1 for a plane without effect on the field.
 
     Attributes
     ----------
@@ -306,7 +294,7 @@ class Gain:
     parameters: tuple[str, ...] = ()
 
     def window(self, values: Values) -> None:
-        """Takes what comes."""
+        """See `Plane`: the whole field passes."""
         return None
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
@@ -314,21 +302,3 @@ class Gain:
         if self.factor == 1:
             return wavefront
         return replace(wavefront, field=wavefront.field * self.factor)
-
-
-@dataclass
-class OffsetDetector(Detector):
-    """A detector whose middle is beside the optical axis.
-
-    Attributes
-    ----------
-    centre : tuple of float
-        x, y of its middle on the image, arcsec.
-    """
-
-    centre: tuple[float, float] = (0.0, 0.0)
-
-    def axes(self, values: Values) -> tuple[Tensor, Tensor]:
-        """See `Detector.axes`."""
-        x, y = super().axes(values)
-        return x + self.centre[0] * ARCSEC, y + self.centre[1] * ARCSEC

@@ -1,4 +1,4 @@
-"""How fine a model has to be for a scene: measured on it, chosen, and verified."""
+"""Choose how fine a model must be for a scene, by measuring the errors of cheaper settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings that a plan chooses between, and how it states an error of the star model."""
+"""The settings that a plan chooses, and its measure of the error of a star model."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Self
 __all__ = ["Choice", "Economy", "ModelError", "Option"]
 
 _WORST = 10.0
-"""Largest error of a single pixel, as a multiple of the budget for the rms."""
+"""Largest allowed error of a single pixel, as a multiple of the budget for the rms."""
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,10 @@ class Choice:
     npix : int
         Samples across the pupil.
     multifidelity : bool
-        Whether the coarse pupil gives only the change of the field since the starting wavefront,
-        where the field is that of the model as given.
+        Whether the coarse pupil is used only for the change of the field since the starting
+        wavefront, at which the field is that of the full model.
     wavelengths : int
-        Number of wavelengths, the nodes of a Gauss quadrature of the model's.
+        Number of wavelengths, as nodes of a Gauss quadrature of the model's bandpass.
     cycles : float
         Highest spatial frequency of the wavefront modes, cycles across the pupil.
     """
@@ -37,7 +37,7 @@ class Choice:
 
     @property
     def system(self) -> Self:
-        """The settings of the optical system alone, without that of the fit."""
+        """The settings of the optical system alone, without those of the fit."""
         return replace(self, cycles=0.0)
 
 
@@ -55,19 +55,19 @@ class ModelError:
     @classmethod
     def in_quadrature(cls, errors: Iterable[ModelError]) -> ModelError:
         """Sum of independent errors."""
-        several = list(errors)
-        return cls(math.hypot(*(e.rms for e in several)), math.hypot(*(e.worst for e in several)))
+        errors = list(errors)
+        return cls(math.hypot(*(e.rms for e in errors)), math.hypot(*(e.worst for e in errors)))
 
     @classmethod
     def largest(cls, errors: Iterable[ModelError]) -> ModelError:
         """The largest rms and the largest worst pixel."""
-        several = list(errors)
-        return cls(max(e.rms for e in several), max(e.worst for e in several))
+        errors = list(errors)
+        return cls(max(e.rms for e in errors), max(e.worst for e in errors))
 
 
 @dataclass(frozen=True)
 class Option:
-    """Fields of `Choice` that may be changed, and the error that this alone causes."""
+    """Changed fields of `Choice`, and the error that this change alone causes."""
 
     changes: dict[str, Any]
     error: ModelError = field(default_factory=ModelError)
@@ -81,9 +81,9 @@ class Economy:
     ----------
     name : str
     options : tuple of Option
-        From cheap to fine; the last is the model as given, or what the caller has pinned.
+        From cheap to fine; the last is the full model, or the setting that the caller keeps.
     note : str
-        Why there is only one option, where that is so.
+        Why there is only one option, if so.
     """
 
     name: str

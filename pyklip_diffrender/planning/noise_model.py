@@ -1,4 +1,4 @@
-"""What a scene allows: the noise of every pixel, and how far the wavefront may have moved."""
+"""The noise of a scene, the expected drift of its wavefront, and what a fit leaves of an error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Drift", "NoiseModel", "RidgeResidual", "least_squares"]
 
 
 def least_squares(columns: Sequence[Tensor], data: Tensor) -> tuple[list[float], Tensor]:
-    """Coefficients of columns of any scale that fit the data best, and the residual."""
+    """Best-fitting coefficients of columns of any scale, and the residual."""
     design = torch.stack(list(columns), dim=1)
     length = torch.linalg.vector_norm(design, dim=0).clamp(min=1e-300)
     design = design / length
@@ -31,19 +31,19 @@ def least_squares(columns: Sequence[Tensor], data: Tensor) -> tuple[list[float],
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """A star and the noise in which it is seen.
+    """The image of a star and its noise.
 
     Attributes
     ----------
     image : Tensor, (ny, nx), float64
         The star at flux 1.
     flux : float
-        Light that the pupil collects, in the unit of the noise.
+        Light collected by the pupil, in the unit of the noise.
     sigma : Tensor, (ny, nx)
         Standard deviation of every pixel.
     valid : Tensor of bool, (ny, nx)
     residual : Tensor, (ny, nx), or None
-        Data less star and background, where there are data.
+        Data minus star and background, if there are data.
     """
 
     image: Tensor
@@ -54,10 +54,10 @@ class NoiseModel:
 
     @classmethod
     def of(cls, subject: Scene | Observation, image: Tensor, share: float = 0.0) -> NoiseModel:
-        """Noise of a star that is to be simulated, or of frames.
+        """Noise of a scene to be simulated, or of frames.
 
-        A simulated star has photon noise of star and background, and read noise; frames have
-        errors of their own, and the flux at which the image fits them best.
+        A scene has photon noise of star and background, and read noise. Frames have their own
+        errors, and the flux is that of the best fit of the image.
 
         Parameters
         ----------
@@ -65,7 +65,7 @@ class NoiseModel:
         image : Tensor, (ny, nx)
             The star at flux 1.
         share : float
-            Share of the star that the model may miss; adds to the noise in quadrature.
+            Model error as a fraction of the star, added to the noise in quadrature.
 
         Raises
         ------
@@ -84,12 +84,12 @@ class NoiseModel:
                 )
             frame = subject.combined()
             data, sigma, valid = (
-                torch.from_numpy(each[0]).to(image.device)
-                for each in (frame.data, frame.error, frame.valid)
+                torch.from_numpy(array[0]).to(image.device)
+                for array in (frame.data, frame.error, frame.valid)
             )
             if not bool(valid.any()):
                 raise NoValidPixelsError(f"{subject.name}: all pixels are masked")
-            # Equal weights: those of photon noise would trust only the faint pixels.
+            # Equal weights, because those of photon noise would rely on the faint pixels only.
             columns = [image[valid], torch.ones_like(image[valid])]
             (flux, level), _ = least_squares(columns, data[valid])
             residual = data - flux * image - level
@@ -97,18 +97,18 @@ class NoiseModel:
         return cls(image, flux, torch.hypot(sigma, share * flux * image), valid, residual)
 
     def in_sigma(self, change: Tensor) -> Tensor:
-        """A change of the image at flux 1, (..., ny, nx), in units of the noise; 0 if masked."""
+        """Change of the image at flux 1, (..., ny, nx), in units of the noise; 0 if masked."""
         return torch.where(self.valid, self.flux * change / self.sigma, 0.0)
 
     def unexplained(self, change: Tensor) -> Tensor:
-        """As `in_sigma`, less what another flux and background would explain.
+        """As `in_sigma`, without what a change of flux and background would explain.
 
-        Every fit has these two free; nothing else is taken off.
+        These two are free in every fit.
         """
         columns = [self.in_sigma(self.image)[self.valid], 1 / self.sigma[self.valid]]
-        left = torch.zeros_like(self.image)
-        left[self.valid] = least_squares(columns, self.in_sigma(change)[self.valid])[1]
-        return left
+        residual = torch.zeros_like(self.image)
+        residual[self.valid] = least_squares(columns, self.in_sigma(change)[self.valid])[1]
+        return residual
 
     def error(self, whitened: Tensor) -> ModelError:
         """Size of an image in units of the noise, over the valid pixels."""
@@ -145,8 +145,8 @@ class Drift:
         return int((self.basis.frequencies <= cycles).sum())
 
     def opd(self, which: int, cycles: float, grid: PupilGrid) -> Tensor:
-        """One of the draws, with its modes up to a spatial frequency, (npix, npix), m."""
-        # Seeds of different plans must not share their draws.
+        """Draw number `which`, with its modes up to a spatial frequency, (npix, npix), m."""
+        # Plans with different seeds must not share draws.
         generator = torch.Generator().manual_seed(1000 * self.seed + which)
         unit = torch.randn(len(self.basis), generator=generator, dtype=torch.float64)
         drawn = torch.where(self.basis.frequencies <= cycles, self.deviation * unit, 0.0)
@@ -154,7 +154,7 @@ class Drift:
 
 
 class RidgeResidual:
-    """What a linear fit of wavefront modes, with their prior, leaves of an error.
+    """The residual of an error after a linear fit of wavefront modes with their prior.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ class RidgeResidual:
         self._slopes = slopes.flatten(1)
         self._curvature = self._slopes @ self._slopes.T
 
-    def left(self, whitened: Tensor, modes: int) -> Tensor:
+    def residual(self, whitened: Tensor, modes: int) -> Tensor:
         """Residual of an error, (ny, nx) in units of the noise, after a fit of the first modes."""
         rows, flat = self._slopes[:modes], whitened.flatten()
         system = self._curvature[:modes, :modes] + torch.eye(len(rows)).to(rows)

@@ -1,4 +1,4 @@
-"""`plan`: measure the economies, pick the cheapest set inside the budget, verify it as a whole."""
+"""`plan`: measure economies, choose the cheapest set within the budget, verify it as a whole."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["plan"]
 _log = logging.getLogger(__name__)
 
 _SHARE_OF_BUDGET = 0.9
-"""Part of the budget that the expected errors may fill: they differ between wavefronts."""
+"""Fraction of the budget for the expected errors, which differ between wavefronts."""
 
 
 def plan(
@@ -48,40 +48,40 @@ def plan(
     """Find the cheapest settings that model a star to within a fraction of its noise.
 
     Every economy is measured on the scene itself: the star is rendered with and without it, at
-    the starting wavefront and after a drift drawn from the prior, and compared in units of the
-    pixel noise. What another flux and background would explain is taken off, because every fit
-    has them free. Errors of several economies add in quadrature. The chosen set is rendered as a
-    whole, at a wavefront that no probe has seen; if its error exceeds the budget, the economy that
-    matters most is made finer and the set is verified again.
+    the starting wavefront and after a drift drawn from the prior, and the difference is taken in
+    units of the pixel noise. Flux and background, which are free in every fit, are fitted to the
+    difference and subtracted. Errors of several economies add in quadrature. The chosen set is
+    rendered as a whole at an independent wavefront; if its error exceeds the budget, the economy
+    that matters most is made finer and the set is verified again.
 
     Parameters
     ----------
     model : OpticalSystem
-        As fine as wanted: errors are relative to it, and no setting becomes finer than its own.
-        Settings that it cannot change (see `OpticalSystem.adjustable`) stay as they are.
+        The finest model: errors are relative to it, and no setting becomes finer. Settings that it
+        cannot change (see `OpticalSystem.adjustable`) stay as they are.
     subject : Scene or Observation
-        A star that is to be simulated, or frames. For frames, the prior is widened until it
-        explains how far the star is from them.
+        A scene to be simulated, or frames. For frames, the prior is widened until it explains
+        their misfit at the start.
     opd : path, OPDMap, Quantity or array
         Wavefront to start from, as for `refine`.
     error_budget : float
         Largest rms error of the star model over the valid pixels, in units of their noise. The
-        worst pixel may be ten times as far off.
+        error of a single pixel may be ten times as large.
     keep : mapping, optional
-        Settings that are decided: fields of `planning.Choice`, such as ``npix`` and ``cycles``.
+        Fixed settings: fields of `planning.Choice`, such as ``npix`` and ``cycles``.
     start : mapping, optional
         The model's other parameters, as for `refine`.
     prior : WavefrontPrior, optional
-        How far the wavefront may have moved.
+        Expected drift of the wavefront.
     cycles : sequence of float
-        Highest spatial frequencies of the modes that a fit may use, see `refine`; the first is
-        that of the finest set here.
+        Highest spatial frequencies of the modes that a fit may use, see `refine`; the plan starts
+        from the first.
     response_npix : int
-        Pupil samples of the copy that computes derivatives; see `refine`.
+        Pupil samples for derivatives; see `refine`.
     model_error : float
-        Fraction of the star that the model may miss anyway (`GaussNewton.min_model_error`).
+        Known model error as a fraction of the star (`GaussNewton.min_model_error`).
     seed : int
-        Of the wavefronts that are drawn.
+        Random seed of the drifts.
 
     Returns
     -------
@@ -93,15 +93,15 @@ def plan(
     MissingOPDError
         If `opd` is None.
     IncompatibleSetupError
-        For a setting in `keep` that is unknown or cannot be had, a budget that is not positive,
-        no `cycles`, or a subject of another type.
+        For a setting in `keep` that is unknown or not available, a budget that is not positive, no
+        `cycles`, or a subject of another type.
     ShapeError, NoValidPixelsError
         For frames of another shape than the model's, or without valid pixels.
 
     Warns
     -----
     DiffrenderWarning
-        If the settings in `keep` do not fit into the budget.
+        If the settings in `keep` exceed the budget.
     """
     if opd is None:
         raise MissingOPDError("plan needs the wavefront that the refinement will start from")
@@ -116,7 +116,7 @@ def plan(
             f"plan: got a {type(subject).__name__} to plan for, expected a Scene or an Observation"
         )
     pins = dict(keep or {})
-    known = [each.name for each in fields(Choice)]
+    known = [setting.name for setting in fields(Choice)]
     if unknown := [name for name in pins if name not in known]:
         raise IncompatibleSetupError(
             f"keep: got {unknown}, expected settings that a plan chooses: {', '.join(known)}"
@@ -178,13 +178,13 @@ def _choice(trial: Trial, picked: Iterable[Option]) -> Choice:
 
 
 def _cheapest(trial: Trial, economies: Sequence[Economy]) -> list[Option]:
-    """Of all sets whose errors together stay inside the budget, the one that takes least time."""
+    """The fastest of all sets of options whose combined error is within the budget."""
     room = _SHARE_OF_BUDGET * trial.budget
     offered = []
     for economy in economies:
-        fitting = [each for each in economy.options if each.error.inside(room)]
-        # What is pinned may be outside; then the best of it is taken, and the rest stays fine.
-        offered.append(fitting or [min(economy.options, key=lambda each: each.error.rms)])
+        fitting = [option for option in economy.options if option.error.inside(room)]
+        # Settings that the caller keeps may exceed it; then take the best of them.
+        offered.append(fitting or [min(economy.options, key=lambda option: option.error.rms)])
 
     def rank(picked: Iterable[Option]) -> tuple[bool, float, float]:
         error = ModelError.in_quadrature(option.error for option in picked)
@@ -198,7 +198,7 @@ def _cheapest(trial: Trial, economies: Sequence[Economy]) -> list[Option]:
 def _verified(
     trial: Trial, economies: Sequence[Economy], picked: list[Option]
 ) -> tuple[list[Option], ModelError, list[str]]:
-    """Verify as a whole; as long as that is outside the budget, make finer what matters most."""
+    """Verify the set as a whole; while over the budget, refine what matters most."""
     steps: list[str] = []
     while True:
         error = trial.verified(_choice(trial, picked))
@@ -207,13 +207,13 @@ def _verified(
         tried = []
         for k, economy in enumerate(economies):
             after = economy.options[economy.options.index(picked[k]) + 1 :]
-            finer = [each for each in after if each.error.rms <= picked[k].error.rms]
+            finer = [option for option in after if option.error.rms <= picked[k].error.rms]
             if finer:
-                # Whatever the probes say of it: one of them may be wrong.
+                # Each is rendered, because the errors that the probes expect may be wrong.
                 other = [*picked[:k], finer[0], *picked[k + 1 :]]
                 tried.append((trial.verified(_choice(trial, other)).rms, k, other))
         if not tried:
             return picked, error, steps
-        _, k, picked = min(tried, key=lambda each: each[:2])
+        _, k, picked = min(tried, key=lambda attempt: attempt[:2])
         steps.append(economies[k].name)
         _log.info("verification: %.3g sigma; finer: %s", error.rms, economies[k].name)

@@ -1,7 +1,7 @@
-"""What each economy costs on a scene: one function for each, all of the same shape.
+"""Probes: functions that measure the errors of an economy on a scene.
 
-A probe takes a trial and returns an `Economy`: its options from cheap to fine, each with the error
-that it causes alone, in units of the pixel noise.
+A probe takes a `Trial` and returns an `Economy`: its options from cheap to fine, each with the
+error that it causes alone, in units of the pixel noise.
 """
 
 from __future__ import annotations
@@ -22,33 +22,30 @@ __all__ = ["PROBES"]
 Candidates = list[dict[str, Any]]
 
 _PAYS = 0.2
-"""Share of the time that an economy must be able to save to be worth a measurement."""
+"""Fraction of the time that an economy must be able to save to be worth measuring."""
 
 _FEW = 0.4
-"""Share of all modes above which a fit of them is not tried: it costs more than it can save."""
+"""Fraction of all modes above which fitting them costs more than it can save."""
 
 _GOOD = 0.3
-"""Share of the budget below which nothing finer is measured."""
+"""Fraction of the budget below which nothing finer is measured."""
 
 _RING = 2.0
-"""Step between the spatial frequencies that are tried, cycles across the pupil."""
+"""Step between candidate spatial frequencies, cycles across the pupil."""
 
 
-def _allowed(candidates: Candidates, given: dict[str, Any], trial: Trial) -> Candidates:
-    """The candidates, and what was given, that agree with what is pinned."""
-    pins = {name: trial.pins[name] for name in given if name in trial.pins}
-    everything = [*(each for each in candidates if each != given), given]
-    kept = [each for each in everything if all(each[name] == pins[name] for name in pins)]
-    if not kept:
-        offered = [tuple(each[name] for name in pins) for each in everything]
+def _allowed(candidates: Candidates, full: dict[str, Any], trial: Trial) -> Candidates:
+    """Of the candidates and the full model's setting, those that the caller's pins allow."""
+    pins = {name: trial.pins[name] for name in full if name in trial.pins}
+    everything = [*(option for option in candidates if option != full), full]
+    allowed = [option for option in everything if all(option[name] == pins[name] for name in pins)]
+    if not allowed:
+        offered = [tuple(option[name] for name in pins) for option in everything]
         raise IncompatibleSetupError(
             f"keep: got {', '.join(f'{n}={value!r}' for n, value in pins.items())}; this model "
             f"offers ({', '.join(pins)}) = {', '.join(map(str, dict.fromkeys(offered)))}"
         )
-    return kept
-
-
-_FIXED = "the model cannot change it"
+    return allowed
 
 
 def _measured(
@@ -61,54 +58,54 @@ def _measured(
     fixed: str = "",
     monotonic: bool = False,
 ) -> Economy:
-    """Options with their errors; only the model as given, if nothing else would pay.
+    """Options with their errors; only the full model if nothing else would pay.
 
-    Measured are options from cheap to fine until one is good; where errors fall with the cost of
-    an option, from the cheapest that is inside the budget, which is found by bisection. `fixed`
-    says what this system cannot change.
+    Options are measured from cheap to fine until one is good. If errors decrease with cost
+    (`monotonic`), the first is the cheapest within the budget, found by bisection. `fixed` says
+    why the system cannot change these settings.
     """
-    given = {field: getattr(trial.finest, field) for field in fields}
-    options = _allowed([] if fixed else candidates, given, trial)
+    full = {field: getattr(trial.finest, field) for field in fields}
+    options = _allowed([] if fixed else candidates, full, trial)
     pinned = not trial.pins.keys().isdisjoint(fields)
-    if options == [given]:
-        return Economy(name, (Option(given),), "kept as asked" if pinned else fixed or "no choice")
-    seconds = [trial.seconds(replace(trial.likely, **each)) for each in options]
-    whole = trial.seconds(trial.likely)
-    if not pinned and whole - min(seconds) < _PAYS * whole:
-        return Economy(name, (Option(given),), "would hardly save time")
+    if options == [full]:
+        return Economy(name, (Option(full),), "kept as asked" if pinned else fixed or "no choice")
+    seconds = [trial.seconds(replace(trial.likely, **option)) for option in options]
+    now = trial.seconds(trial.likely)
+    if not pinned and now - min(seconds) < _PAYS * now:
+        return Economy(name, (Option(full),), "would hardly save time")
     order = sorted(range(len(options)), key=lambda k: seconds[k])
-    cheaper = [options[k] for k in order if options[k] != given]
-    seen: dict[int, Option] = {}
+    cheaper = [options[k] for k in order if options[k] != full]
+    measured: dict[int, Option] = {}
 
     def measure(k: int) -> ModelError:
-        if k not in seen:
-            seen[k] = Option(cheaper[k], error(replace(trial.finest, **cheaper[k])))
-        return seen[k].error
+        if k not in measured:
+            measured[k] = Option(cheaper[k], error(replace(trial.finest, **cheaper[k])))
+        return measured[k].error
 
-    places, first = range(len(cheaper)), 0
+    indices, first = range(len(cheaper)), 0
     if monotonic:
-        first = bisect_left(places, True, key=lambda k: measure(k).inside(trial.budget))
-    next((k for k in places[first:] if measure(k).rms < _GOOD * trial.budget), None)
-    finest = [Option(given)] if given in options else []
-    return Economy(name, (*(seen[k] for k in sorted(seen)), *finest))
+        first = bisect_left(indices, True, key=lambda k: measure(k).inside(trial.budget))
+    next((k for k in indices[first:] if measure(k).rms < _GOOD * trial.budget), None)
+    finest = [Option(full)] if full in options else []
+    return Economy(name, (*(measured[k] for k in sorted(measured)), *finest))
 
 
 def _rendered(trial: Trial, base: Choice | None = None) -> Callable[[Choice], ModelError]:
-    """Error of a rendered star, the larger of that at the start and that after a drift."""
+    """Error of a rendered star: the larger of those at the start and after a drift."""
     return lambda choice: ModelError.largest(
         trial.error(choice, which, base) for which in (START, PROBED)
     )
 
 
 def wavefront_modes(trial: Trial) -> Economy:
-    """Without the wavefront's fine structure.
+    """Economy: fewer modes, without the fine structure of the wavefront.
 
-    On a small field many modes do the same to the star, and those that are fitted make up for
-    those that are not: then what counts is what such a fit leaves.
+    On a small field many modes have the same effect on the star, so fitted modes compensate for
+    omitted ones. The error is then the residual of such a fit.
     """
     finest, detector = trial.finest.cycles, trial.model.detector
     steps = [_RING * (k + 1) for k in range(math.ceil(finest / _RING) - 1)]
-    # A mode of so many cycles puts its light at the edge of the field.
+    # A mode with this many cycles diffracts light to the edge of the field.
     (ny, nx), (x, y) = detector.shape, detector.pixelscale
     edge = min(nx * x, ny * y) / 2 * ARCSEC
     reach = edge * trial.model.diameter / trial.model.bandpass.mean_wavelength
@@ -125,9 +122,9 @@ def wavefront_modes(trial: Trial) -> Economy:
 
 
 def wavelengths(trial: Trial) -> Economy:
-    """Fewer wavelengths, placed as Gauss quadrature has them."""
+    """Economy: fewer wavelengths, at the nodes of a Gauss quadrature."""
     count = trial.finest.wavelengths
-    # Their error is the same on any pupil: it is measured on a coarse one.
+    # Their error hardly depends on the pupil grid, so it is measured on a coarse one.
     npix, fixed = trial.rough.npix, "the wavelengths of this system are fixed"
     error = _rendered(trial, replace(trial.finest, npix=npix))
     return _measured(
@@ -142,11 +139,11 @@ def wavelengths(trial: Trial) -> Economy:
 
 
 def pupil_grid(trial: Trial) -> Economy:
-    """Fewer samples across the pupil, for all of the field or for its changes only."""
+    """Economy: fewer samples across the pupil, for the whole field or only for its changes."""
     candidates: Candidates = []
     for npix in trial.grids:
         candidates.append({"npix": npix, "multifidelity": False})
-        # Steps from a fine field are those of the star: derivatives need a copy without.
+        # A constant is added to the field of the star only, so derivatives need another copy.
         if trial.response_npix < npix:
             candidates.append({"npix": npix, "multifidelity": True})
     can_change = "npix" in trial.model.adjustable
@@ -160,4 +157,4 @@ PROBES: dict[str, Callable[[Trial], Economy]] = {
     "wavelengths": wavelengths,
     "pupil grid": pupil_grid,
 }
-"""All economies, by name; first those that decide whether others pay."""
+"""All economies by name, starting with those that decide whether others pay."""

@@ -1,4 +1,4 @@
-"""`Plan`: the settings that were chosen, why, and what they save."""
+"""`Plan`: the chosen settings, the reasons for them, and the time they save."""
 
 from __future__ import annotations
 
@@ -23,30 +23,31 @@ class Plan:
     Attributes
     ----------
     model, given : OpticalSystem
-        The system to fit with, and the system as given, which errors are relative to.
+        The system to fit with, and the full system, to which errors are relative.
     choice : Choice
         All settings.
     refine_options : dict
-        What `refine` is told: ``cycles``.
+        Arguments for `refine`: ``cycles``.
     table : QTable
-        One row for each economy: ``what``, ``chosen``, ``finest``, ``why``; its ``error`` alone
-        and in the ``worst`` pixel, units of the noise; ``seconds`` of a refinement with it alone.
+        One row per economy: ``what``, ``chosen``, ``finest``, ``why``; the rms ``error`` that it
+        causes alone and that of the ``worst`` pixel, in units of the noise; ``seconds`` of a
+        refinement with it alone.
     budget : float
         Largest rms error, in units of the noise.
     error, verified_error : ModelError
-        Of all settings together: expected, and measured against the model as given.
+        Of all settings together: expected, and measured against the full model.
     seconds, seconds_given : float
-        Expected for a refinement on one core, counted from operations: with the plan, and with
-        everything as given. Ratios are good, absolute times depend on the machine.
+        Estimated for a refinement on one core from the number of operations: with the plan, and
+        with the full model. Ratios are accurate, absolute times depend on the machine.
     seed : int
-        Of the wavefronts that were drawn.
+        Random seed of the drifts.
     pinned, steps : tuple of str
-        Settings that the caller kept, and economies that the verification made finer again.
+        Settings kept by the caller, and economies that the verification made finer.
     final_error : ModelError, optional
-        Of the refined star, against the model as given at the wavefront of the solution; only in
-        the plan of a `Refinement`.
+        Of the refined star against the full model, at the fitted wavefront; only in the plan of a
+        `Refinement`.
     abandoned : bool
-        Whether that was too large, so that the fit went on with the model as given.
+        Whether that was too large, so that the fit continued with the full model.
     """
 
     model: OpticalSystem
@@ -96,7 +97,7 @@ class Plan:
         return "\n".join(line.rstrip() for line in lines)
 
     def summary(self) -> dict[str, Any]:
-        """The facts that belong in a header or a log: text and numbers by short names."""
+        """Values for a header or a log, by short names."""
         facts: dict[str, Any] = {
             **vars(self.choice),
             "budget": self.budget,
@@ -113,7 +114,7 @@ class Plan:
 
 
 def _label(name: str, choice: Choice) -> str:
-    """What a choice has of an economy, in words."""
+    """The setting of a choice that belongs to an economy, in words."""
     return {
         "pupil grid": f"{choice.npix}" + " for differences" * choice.multifidelity,
         "wavelengths": f"{choice.wavelengths}",

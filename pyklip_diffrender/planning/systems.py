@@ -1,4 +1,4 @@
-"""Cheaper copies of a system: fewer wavelengths, coarser pupils, steps from a finer one."""
+"""Cheaper copies of a system: fewer wavelengths, a coarser pupil, changes of a finer field."""
 
 from __future__ import annotations
 
@@ -20,54 +20,54 @@ __all__ = ["CheapSystem", "build", "coarse_steps", "quadrature"]
 
 
 class CheapSystem(OpticalSystem):
-    """Another system with other wavelengths, or with a constant added to its fields.
+    """A system with other wavelengths, or with a constant added to its fields.
 
     Parameters
     ----------
-    made : OpticalSystem
+    base : OpticalSystem
     bandpass : Bandpass, optional
-        Default that of `made`.
+        Default that of `base`.
     """
 
-    def __init__(self, made: OpticalSystem, bandpass: Bandpass | None = None) -> None:
-        # Planes that were sampled at some wavelengths are others at others.
-        made = made if bandpass is None else made.at_wavelengths(bandpass)
+    def __init__(self, base: OpticalSystem, bandpass: Bandpass | None = None) -> None:
+        # `at_wavelengths`, because planes may have to be sampled at the new wavelengths.
+        base = base if bandpass is None else base.at_wavelengths(bandpass)
         super().__init__(
-            made.entrance,
-            made.planes,
-            made.detector,
-            made.bandpass,
-            recipe=made.recipe,
-            route=made.route,
-            defaults=made.defaults,
+            base.entrance,
+            base.planes,
+            base.detector,
+            base.bandpass,
+            recipe=base.recipe,
+            route=base.route,
+            defaults=base.defaults,
         )
-        self._made = made
+        self._base = base
         self._constants: dict[float, Tensor] = {}
 
     @property
     def setup(self) -> dict[str, str]:
-        """As of the other system."""
-        return self._made.setup
+        """See `OpticalSystem.setup`."""
+        return self._base.setup
 
     @property
     def adjustable(self) -> frozenset[str]:
-        """As of the other system."""
-        return self._made.adjustable
+        """See `OpticalSystem.adjustable`."""
+        return self._base.adjustable
 
     def with_fidelity(self, **changes: Any) -> OpticalSystem:
         """See `OpticalSystem.with_fidelity`."""
-        return CheapSystem(self._made.with_fidelity(**changes))
+        return CheapSystem(self._base.with_fidelity(**changes))
 
     def stepping_from(self, fields: Sequence[Tensor], opd: Tensor, values: Values) -> Self:
-        """The same system, with a constant added to its fields that makes them right at one OPD.
+        """The same system with a constant added to its fields that makes them exact at one OPD.
 
-        Copies made by `with_fidelity` are without the constant: they serve derivatives, which it
-        does not change, and other sources than the star, for which it would be wrong. `fields` are
-        those of a finer system at `opd` (m, on this system's grid) and `values`.
+        `fields` are those of a finer system at `opd` (m, on this system's grid) and `values`.
+        Copies made by `with_fidelity` lack the constant: it does not change derivatives, for which
+        they are used, and would be wrong for sources other than the star.
         """
         with torch.no_grad():
-            there = self.fields(opd, **values)
-            constants = [fine - coarse for fine, coarse in zip(fields, there, strict=True)]
+            own = self.fields(opd, **values)
+            constants = [fine - coarse for fine, coarse in zip(fields, own, strict=True)]
         other = copy.copy(self)
         other._constants = dict(zip(self.bandpass.wavelengths, constants, strict=True))
         return other
@@ -81,21 +81,21 @@ class CheapSystem(OpticalSystem):
 def coarse_steps(
     model: OpticalSystem, opd0: Value, npix: int, dtype: torch.dtype | None = None
 ) -> CheapSystem:
-    """A coarse copy of a system whose star is exact at one wavefront and almost so near it.
+    """A coarse copy of a system whose star is exact at one wavefront and nearly so close to it.
 
-    Most of the error of a coarse pupil, how it samples segments and openings, does not depend on
-    the wavefront and cancels in ``E_fine(opd0) + E_coarse(opd) - E_coarse(opd0)``.
+    Most of the error of a coarse pupil comes from its sampling of segments and openings. It does
+    not depend on the wavefront and cancels in ``E_fine(opd0) + E_coarse(opd) - E_coarse(opd0)``.
 
     Parameters
     ----------
     model : OpticalSystem
         The fine system; its `npix` must be adjustable.
     opd0 : Tensor, Quantity or array, (model.npix, model.npix)
-        Where the fine field is taken, m.
+        Wavefront at which the copy is exact, m.
     npix : int
-        Pupil samples of the copy, which takes wavefronts on this grid; must divide the model's.
+        Pupil samples of the copy and of its wavefronts; must divide the model's.
     dtype : torch.dtype, optional
-        Of the copy; default the model's.
+        Type of the copy; default the model's.
     """
     coarse = CheapSystem(model.with_fidelity(npix=npix, dtype=dtype or model.dtype))
     with torch.no_grad():
@@ -104,24 +104,20 @@ def coarse_steps(
 
 
 def quadrature(bandpass: Bandpass, count: int) -> Bandpass:
-    """Fewer wavelengths with the same moments: Gauss quadrature of the given ones.
+    """Replace the wavelengths by `count` nodes of their Gauss quadrature.
 
-    `count` nodes integrate polynomials up to degree 2 `count` - 1 as the given ones do (G. Golub
-    and J. Welsch, Math. Comp. 23, 221, 1969).
-
-    Parameters
-    ----------
-    bandpass : Bandpass
-    count : int
-        With as many as there are, the bandpass itself is returned.
+    The nodes integrate polynomials up to degree 2 `count` - 1 exactly as the original wavelengths
+    do (G. Golub and J. Welsch, Math. Comp. 23, 221, 1969). A bandpass without more wavelengths
+    than `count` is returned unchanged.
     """
-    given = np.array(bandpass.wavelengths)
-    if count >= len(given):
+    wavelengths = np.array(bandpass.wavelengths)
+    if count >= len(wavelengths):
         return bandpass
-    middle, half = (given.max() + given.min()) / 2, (given.max() - given.min()) / 2
-    x = (given - middle) / half
-    # Polynomials that are orthonormal under the given weights, at the given wavelengths; in their
-    # basis, multiplication by x is a matrix whose eigenvalues are the nodes.
+    low, high = wavelengths.min(), wavelengths.max()
+    middle, half = (high + low) / 2, (high - low) / 2
+    x = (wavelengths - middle) / half
+    # Polynomials at these wavelengths, orthonormal under their weights. In this basis,
+    # multiplication by x is a matrix whose eigenvalues are the nodes.
     powers = np.polynomial.chebyshev.chebvander(x, count - 1)
     basis, _ = np.linalg.qr(np.sqrt(np.array(bandpass.weights))[:, None] * powers)
     nodes, vectors = np.linalg.eigh(basis.T @ (x[:, None] * basis))
@@ -129,6 +125,6 @@ def quadrature(bandpass: Bandpass, count: int) -> Bandpass:
 
 
 def build(model: OpticalSystem, choice: Choice) -> CheapSystem:
-    """The system of a choice, without the steps from a finer one."""
-    made = model if choice.npix == model.npix else model.with_fidelity(npix=choice.npix)
-    return CheapSystem(made, quadrature(model.bandpass, choice.wavelengths))
+    """The system of a choice, without the constant that makes it exact at one wavefront."""
+    base = model if choice.npix == model.npix else model.with_fidelity(npix=choice.npix)
+    return CheapSystem(base, quadrature(model.bandpass, choice.wavelengths))

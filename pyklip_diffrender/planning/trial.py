@@ -1,4 +1,4 @@
-"""Renders the star with the model as given and with cheaper ones, and compares."""
+"""Render the star with the full model and with cheaper ones, and compare them."""
 
 from __future__ import annotations
 
@@ -32,40 +32,40 @@ from pyklip_diffrender.wavefront.priors import WavefrontPrior
 __all__ = ["PROBED", "START", "Trial"]
 
 START, PROBED, VERIFIED = 0, 1, 2
-"""Wavefronts: the starting one, the drifted one of the probes, an independent one to verify."""
+"""Wavefronts: at the start, after the drift of the probes, after an independent drift."""
 
 _MORE = range(3, 19)
-"""Further drifts, which tell how far the prior expects the star to move: sixteen, for that of a
-single one is uncertain by a third."""
+"""Sixteen further drifts, for the change of the star that the prior expects; the change by a single
+drift is uncertain by a third."""
 
 _ALIGNMENT = ("star_offset", "lyot_shift", "lyot_rotation")
-"""Parameters whose misfit at the start is not that of the wavefront."""
+"""Parameters that contribute to the misfit at the start besides the wavefront."""
 
 _LEAST = 0.3
-"""The prior is never narrowed by more than this, however well the star fits the data."""
+"""Smallest factor by which the prior is narrowed if the star fits the data well."""
 
 _ROUGH_NPIX, _ROUGH_WAVELENGTHS = 256, 3
-"""Pupil samples and wavelengths at which differences that hardly depend on them are measured."""
+"""Pupil samples and wavelengths for differences that hardly depend on them."""
 
 
 @dataclass
 class Trial:
-    """A scene, the model of it as given, and what has been rendered so far.
+    """A scene, its full model, and the cached renderings.
 
-    Parameters are those of `plan`: `opd0` on the model's grid in m, `values` the model's other
-    parameters, `cycles` the highest frequency of the finest modes, `pins` what is to be kept;
-    `response_npix` becomes what this model and field need.
+    Parameters are those of `plan`: `opd0` is on the model's grid in m, `values` are the model's
+    other parameters, `cycles` is the highest frequency of the finest modes, `pins` are the settings
+    to keep. `response_npix` is raised to what model and field need.
 
     Attributes
     ----------
     finest : Choice
-        Everything as given.
+        The full model.
     rough : Choice
-        As given but for a coarse pupil and few wavelengths, where these can be had.
+        The same with a coarse pupil and few wavelengths, where possible.
     likely : Choice
-        With the cheapest good options of the economies that were probed.
+        With the cheapest good options of the economies probed so far.
     grids : list of int
-        Samples across coarser pupils that may be used, from coarse to fine.
+        Samples across usable coarser pupils, from coarse to fine.
     noise : NoiseModel
     drift : Drift
     """
@@ -92,16 +92,12 @@ class Trial:
             cycles=self.cycles,
         )
         halves = [model.npix >> k for k in range(6, 0, -1) if model.npix % (1 << k) == 0]
-        # The derivatives' grid is fine enough for the field, and that of a fixed model its own.
+        # The grid of the derivatives resolves the field; a fixed model keeps its own grid.
         self.grids = [npix for npix in halves if npix >= self.response_npix]
         waves = self.finest.wavelengths
-        self.rough = replace(
-            self.finest,
-            npix=next((npix for npix in self.grids if npix >= _ROUGH_NPIX), model.npix),
-            wavelengths=waves
-            if "bandpass" not in model.adjustable
-            else min(_ROUGH_WAVELENGTHS, waves),
-        )
+        few = min(_ROUGH_WAVELENGTHS, waves) if "bandpass" in model.adjustable else waves
+        npix = next((npix for npix in self.grids if npix >= _ROUGH_NPIX), model.npix)
+        self.rough = replace(self.finest, npix=npix, wavelengths=few)
         self._systems: dict[Choice, OpticalSystem] = {self.finest.system: model}
         self._images: dict[tuple[Choice, int], Tensor] = {}
         self._fields: dict[int, list[Tensor]] = {}
@@ -113,9 +109,9 @@ class Trial:
         self.drift.deviation *= self._misfit()
 
     def _misfit(self) -> float:
-        """Rms misfit of the starting star, relative to what the prior expects.
+        """Rms misfit of the star at the start, relative to the expectation of the prior.
 
-        Once star and Lyot stop are aligned; 1 where there are no data.
+        Taken after aligning star and Lyot stop; 1 if there are no data.
         """
         noise, valid = self.noise, self.noise.valid
         if noise.residual is None:
@@ -129,32 +125,32 @@ class Trial:
         rows = parameter_jacobian(coarse, small, values, names, fields)
         columns = [noise.in_sigma(row)[valid] for row in (*rows, noise.image)]
         columns.append(1 / noise.sigma[valid])
-        left = least_squares(columns, (noise.residual / noise.sigma)[valid])[1]
-        # Plus three standard deviations of chi-squared: a small misfit may be so by chance.
-        excess = float(left.square().mean()) - 1.0 + 3 * math.sqrt(2 / len(left))
+        misfit = least_squares(columns, (noise.residual / noise.sigma)[valid])[1]
+        # Plus three standard deviations of chi-squared, because it may be small by chance.
+        excess = float(misfit.square().mean()) - 1.0 + 3 * math.sqrt(2 / len(misfit))
         start = self.image(self.rough, START)
-        moved = [noise.in_sigma(self._rendered(self.rough, k) - start)[valid] for k in _MORE]
-        expected = float(torch.stack(moved).square().mean())
+        changes = [noise.in_sigma(self._rendered(self.rough, k) - start)[valid] for k in _MORE]
+        expected = float(torch.stack(changes).square().mean())
         return max(_LEAST, math.sqrt(max(excess, 0.0) / max(expected, 1e-300)))
 
     def _few_wavelengths(self) -> tuple[OpticalSystem, list[Tensor]]:
-        """The given model and its fields at the start, at few wavelengths."""
+        """The full model and its fields at the start, at few wavelengths."""
         waves = self.rough.wavelengths
         return self.system(replace(self.finest, wavelengths=waves)), self._fine_fields(waves)
 
     def learn(self, economy: Economy) -> None:
-        """Take note of what a probe measured."""
+        """Update `likely` with the cheapest good option of an economy."""
         for option in economy.options:
             if option.error.inside(self.budget):
                 self.likely = replace(self.likely, **option.changes)
                 return
 
     def seconds(self, choice: Choice) -> float:
-        """Expected time of a refinement on one core.
+        """Estimated time of a refinement on one core.
 
-        Operations are counted, not timed, so that a plan is the same on a busy machine: images,
-        derivatives by modes and alignment, Jacobians and their squares, solutions. The rates are
-        those of one core in 2026; another machine scales nearly all options alike.
+        Operations are counted, not timed, so that plans do not depend on the load of the machine:
+        images, derivatives by modes and alignment, Jacobians and their squares, solutions. The
+        rates are those of one core in 2026; on another machine nearly all options scale alike.
         """
         detector, waves = self.model.detector, choice.wavelengths
         pixels = detector.shape[0] * detector.shape[1]
@@ -168,7 +164,7 @@ class Trial:
         return 10 * images + waves * (modes * response + 0.12) + 6 * jacobian + 1.4e-10 * modes**3
 
     def _fine_fields(self, wavelengths: int) -> list[Tensor]:
-        """The given model's fields at the start, at so many wavelengths."""
+        """The full model's fields at the start, at a number of wavelengths."""
         if wavelengths not in self._fields:
             fine = self.system(replace(self.finest, wavelengths=wavelengths))
             with torch.no_grad():
@@ -197,14 +193,14 @@ class Trial:
             return system(opd, **self.values).double()
 
     def image(self, choice: Choice, which: int) -> Tensor:
-        """The star as a choice renders one of the wavefronts, (ny, nx), at flux 1."""
+        """The star rendered by a choice at one of the wavefronts, (ny, nx), at flux 1."""
         key = (replace(choice, cycles=self.finest.cycles) if which == START else choice, which)
         if key not in self._images:
             self._images[key] = self._rendered(*key)
         return self._images[key]
 
     def prepare_fit(self, cycles: float) -> None:
-        """Let errors of fewer modes be what a fit of these leaves, up to a spatial frequency."""
+        """From now on, measure errors of fewer modes after a fit of the modes up to `cycles`."""
         if self._ridge is None:
             fine, fields = self._few_wavelengths()
             basis, npix = default_basis(cycles), self.response_npix
@@ -214,15 +210,15 @@ class Trial:
             self._ridge = RidgeResidual(slopes * prior[:, None, None])
 
     def error(self, choice: Choice, which: int, base: Choice | None = None) -> ModelError:
-        """Error of the star of a choice, relative to the given model or to another choice."""
+        """Error of the star of a choice, relative to the full model or to another choice."""
         change = self.image(choice, which) - self.image(base or self.finest, which)
-        left = self.noise.unexplained(change)
+        residual = self.noise.unexplained(change)
         if choice.cycles < self.finest.cycles and self._ridge:
-            left = self._ridge.left(left, self.drift.count(choice.cycles))
-        return self.noise.error(left)
+            residual = self._ridge.residual(residual, self.drift.count(choice.cycles))
+        return self.noise.error(residual)
 
     def verified(self, choice: Choice) -> ModelError:
-        """Error of a choice as a whole, at the start and at a wavefront no probe has seen."""
+        """Error of a choice as a whole, at the start and after an independent drift."""
         if choice == self.finest:
             return ModelError()
         return ModelError.largest(self.error(choice, which) for which in (START, VERIFIED))

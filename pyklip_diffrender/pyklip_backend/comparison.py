@@ -1,4 +1,4 @@
-"""KLIP itself on arrays in memory, for comparisons in one run."""
+"""KLIP by pyKLIP on arrays in memory, for comparisons."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def klip_rdi(
     Parameters
     ----------
     target : ndarray, (ny, nx)
-        The frame, star in the middle of the array.
+        The frame, with the star in the middle of the array.
     references : ndarray, (frames, ny, nx)
         Frames of a reference star.
     numbasis : int
         Karhunen-Loeve modes.
     annuli, subsections : int
-        Division of the image, as in `pyklip.parallelized.klip_dataset`.
+        See `pyklip.parallelized.klip_dataset`.
     inner : float
         Inner working angle, pixels.
     wavelength : float
@@ -60,7 +60,7 @@ def klip_rdi(
         IWA=inner,
         filenames=names[:1],
     )
-    # pyKLIP and its file writer print as they go, and show a bar.
+    # pyKLIP prints messages and a progress bar.
     with (
         tempfile.TemporaryDirectory() as folder,
         contextlib.redirect_stdout(io.StringIO()),

@@ -1,4 +1,4 @@
-"""Subtracted frames put where, and masked as, pyKLIP's `klip_parallelized` leaves them."""
+"""Place and mask subtracted frames the way pyKLIP's `klip_parallelized` does."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["Annuli", "aligned_before", "annuli_of", "fill", "noise_cube", "place
 
 @dataclass(frozen=True)
 class Annuli:
-    """The annuli pyKLIP would use, of which only the outer edges and a width matter here.
+    """The annuli that pyKLIP would use, reduced to what matters without KLIP.
 
     Attributes
     ----------
     inner, outer : float
         Pixels; r < inner and r >= outer are NaN in a product.
     width : float
-        Pixels; of the narrowest annulus, over which pyKLIP measures noise.
+        Width in pixels of the narrowest annulus, over which pyKLIP measures noise.
     """
 
     inner: float
@@ -38,25 +38,19 @@ def annuli_of(
     annuli: int,
     spacing: str,
 ) -> Annuli:
-    """Find the edges as pyKLIP does, with its rule for data sets that do not set an OWA.
+    """Find the annuli of frames (n, ny, nx) by pyKLIP's rules.
 
     Parameters
     ----------
-    imgs : ndarray
-        (n, ny, nx) frames.
-    centers : ndarray
-        (n, 2) star centres [x, y].
+    imgs : ndarray, (n, ny, nx)
+    centers : ndarray, (n, 2)
+        Star centres x, y.
     inner, outer : float
-        IWA and OWA in pixels; None for the whole image.
+        IWA and OWA in pixels; `outer` is None for the whole image.
     annuli : int
         Number of annuli.
     spacing : str
         "constant", "log" or "linear".
-
-    Raises
-    ------
-    ValueError
-        By pyKLIP, for annuli narrower than a pixel.
     """
     from pyklip.klip import define_annuli_bounds
 
@@ -73,22 +67,22 @@ def annuli_of(
 
 
 def fill(residual: NDArray[np.float64], good: NDArray[np.bool_]) -> int:
-    """Replace flagged pixels by the median of good neighbours, in place.
+    """Replace flagged pixels by the median of their good neighbours, in place.
 
-    The spline that shifts and turns frames would make one bad pixel ring over a dozen others.
-    NaN pixels stay NaN; where no pixel within two is good, a flagged one becomes NaN.
+    Otherwise the spline that shifts and rotates frames would spread each bad pixel over a dozen
+    others. NaN pixels stay NaN; a flagged pixel without a good one within two pixels becomes NaN.
 
     Parameters
     ----------
-    residual : ndarray
-        (ny, nx) frame minus star.
-    good : ndarray
-        (ny, nx) bool, False for flagged pixels.
+    residual : ndarray, (ny, nx)
+        Frame minus star.
+    good : ndarray of bool, (ny, nx)
+        False for flagged pixels.
 
     Returns
     -------
     int
-        How many were replaced.
+        Number of pixels replaced.
     """
     trusted = np.where(good, residual, np.nan)
     flagged = np.argwhere(~good & np.isfinite(residual))
@@ -108,27 +102,13 @@ def place(
     new_center: NDArray[np.float64],
     annuli: Annuli,
 ) -> NDArray[np.float64]:
-    """Shift one subtracted frame to the common centre, mask it, take its pedestal away.
+    """Shift a subtracted frame to the common centre, mask it, and subtract its pedestal.
 
-    Parameters
-    ----------
-    residual : ndarray
-        (ny, nx) frame minus star.
-    old_center, new_center : ndarray
-        [x, y], 0-indexed.
-    annuli : Annuli
-        What is kept.
-
-    Returns
-    -------
-    ndarray
-        (ny, nx). The pedestal is the sigma-clipped median, which companions do not move: KLIP
-        makes the mean of each section zero, and what reads its products counts on that.
+    The pedestal is the sigma-clipped median, which companions do not change. KLIP makes the mean
+    of each section zero, and code that reads its products relies on that.
     """
     from pyklip.klip import align_and_scale
 
-    if not np.isfinite(residual).any():
-        return np.full(residual.shape, np.nan)
     placed = np.asarray(align_and_scale(residual, new_center=new_center, old_center=old_center))
     y, x = np.indices(placed.shape)
     r = np.hypot(x - new_center[0], y - new_center[1])
@@ -139,29 +119,34 @@ def place(
     return placed
 
 
-def slices(frames: NDArray[np.float64], count: int, dtype: Any) -> NDArray[Any]:
-    """Repeat (n, ny, nx) `count` times in pyKLIP's number type: (count, n, ny, nx).
+def _number_type(dtype: Any) -> np.dtype[Any]:
+    """Number type of pyKLIP: single precision unless the call says otherwise."""
+    return np.dtype(ctypes.c_float if dtype is None else dtype)
 
-    A method without a KL cut-off has one answer, and products have one slice per entry of
-    numbasis, because later steps index them by it.
+
+def slices(frames: NDArray[np.float64], count: int, dtype: Any) -> NDArray[Any]:
+    """Repeat frames (n, ny, nx) in pyKLIP's number type: (count, n, ny, nx).
+
+    Without a KL cut-off there is one result, but pyKLIP's later steps expect one slice for each
+    entry of numbasis.
     """
-    number = np.dtype(ctypes.c_float if dtype is None else dtype)
-    return np.repeat(frames.astype(number)[np.newaxis], count, axis=0)
+    return np.repeat(frames.astype(_number_type(dtype))[np.newaxis], count, axis=0)
 
 
 def noise_cube(
     frames: NDArray[np.float64],
     center: NDArray[np.float64],
     annuli: Annuli,
+    count: int,
     numthreads: int | None,
 ) -> NDArray[np.float64]:
-    """Azimuthal scatter of each frame by pyKLIP's own measure, (n, ny, nx), for weighted means."""
+    """Azimuthal scatter of frames (n, ny, nx) as measured by pyKLIP, (count, n, ny, nx)."""
     from pyklip.parallelized import generate_noise_maps
 
     maps = generate_noise_maps(
         frames, center, annuli.width, IWA=annuli.inner, OWA=annuli.outer, numthreads=numthreads
     )
-    return np.asarray(maps)
+    return np.repeat(np.asarray(maps)[np.newaxis], count, axis=0)
 
 
 def aligned_before(
@@ -171,16 +156,14 @@ def aligned_before(
     center: NDArray[np.float64],
     dtype: Any,
 ) -> NDArray[Any]:
-    """Frames before the subtraction, centred and scaled to each wavelength, as for save_aligned.
+    """Unsubtracted frames for save_aligned: centred, and scaled to each of the wavelengths.
 
     Returns
     -------
-    ndarray
-        (wavelengths, n, ny, nx).
+    ndarray, (wavelengths, n, ny, nx)
     """
     from pyklip.klip import align_and_scale
 
-    number = np.dtype(ctypes.c_float if dtype is None else dtype)
     return np.array(
         [
             [
@@ -189,5 +172,5 @@ def aligned_before(
             ]
             for to in np.unique(wavelengths)
         ],
-        dtype=number,
+        dtype=_number_type(dtype),
     )

@@ -1,11 +1,11 @@
-"""Products that appear complete or not at all, with a header that says how they were made."""
+"""Output files that appear complete or not at all, with provenance in their headers."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,21 +18,21 @@ from pyklip_diffrender.pyklip_backend.frames import Frames
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.wavefront.opd import OPDMap
 
-__all__ = ["Made", "provenance", "require_folder", "staging", "stamp"]
+__all__ = ["ReductionRecord", "provenance", "require_folder", "staging", "stamp"]
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
-    """What was done to the frames of one wavelength.
+class ReductionRecord:
+    """How the frames of one wavelength were reduced.
 
     Attributes
     ----------
     frames : Frames
-        What was fitted.
+        The fitted frames.
     opd : OPDMap
-        Where the fit started.
+        The wavefront map at the start.
     subtraction : Subtraction
-        The star that was found.
+        The fitted star.
     filled : int
         Flagged pixels that were replaced after the subtraction.
     """
@@ -42,18 +42,18 @@ class Made:
     subtraction: Subtraction
     filled: int
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Made:
+    def __deepcopy__(self, memo: dict[int, Any]) -> ReductionRecord:
         """Itself: it never changes, and a contrast curve copies its dataset 120 times."""
         return self
 
 
 def require_folder(folder: str | os.PathLike[str]) -> Path:
-    """Resolve the output folder before an hour of fitting, not after.
+    """Check the output folder before an hour of fitting, not after.
 
     Raises
     ------
     FileNotFoundError
-        If there is none: pyKLIP does not make it either.
+        If there is none; pyKLIP does not make it either.
     PermissionError
         If nothing can be written there.
     """
@@ -67,10 +67,10 @@ def require_folder(folder: str | os.PathLike[str]) -> Path:
 
 @contextmanager
 def staging(folder: Path) -> Iterator[Path]:
-    """Give an empty folder whose files move to `folder` when the block ends well.
+    """Temporary folder whose files are moved to `folder` if the block succeeds.
 
-    It lies inside `folder`, so that each move is one step on the same file system. If the block
-    raises, the staged files are gone and `folder` is as it was.
+    It is inside `folder`, so that each move is one step on the same file system. If the block
+    raises, the files are deleted and `folder` is unchanged.
     """
     stage = Path(tempfile.mkdtemp(prefix=".diffrender-", dir=folder))
     try:
@@ -83,14 +83,17 @@ def staging(folder: Path) -> Iterator[Path]:
         shutil.rmtree(stage)
 
 
-def provenance(made: Sequence[Made]) -> fits.Header:
-    """Cards for a product made from these wavelengths, in order: keywords, then HISTORY.
+def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
+    """Cards for a product made from these wavelengths: keywords, then HISTORY.
 
-    A keyword holds the one value that all fits share, or for chi2 and the status that of the
-    worst fit; HISTORY holds all of them.
+    A keyword holds the value that all fits share; chi2 and status are those of the worst fit.
+    HISTORY has them all.
     """
-    worst = max((m.subtraction.worst for m in made), key=lambda fit: fit.chi2)
-    first = made[0]
+    fits_of_all = [fit for record in records for fit in record.subtraction.fits]
+    worst = max(fits_of_all, key=lambda fit: fit.chi2)
+    first = records[0]
+    # Other subtractors may know nothing of companions.
+    companions = max(len(getattr(fit.result, "companions", ())) for fit in fits_of_all)
     header = fits.Header()
     values: list[tuple[str, Any, str]] = [
         ("DRALGO", "diffrender", "star subtraction algorithm"),
@@ -98,16 +101,20 @@ def provenance(made: Sequence[Made]) -> fits.Header:
         ("DROPD", first.opd.name, "wavefront map at the start"),
         # 64 digits leave no room for a comment on the card.
         ("DRSHA256", first.opd.sha256, ""),
-        ("DRFILT", _shared([m.frames.filter or "" for m in made]), "filter of the model"),
-        ("DRMETH", _shared([m.subtraction.method for m in made]), "refinement method"),
+        (
+            "DRFILT",
+            _shared(r.frames.observation.filter or "" for r in records),
+            "filter of the model",
+        ),
+        ("DRMETH", _shared(r.subtraction.method for r in records), "refinement method"),
         ("DRSTAT", worst.status, "how the refinement ended"),
         ("DRSEED", first.subtraction.seed, "random seed"),
         ("DRCHI2", _number(worst.chi2), "chi2 per fitted pixel"),
-        ("DRNFIT", sum(len(m.subtraction.fits) for m in made), "number of refinements"),
-        ("DRKEPT", _companions(made), "most companions that a fit knew of"),
-        ("DRPIXELS", _shared([m.frames.pixels for m in made]), "pixels that were fitted"),
-        ("DRFILLED", sum(m.filled for m in made), "flagged pixels replaced by neighbours"),
-        ("DRNOISE", _shared([m.frames.noise for m in made]), "where the errors came from"),
+        ("DRNFIT", len(fits_of_all), "number of refinements"),
+        ("DRKEPT", companions, "most companions that a fit knew of"),
+        ("DRPIXELS", _shared(r.frames.pixels for r in records), "pixels that were fitted"),
+        ("DRFILLED", sum(r.filled for r in records), "flagged pixels replaced by neighbours"),
+        ("DRNOISE", _shared(r.frames.noise for r in records), "where the errors came from"),
     ]
     for key, value, comment in values:
         header[key] = (value, comment) if comment else value
@@ -116,13 +123,14 @@ def provenance(made: Sequence[Made]) -> fits.Header:
         "KL modes are all the same image"
     )
     header.add_history("DRSHA256 is the SHA-256 of the wavefront map's file, or of its array")
-    for m in made:
+    for record in records:
+        frames, subtraction = record.frames, record.subtraction
         header.add_history(
-            f"diffrender: {m.frames.name}, {m.frames.filter or 'given model'}, opd {m.opd.name}, "
-            f"{m.subtraction.method}, seed {m.subtraction.seed}, {m.frames.pixels} pixels, errors "
-            f"{m.frames.noise}"
+            f"diffrender: {frames.observation.name}, {frames.observation.filter or 'given model'}, "
+            f"opd {record.opd.name}, {subtraction.method}, seed {subtraction.seed}, "
+            f"{frames.pixels} pixels, errors {frames.noise}"
         )
-        for fit in m.subtraction.fits:
+        for fit in subtraction.fits:
             header.add_history(
                 f"diffrender: frames {', '.join(map(str, fit.frames))}: {fit.status}, "
                 f"chi2/N {fit.chi2:.4g}"
@@ -141,13 +149,8 @@ def stamp(folder: Path, cards: fits.Header) -> None:
             hdus[0].header.extend(cards, strip=False, update=True)
 
 
-def _shared(values: Sequence[str]) -> str:
+def _shared(values: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(values))
-
-
-def _companions(made: Sequence[Made]) -> int:
-    """Of fits that say so; other subtractors may know nothing of companions."""
-    return max(len(getattr(f.result, "companions", ())) for m in made for f in m.subtraction.fits)
 
 
 def _number(value: float) -> float | str:

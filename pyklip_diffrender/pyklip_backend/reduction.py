@@ -1,9 +1,8 @@
-"""One `klip_dataset` call in which the star is rendered instead of estimated from references.
+"""One call of `klip_dataset` in which the star is rendered instead of estimated from references.
 
-pyKLIP goes on doing what it does: it checks the arguments, derotates, collapses, and has the
-dataset write the files. Only `klip_parallelized` (and its lite twin) is another function for the
-duration of the call, with the same contract; `high_pass_filter_imgs` is followed so that the fit
-sees frames before they are filtered.
+pyKLIP still checks the arguments, derotates, collapses, and writes the files. For the duration of
+the call only `klip_parallelized` (and its lite version) is replaced by a function with the same
+interface, and `high_pass_filter_imgs` by one that keeps the unfiltered frames for the fit.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from pyklip_diffrender.errors import (
     RefinementError,
     ShapeError,
 )
-from pyklip_diffrender.pyklip_backend.frames import Frames, frames_of
+from pyklip_diffrender.pyklip_backend.frames import Frames, frames_of, require_frames
 from pyklip_diffrender.pyklip_backend.placement import (
     aligned_before,
     annuli_of,
@@ -32,15 +31,14 @@ from pyklip_diffrender.pyklip_backend.placement import (
     slices,
 )
 from pyklip_diffrender.pyklip_backend.products import (
-    Made,
+    ReductionRecord,
     provenance,
     require_folder,
     staging,
     stamp,
 )
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
-from pyklip_diffrender.pyklip_backend.wavefront import starting_opd
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["RESULTS", "Reduction", "mark_filtered"]
@@ -48,7 +46,7 @@ __all__ = ["RESULTS", "Reduction", "mark_filtered"]
 logger = logging.getLogger(__name__)
 
 RESULTS = "diffrender_results"
-"""Attribute of the dataset with one `Made` for each wavelength after a reduction."""
+"""Attribute of the dataset with one `ReductionRecord` per wavelength after a reduction."""
 
 _FILTERED = "_diffrender_filtered"
 
@@ -61,14 +59,14 @@ class Reduction:
     arguments : mapping
         All arguments of the call, defaults included.
     settings : DiffrenderSettings
-        What the call, the dataset and the registration say together.
+        Merged settings of the call, the dataset and the registration.
     """
 
     def __init__(self, arguments: Mapping[str, Any], settings: DiffrenderSettings) -> None:
         self.arguments = dict(arguments)
         self.dataset = arguments["dataset"]
         self.settings = settings
-        self.made: list[Made] = []
+        self.records: list[ReductionRecord] = []
         self._unfiltered: NDArray[Any] | None = None
         self._filter: Callable[[NDArray[Any]], NDArray[Any]] | None = None
 
@@ -78,13 +76,13 @@ class Reduction:
         Parameters
         ----------
         klip_dataset : callable
-            Gives pyKLIP's own `klip_dataset` when it is called with the functions to use in it in
-            place of those of the same name in its module.
+            Takes replacements for functions of pyKLIP's module by name, and returns pyKLIP's
+            `klip_dataset` using these; see `PatchedFunction.original`.
 
         Raises
         ------
         DiffrenderError
-            For bad input and failed fits; also what pyKLIP raises on its arguments.
+            For bad input and failed fits. pyKLIP's own errors pass through.
         """
         self._check()
         opd = starting_opd(self.settings.opd)
@@ -102,23 +100,20 @@ class Reduction:
         try:
             with staging(folder) as stage:
                 reduce(**{**self.arguments, "outputdir": str(stage)})
-                stamp(stage, provenance(self.made))
+                stamp(stage, provenance(self.records))
         except BaseException:
             vars(self.dataset).clear()
             vars(self.dataset).update(before)
             raise
-        setattr(self.dataset, RESULTS, tuple(self.made))
+        setattr(self.dataset, RESULTS, tuple(self.records))
         logger.info("products of %r are in %s", self.arguments["fileprefix"], folder)
 
     def _check(self) -> None:
-        """Find what cannot work before anything is changed."""
+        """Raise for input that cannot work, before anything is changed."""
         dataset, mode = self.dataset, str(self.arguments["mode"])
         if np.ndim(dataset.input) != 3:
             raise ShapeError(f"dataset.input: got shape {np.shape(dataset.input)}, expected 3-D")
-        if len(dataset.input) == 0:
-            raise NoValidPixelsError(
-                "the dataset has no frames; check the list of files it was given"
-            )
+        require_frames(dataset)
         if not np.isfinite(dataset.input).any():
             raise NoValidPixelsError(
                 f"{list(map(str, dataset.filenames))}: every pixel of every frame is NaN, nothing "
@@ -143,7 +138,7 @@ class Reduction:
     def _high_pass(
         self, imgs: NDArray[Any], numthreads: int | None = None, filtersize: float = 10
     ) -> NDArray[Any]:
-        """Stand in for `high_pass_filter_imgs`: remember the frames and the filter."""
+        """Replace `high_pass_filter_imgs`; keeps the unfiltered frames and the filter."""
         from pyklip.klip import high_pass_filter
 
         def apply(frame: NDArray[Any]) -> NDArray[Any]:
@@ -164,18 +159,18 @@ class Reduction:
         IWA: float,
         **kw: Any,
     ) -> tuple[Any, ...]:
-        """Stand in for `pyklip.parallelized.klip_parallelized`.
+        """Replace `pyklip.parallelized.klip_parallelized`.
 
         Returns
         -------
         sub_imgs : ndarray
             (b, n, ny, nx), one equal slice for each of the b entries of numbasis.
         aligned_center : sequence
-            [x, y] on which all of them are centred.
+            [x, y] of their common centre.
         noise : ndarray
-            (b, n, ny, nx) if asked for, else ``[1.]``.
+            (b, n, ny, nx) if requested, else ``[1.]``.
         aligned : ndarray
-            (wavelengths, n, ny, nx) frames before the subtraction, if asked for.
+            (wavelengths, n, ny, nx) unsubtracted frames, if requested.
         """
         index = np.flatnonzero(np.isin(self.dataset.wvs, np.unique(wvs)))
         center = kw.get("aligned_center")
@@ -186,27 +181,27 @@ class Reduction:
         unfiltered = imgs if self._unfiltered is None else self._unfiltered[index]
         placed = np.full(imgs.shape, np.nan)
         for wave in np.unique(wvs):
-            which = np.flatnonzero(wvs == wave)
-            frames = frames_of(
-                self.dataset, index[which], unfiltered[which], self._settings_at(wave)
-            )
-            residual = self._subtract(frames, opd, self._settings_at(wave))
-            for i, frame, old in zip(which, residual, frames.centers, strict=True):
-                placed[i] = place(frame, old, center, annuli)
+            of_wave = np.flatnonzero(wvs == wave)
+            settings = self._settings_at(wave)
+            frames = frames_of(self.dataset, index[of_wave], unfiltered[of_wave], settings)
+            residuals = self._subtract(frames, opd, settings)
+            for i, residual, old_center in zip(
+                of_wave[frames.usable], residuals, frames.observation.center, strict=True
+            ):
+                placed[i] = place(residual, old_center, center, annuli)
         placed[np.isnan(imgs)] = np.nan
 
         count, dtype = len(np.atleast_1d(kw["numbasis"])), kw.get("dtype")
         noise: NDArray[Any] = np.array([1.0])
         if kw.get("compute_noise_cube"):
-            maps = noise_cube(placed, center, annuli, kw.get("numthreads"))
-            noise = np.repeat(maps[np.newaxis], count, axis=0)
+            noise = noise_cube(placed, center, annuli, count, kw.get("numthreads"))
         outputs: tuple[Any, ...] = (slices(placed, count, dtype), list(center), noise)
         if kw.get("save_aligned"):
             outputs += (aligned_before(imgs, centers, wvs, center, dtype),)
         return outputs
 
     def _settings_at(self, wave: float) -> DiffrenderSettings:
-        """The settings with the one model for this wavelength."""
+        """The settings with the model for this wavelength."""
         model = self.settings.model
         if not isinstance(model, Mapping):
             if model is not None and len(np.unique(self.dataset.wvs)) > 1:
@@ -223,30 +218,29 @@ class Reduction:
     def _subtract(
         self, frames: Frames, opd: OPDMap, settings: DiffrenderSettings
     ) -> NDArray[np.float64]:
-        """Frames minus their star, (n, ny, nx), filtered if the call asks for it."""
-        usable = frames.usable()
+        """Frames minus their star, (m, ny, nx), high-pass filtered if the call asks for it."""
+        observation = frames.observation
         subtractor = settings.subtractor or subtract_by_refinement
-        found = subtractor(frames.observation(usable), opd, settings)
-        residual = np.full(frames.data.shape, np.nan)
-        if found.star.shape != residual[usable].shape:
+        subtraction = subtractor(observation, opd, settings)
+        if subtraction.star.shape != frames.data.shape:
             raise ShapeError(
-                f"star: got shape {found.star.shape}, expected {residual[usable].shape}"
+                f"star: got shape {subtraction.star.shape}, expected {frames.data.shape}"
             )
-        residual[usable] = frames.data[usable] - found.star
-        lost = usable & ~np.any(np.isfinite(residual) & frames.valid, axis=(1, 2))
+        residuals = frames.data - subtraction.star
+        lost = ~np.any(np.isfinite(residuals) & observation.valid, axis=(1, 2))
         if lost.any():
             raise RefinementError(
-                f"{frames.name}: the rendered star has no finite pixel in {int(lost.sum())} frames",
-                found.worst.result,
+                f"{observation.name}: the rendered star has no finite pixel in {int(lost.sum())} "
+                "frames",
+                subtraction.worst.result,
             )
-        filled = sum(fill(residual[i], frames.valid[i]) for i in np.flatnonzero(usable))
-        self.made.append(Made(frames, opd, found, filled))
+        filled = sum(map(fill, residuals, observation.valid))
+        self.records.append(ReductionRecord(frames, opd, subtraction, filled))
         if self._filter is not None:
-            for i in np.flatnonzero(usable):
-                residual[i] = self._filter(residual[i])
-        return residual
+            residuals = np.array([self._filter(residual) for residual in residuals])
+        return residuals
 
 
 def mark_filtered(dataset: Any) -> None:
-    """Remember that ``dataset.input`` is filtered; a deep copy remembers it too."""
+    """Mark ``dataset.input`` as filtered; the mark is kept in deep copies."""
     setattr(dataset, _FILTERED, dataset.input)

@@ -1,9 +1,9 @@
-"""Make ``algo="diffrender"`` work in pyKLIP, for good or for a block, and undo it exactly.
+"""Make ``algo="diffrender"`` work in pyKLIP, permanently or in a block, and undo it exactly.
 
 Scripts often hold `klip_dataset` itself (``from pyklip.parallelized import klip_dataset``) long
-before this package is imported, so replacing the name in the module would not reach them. The
-function object stays, and only its code is exchanged: the new code hands the call to
-`dispatch`, which runs pyKLIP's own code for every other algorithm.
+before this package is imported, so replacing the name in its module would not reach them. Instead
+the function object stays and its code is replaced by a call of `dispatch`, which runs pyKLIP's own
+code for every other algorithm.
 """
 
 from __future__ import annotations
@@ -13,108 +13,112 @@ import logging
 import threading
 from collections.abc import Iterator
 from contextvars import ContextVar
-from typing import Any, Unpack
+from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.pyklip_backend.capture import capturing_readdata
-from pyklip_diffrender.pyklip_backend.exchange import ExchangedFunction, ExchangedMethod
+from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
 from pyklip_diffrender.pyklip_backend.reduction import Reduction, mark_filtered
 from pyklip_diffrender.pyklip_backend.settings import (
     DiffrenderSettings,
     OPDLike,
-    Options,
     settings_of,
 )
+from pyklip_diffrender.pyklip_backend.source import keeping_source
 
-__all__ = ["ALGORITHM", "backend", "dispatch", "dispatch_fm", "is_registered"]
-__all__ += ["register", "unregister"]
+__all__ = [
+    "ALGORITHM",
+    "backend",
+    "dispatch",
+    "dispatch_fm",
+    "is_registered",
+    "register",
+    "unregister",
+]
 
 logger = logging.getLogger(__name__)
 
 ALGORITHM = "diffrender"
-"""What to give `klip_dataset` as `algo`."""
+"""Value of the argument `algo` of `klip_dataset`."""
 
 
-class _Hooks:
-    """The exchanges in pyKLIP, there while anyone holds them."""
+class _Patches:
+    """The changes to pyKLIP while the backend is in use."""
 
     def __init__(self) -> None:
         from pyklip import fm, parallelized
 
-        self.klip_dataset = ExchangedFunction(
+        self.klip_dataset = PatchedFunction(
             parallelized.klip_dataset,
             _klip_dataset,
             ("klip_parallelized", "klip_parallelized_lite", "high_pass_filter_imgs"),
         )
-        self.fm_klip_dataset = ExchangedFunction(fm.klip_dataset, _fm_klip_dataset, ())
-        self._all: list[ExchangedFunction | ExchangedMethod] = [
-            self.klip_dataset,
-            self.fm_klip_dataset,
-        ]
+        self.fm_klip_dataset = PatchedFunction(fm.klip_dataset, _fm_klip_dataset, ())
+        self._all: list[PatchedFunction | PatchedMethod] = [self.klip_dataset, self.fm_klip_dataset]
         try:
             from pyklip.instruments.JWST import JWSTData
         except ImportError as error:
             # It needs astroquery, which other instruments do not.
-            logger.info("pyKLIP's JWST reader is not there to be extended: %s", error)
+            logger.info("pyKLIP's JWST reader cannot be imported, so is not extended: %s", error)
         else:
-            self._all.append(ExchangedMethod(JWSTData, "readdata", capturing_readdata))
+            self._all.append(PatchedMethod(JWSTData, "readdata", keeping_source))
 
-    def exchange(self) -> None:
-        for one in self._all:
-            one.exchange()
+    def apply(self) -> None:
+        for patch in self._all:
+            patch.apply()
 
     def restore(self) -> None:
-        for one in reversed(self._all):
-            one.restore()
+        for patch in reversed(self._all):
+            patch.restore()
 
 
 class _Registry:
-    """Who holds the hooks, and the settings given to `register`."""
+    """The users of the backend, and the settings given to `register`."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self.hooks: _Hooks | None = None
+        self.patches: _Patches | None = None
         self.registered = False
         self.blocks = 0
         self.defaults = DiffrenderSettings()
 
-    def update(self) -> None:
-        """Put the hooks in or out, as the holders want it."""
-        wanted = self.registered or self.blocks > 0
-        if wanted and self.hooks is None:
-            hooks = _Hooks()
-            hooks.exchange()
-            self.hooks = hooks
-        elif not wanted and self.hooks is not None:
-            self.hooks.restore()
-            self.hooks = None
+    def use(self, registered: bool, blocks: int) -> None:
+        """Set the users; patch pyKLIP for the first and restore it after the last."""
+        in_use = registered or blocks > 0
+        if in_use and self.patches is None:
+            patches = _Patches()
+            patches.apply()
+            self.patches = patches
+        elif not in_use and self.patches is not None:
+            self.patches.restore()
+            self.patches = None
+        self.registered, self.blocks = registered, blocks
 
 
 _registry = _Registry()
 
 _NO_BLOCK = (DiffrenderSettings(), False)
 _block: ContextVar[tuple[DiffrenderSettings, bool]] = ContextVar("diffrender", default=_NO_BLOCK)
-"""Settings of the `backend` blocks around here, and whether KLIP is redirected."""
+"""Settings of the enclosing `backend` blocks, and whether they take over KLIP."""
 
 
 def is_registered() -> bool:
-    """Whether ``algo="diffrender"`` works right now."""
-    return _registry.hooks is not None
+    """Whether ``algo="diffrender"`` works at present."""
+    return _registry.patches is not None
 
 
-def register(opd: OPDLike | None = None, model: Any = None, **options: Unpack[Options]) -> None:
+def register(opd: OPDLike | None = None, model: Any = None, **options: Any) -> None:
     """Make ``klip_dataset(..., algo="diffrender")`` work until `unregister`.
 
-    Calling it again changes the settings it is given and nothing else. From then on `JWSTData`
-    keeps the recorded pixels, errors, flags and headers of the files it reads; register before
-    making the dataset, so that the fit can use them.
+    Calling it again changes only the settings that are given. While registered, `JWSTData` also
+    keeps the recorded pixels, errors, flags and headers of the files it reads, for the fit to use;
+    so register before making the dataset.
 
     Parameters
     ----------
     opd : path, ndarray or Quantity, optional
         Default wavefront map, see `DiffrenderSettings`.
     model : optical model, optional
-        Default model; by default the one for the dataset's filter.
+        Default model; if not given, one is made for the dataset's filter.
     **options
         Other fields of `DiffrenderSettings`.
 
@@ -131,24 +135,18 @@ def register(opd: OPDLike | None = None, model: Any = None, **options: Unpack[Op
     """
     settings = DiffrenderSettings(opd=opd, model=model, **options)
     with _registry.lock:
+        _registry.use(True, _registry.blocks)
         _registry.defaults = settings.over(_registry.defaults)
-        _registry.registered = True
-        try:
-            _registry.update()
-        except BaseException:
-            _registry.registered = False
-            raise
 
 
 def unregister() -> None:
-    """Put pyKLIP back exactly as it was and forget the settings given to `register`.
+    """Restore pyKLIP exactly and forget the settings given to `register`.
 
-    Inside a `backend` block, pyKLIP is put back when the block ends.
+    Inside a `backend` block, pyKLIP is restored when the block ends.
     """
     with _registry.lock:
-        _registry.registered = False
         _registry.defaults = DiffrenderSettings()
-        _registry.update()
+        _registry.use(False, _registry.blocks)
 
 
 @contextlib.contextmanager
@@ -158,19 +156,19 @@ def backend(
     opd: OPDLike | None = None,
     model: Any = None,
     force: bool = True,
-    **options: Unpack[Options],
+    **options: Any,
 ) -> Iterator[None]:
-    """Use this backend within a block, without changing a line of what is called there.
+    """Use this backend within a block, without changing the code that is called there.
 
     Parameters
     ----------
     name : str
-        "diffrender", the only one there is.
+        Only "diffrender".
     opd, model, **options
-        As for `register`; they win over those of the dataset and of `register`.
+        As for `register`; they override those of the dataset and of `register`.
     force : bool
-        Also take over calls with ``algo="klip"``, as in code that hard-codes it. Other algorithms
-        are never touched.
+        Also take over calls with ``algo="klip"``, for code that hard-codes it. Other algorithms
+        are not affected.
 
     Raises
     ------
@@ -187,77 +185,71 @@ def backend(
     outer, _ = _block.get()
     settings = DiffrenderSettings(opd=opd, model=model, **options).over(outer)
     with _registry.lock:
-        _registry.blocks += 1
-        try:
-            _registry.update()
-        except BaseException:
-            _registry.blocks -= 1
-            raise
+        _registry.use(_registry.registered, _registry.blocks + 1)
     token = _block.set((settings, force))
     try:
         yield
     finally:
         _block.reset(token)
         with _registry.lock:
-            _registry.blocks -= 1
-            _registry.update()
+            _registry.use(_registry.registered, _registry.blocks - 1)
 
 
-def _wanted(algo: Any) -> bool:
+def _is_ours(algo: Any) -> bool:
     """Whether a call with this `algo` is for this backend."""
     _, force = _block.get()
     name = str(algo).lower()
     return name == ALGORITHM or (force and name == "klip")
 
 
-def _hooks() -> _Hooks:
-    """The hooks that led here; they can only be gone if another thread took them out just now."""
-    hooks = _registry.hooks
-    if hooks is None:
+def _patches() -> _Patches:
+    """The patches that led to the present call; another thread may just have removed them."""
+    patches = _registry.patches
+    if patches is None:
         raise IncompatibleSetupError("diffrender was unregistered while klip_dataset was called")
-    return hooks
+    return patches
 
 
 def dispatch(*args: Any, **kwargs: Any) -> None:
-    """Take a call of `pyklip.parallelized.klip_dataset`: ours, or pyKLIP's own code."""
-    klip_dataset = _hooks().klip_dataset
+    """Handle a call of `pyklip.parallelized.klip_dataset`: with this backend or pyKLIP's code."""
+    klip_dataset = _patches().klip_dataset
     try:
         call = klip_dataset.signature.bind(*args, **kwargs)
     except TypeError:
-        # pyKLIP's own code says it in its own words.
-        klip_dataset.body()(*args, **kwargs)
+        # Prefer the message of pyKLIP's own code.
+        klip_dataset.original()(*args, **kwargs)
         raise
     call.apply_defaults()
     arguments = call.arguments
-    if _wanted(arguments["algo"]):
+    if _is_ours(arguments["algo"]):
         settings, _ = _block.get()
         settings = settings.over(settings_of(arguments["dataset"])).over(_registry.defaults)
-        Reduction(arguments, settings).run(klip_dataset.body)
+        Reduction(arguments, settings).run(klip_dataset.original)
     else:
-        klip_dataset.body()(*args, **kwargs)
+        klip_dataset.original()(*args, **kwargs)
     if arguments["highpass"] not in (False, None):
         mark_filtered(arguments["dataset"])
 
 
 def dispatch_fm(*args: Any, **kwargs: Any) -> Any:
-    """Take a call of `pyklip.fm.klip_dataset`, which has no `algo` of its own.
+    """Handle a call of `pyklip.fm.klip_dataset`, which has no argument `algo`.
 
     Raises
     ------
     IncompatibleSetupError
-        If it is for this backend: forward modelling of KLIP's over-subtraction does not apply.
+        If it is for this backend, to which a model of KLIP's over-subtraction does not apply.
     """
-    if _wanted(kwargs.get("algo", "klip")):
+    if _is_ours(kwargs.get("algo", "klip")):
         raise IncompatibleSetupError(
             "pyklip.fm.klip_dataset is not supported by diffrender yet: it models how KLIP "
             "subtracts a companion from itself. Call it outside the backend block and without "
             "algo='diffrender', or use pyklip.parallelized.klip_dataset"
         )
-    return _hooks().fm_klip_dataset.body()(*args, **kwargs)
+    return _patches().fm_klip_dataset.original()(*args, **kwargs)
 
 
 def _klip_dataset(*args, **kwargs):  # type: ignore[no-untyped-def]
-    # Runs in place of pyKLIP's code and with its globals: nothing of this module is in sight.
+    # Runs in place of pyKLIP's code, with its globals: names of this module are not available.
     from pyklip_diffrender.pyklip_backend.registration import dispatch
 
     return dispatch(*args, **kwargs)

@@ -1,10 +1,10 @@
-"""What a reduction needs to know besides the dataset, and where it may be said.
+"""The settings of a reduction and the wavefront map it starts from.
 
-`klip_dataset` takes no keyword it does not know, so the settings of the backend come from
-three places; a field given in an earlier one wins over the same field in a later one:
+`klip_dataset` accepts no further keywords, so the settings of the backend come from three places.
+A field given in an earlier one overrides the same field in a later one:
 
 1. the innermost ``with backend(...)`` around the call,
-2. ``dataset.diffrender = DiffrenderSettings(...)``, which goes with the dataset, copies included,
+2. ``dataset.diffrender = DiffrenderSettings(...)``, which its copies share,
 3. the defaults given to ``register(...)``.
 """
 
@@ -14,49 +14,33 @@ import dataclasses
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from astropy import units as u
 from numpy.typing import ArrayLike, NDArray
 
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
+from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
 
 if TYPE_CHECKING:
     from pyklip_diffrender.planning import Plan
     from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
-    from pyklip_diffrender.wavefront.opd import OPDMap
 
-__all__ = ["ATTRIBUTE", "DiffrenderSettings", "OPDLike", "Options", "settings_of"]
+__all__ = ["ATTRIBUTE", "DiffrenderSettings", "OPDLike", "settings_of", "starting_opd"]
 
 OPDLike: TypeAlias = "str | os.PathLike[str] | NDArray[np.floating[Any]] | u.Quantity | OPDMap"
 """A wavefront map: a FITS file, an array in metres, a Quantity, or what `read_opd` returns."""
 
 ATTRIBUTE = "diffrender"
-"""Name of the attribute of a dataset that holds its own settings."""
-
-
-class Options(TypedDict, total=False):
-    """The settings other than `opd` and `model`, as keywords."""
-
-    filter: str
-    pixelscale: float | tuple[float, float]
-    fit_pixels: int
-    error: ArrayLike
-    unit: u.UnitBase
-    seed: int
-    fit: GaussNewton | Adam
-    start: Mapping[str, Any]
-    systematics: Systematics
-    plan: Plan | str
-    keep_detected: bool
-    model_options: Mapping[str, Any]
-    subtractor: Callable[..., Any]
+"""Attribute of a dataset that holds its own settings."""
 
 
 @dataclass(frozen=True, eq=False)
 class DiffrenderSettings:
-    """Settings of ``algo="diffrender"``; None means "not said here".
+    """Settings of ``algo="diffrender"``; a field that is None is not set here.
 
     Attributes
     ----------
@@ -64,23 +48,22 @@ class DiffrenderSettings:
         Wavefront map to start from: a FITS file, or a square array in metres, OTE entrance-pupil
         orientation. There is no default: a reduction without one raises `MissingOPDError`.
     model : optical model or mapping, optional
-        What `nircam_coronagraph` and the bridges return. For a dataset of several wavelengths a
-        mapping from the wavelength, as in ``dataset.wvs``, to a model. Built from the filter if
-        not given.
+        From `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping
+        from the wavelength in ``dataset.wvs`` to a model. Made for the filter if not given.
     filter : str, optional
-        NIRCam filter, such as ``"F444W"``. Read from the dataset where that can be done.
+        NIRCam filter, such as ``"F444W"``. Read from the dataset if possible.
     pixelscale : float or (x, y), optional
-        Arcsec per pixel. Read from the dataset or the model where that can be done.
+        Arcsec per pixel. Read from the dataset if possible.
     fit_pixels : int, optional
-        Side in pixels of the square about the star that is fitted; what is subtracted covers the
-        whole frame. By default as much as the frames hold, up to
+        Side in pixels of the fitted square about the star; the subtraction covers the whole
+        frame. By default as large as the frames allow, up to
         `pyklip_diffrender.pyklip_backend.subtract.FIT_PIXELS`.
     error : array_like, optional
         Standard deviation per pixel, in the unit of the frames: a number, (ny, nx), or
-        (n, ny, nx) on the frames as they are in ``dataset.input``. Read from the ERR extension
-        where there is one, else estimated from the frames.
+        (n, ny, nx) for the frames of ``dataset.input``. Read from the ERR extension if there is
+        one, else estimated from the frames.
     unit : Unit, optional
-        Unit of the frames. Read from BUNIT where there is one, else dimensionless.
+        Unit of the frames. Read from BUNIT if present, else dimensionless.
     seed : int, optional
         Passed to `refine`; 0 by default.
     fit : GaussNewton or Adam, optional
@@ -88,19 +71,19 @@ class DiffrenderSettings:
     start : dict, optional
         Starting values by parameter name; see `refine`.
     systematics : Systematics, optional
-        What is known of the model's error; see `refine`.
+        Known pattern of the model's error; see `refine`.
     plan : Plan or str, optional
-        "auto" (the default), "off", or a plan that was made before, which serves for all fits of a
+        "auto" (the default), "off", or an existing plan, which is used for all fits of a
         reduction; see `refine`.
     keep_detected : bool, optional
-        Look for companions in the fits (`detect`) and refine the star once more with them in the
-        model, so that none of their light is taken for the star's; False by default. What is not
-        detected loses as much as before: bright injected companions then say nothing about how
-        much of a faint one is left.
+        Search the fits for companions (`detect`) and refine the star once more with them in the
+        model, so that none of their light is subtracted with the star; False by default.
+        Undetected companions still lose light, so the throughput of bright injected companions
+        then does not apply to faint ones.
     model_options : mapping, optional
         Further keywords of `nircam_coronagraph`, such as ``npix`` and ``nlambda``.
     subtractor : Subtractor, optional
-        What renders the star; `subtract_by_refinement` by default.
+        Function that renders the star; `subtract_by_refinement` by default.
     """
 
     opd: OPDLike | None = None
@@ -120,23 +103,21 @@ class DiffrenderSettings:
     subtractor: Callable[..., Any] | None = None
 
     def over(self, other: DiffrenderSettings) -> DiffrenderSettings:
-        """These settings, with what they do not say taken from `other`."""
+        """These settings, completed by those of `other`."""
         merged: dict[str, Any] = {}
-        for field in dataclasses.fields(self):
-            mine, theirs = getattr(self, field.name), getattr(other, field.name)
-            if field.name.endswith("_options"):
-                merged[field.name] = {**theirs, **mine}
-            else:
-                merged[field.name] = theirs if mine is None else mine
+        for name in (field.name for field in dataclasses.fields(self)):
+            own = getattr(self, name)
+            merged[name] = getattr(other, name) if own is None else own
+        merged["model_options"] = {**other.model_options, **self.model_options}
         return DiffrenderSettings(**merged)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> DiffrenderSettings:
-        """Itself: nothing in it changes, and a contrast curve copies its dataset 120 times."""
+        """Itself: it never changes, and a contrast curve copies its dataset 120 times."""
         return self
 
 
 def settings_of(dataset: Any) -> DiffrenderSettings:
-    """Settings that a dataset carries; empty if it carries none.
+    """Settings attached to a dataset; empty if there are none.
 
     Raises
     ------
@@ -152,3 +133,35 @@ def settings_of(dataset: Any) -> DiffrenderSettings:
             f"Set dataset.{ATTRIBUTE} = DiffrenderSettings(opd=...)"
         )
     return own
+
+
+def starting_opd(opd: OPDLike | None) -> OPDMap:
+    """Read the wavefront map that the settings name.
+
+    Raises
+    ------
+    MissingOPDError
+        If `opd` is None.
+    CorruptFileError, UnitError, ShapeError, NonFiniteError
+        As `read_opd`.
+    """
+    if opd is None:
+        raise MissingOPDError(
+            "algo='diffrender' starts from a measured wavefront map and none was given. Give a "
+            "FITS file, an array in metres or a Quantity, in one of three ways: "
+            "register(opd=...) once; `with backend(opd=...):` around klip_dataset; or "
+            "dataset.diffrender = DiffrenderSettings(opd=...). For JWST, take the map measured "
+            "closest in time to the observation"
+        )
+    if isinstance(opd, str | os.PathLike):
+        path = Path(opd).resolve()
+        # A contrast curve reads the same map for each of its 120 reductions.
+        state = path.stat() if path.is_file() else None
+        return _read(path, state and (state.st_mtime_ns, state.st_size))
+    return as_opd_map(opd)
+
+
+@lru_cache(maxsize=4)
+def _read(path: Path, version: tuple[int, int] | None) -> OPDMap:
+    """Read a map once for each version of its file."""
+    return as_opd_map(path)

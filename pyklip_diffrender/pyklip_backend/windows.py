@@ -1,4 +1,4 @@
-"""Boxes about the star: what of a frame is fitted, and where it goes back."""
+"""Boxes around the star: the part of a frame that is fitted, and where it belongs in the frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Window", "extent"]
 
 @dataclass(frozen=True)
 class Window:
-    """A box in frames that have their star in one place; it may stick out of them.
+    """A box in frames that have their star in one place; it may reach beyond their edges.
 
     Attributes
     ----------
@@ -37,8 +37,17 @@ class Window:
         ny, nx = shape
         return cls(round(center[1] - (ny - 1) / 2), round(center[0] - (nx - 1) / 2), shape)
 
+    def __contains__(self, other: Window) -> bool:
+        (ny, nx), (other_ny, other_nx) = self.shape, other.shape
+        return (
+            self.y <= other.y
+            and self.x <= other.x
+            and self.y + ny >= other.y + other_ny
+            and self.x + nx >= other.x + other_nx
+        )
+
     def _overlap(self, frame: tuple[int, ...]) -> tuple[Any, Any]:
-        """Where box and frame overlap: slices in the frame, and in the box."""
+        """Slices of the overlap of box and frame, in the frame and in the box."""
         y0, x0 = max(self.y, 0), max(self.x, 0)
         y1 = max(min(self.y + self.shape[0], frame[0]), y0)
         x1 = max(min(self.x + self.shape[1], frame[1]), x0)
@@ -47,21 +56,21 @@ class Window:
         ]
 
     def cut(self, cube: NDArray[Any], fill: Any) -> NDArray[Any]:
-        """Cut the box out of (n, Ny, Nx): (n, ny, nx), `fill` where there is no frame."""
+        """Cut the box out of (n, Ny, Nx): (n, ny, nx), with `fill` outside the frame."""
         boxes = np.full((len(cube), *self.shape), fill, dtype=cube.dtype)
-        here, there = self._overlap(cube.shape[1:])
-        boxes[there] = cube[here]
+        in_frame, in_box = self._overlap(cube.shape[1:])
+        boxes[in_box] = cube[in_frame]
         return boxes
 
     def paste(self, box: NDArray[np.float64], frame: tuple[int, int]) -> NDArray[np.float64]:
         """Put a box (ny, nx) back into a frame (Ny, Nx) of NaN."""
         out = np.full(frame, np.nan)
-        here, there = self._overlap(frame)
-        out[here] = box[there]
+        in_frame, in_box = self._overlap(frame)
+        out[in_frame] = box[in_box]
         return out
 
     def of(self, observation: Observation) -> Observation:
-        """Take the part of an observation inside the box.
+        """The part of an observation inside the box.
 
         Raises
         ------
@@ -85,7 +94,7 @@ class Window:
 
 
 def extent(observation: Observation) -> Window:
-    """The box that holds all valid pixels: frames may be padded with NaN."""
+    """The box that holds all valid pixels; frames may be padded with NaN."""
     _, rows, columns = np.nonzero(observation.valid)
     return Window(
         int(rows.min()), int(columns.min()), (int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1)

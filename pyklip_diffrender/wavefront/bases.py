@@ -1,8 +1,8 @@
 """Bases for wavefront changes: rigid segment motions and Fourier modes.
 
 A coefficient is the rms of its mode in metres (over the segment, or over the full array), so that
-one prior scale means the same for every mode of a kind. Modes are analytic: they can be sampled
-on any pupil grid, which is what lets a coarse model serve a fine one.
+a prior scale has the same meaning for all modes of a kind. Modes are analytic and can be sampled on
+any pupil grid, so that a coarse and a fine model share their coefficients.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from torch import Tensor
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.jwst import TABULATED_GAP, jwst_segments
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
-from pyklip_diffrender.optics.zernike import zernike_basis
 
-__all__ = ["Basis", "FourierModes", "JointBasis", "SegmentMotions", "ZernikeModes", "default_basis"]
+__all__ = ["Basis", "FourierModes", "JointBasis", "SegmentMotions", "default_basis"]
 
 
 class Basis(Protocol):
@@ -29,11 +28,11 @@ class Basis(Protocol):
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Kinds of mode, each with a prior scale of its own."""
+        """Kinds of mode, each with its own prior scale."""
 
     @property
     def group_index(self) -> Tensor:
-        """For every mode the index of its group, (modes,), int64."""
+        """Index of the group of every mode, (modes,), int64."""
 
     @property
     def frequencies(self) -> Tensor:
@@ -86,7 +85,7 @@ class SegmentMotions:
 
 
 def _whole(grid: PupilGrid) -> PupilGrid:
-    """Of the whole segment, whatever part of it `grid` holds: the modes stay the same."""
+    """The full grid, so that modes do not depend on the part of a segment that `grid` covers."""
     return PupilGrid.full(grid.npix, grid.diameter)
 
 
@@ -100,7 +99,7 @@ def _sampled_segments(grid: PupilGrid) -> list[tuple[PupilGrid, Tensor]]:
             f"are modes by default, span {2 * reach:.3g} m. For another telescope use "
             "GaussNewton(basis=FourierModes(24)), from pyklip_diffrender.wavefront.bases"
         )
-    # Half the gap on every side: each point of the gaps belongs to a segment too.
+    # Half the gap on every side, so that each point of the gaps belongs to a segment.
     return [
         _sampled_segment(widen_polygon(outline, TABULATED_GAP / 2), grid)
         for outline in jwst_segments().values()
@@ -130,7 +129,7 @@ class FourierModes:
     ----------
     max_cycles : float
         Highest radial frequency. MASKRND's narrow openings spread light over 11 lambda/D, so a
-        5 arcsec field at 4.5 um hears frequencies to about 24.
+        field of 5 arcsec at 4.5 um is sensitive to frequencies up to about 24.
     min_cycles : float
         Lowest radial frequency.
     """
@@ -167,7 +166,7 @@ class FourierModes:
         for axis, positions in ((0, grid.x), (1, grid.y)):
             angle = (2 * math.pi / grid.diameter) * pairs[:, axis, None] * positions
             waves.append(math.sqrt(2) ** 0.5 * torch.complex(torch.cos(angle), torch.sin(angle)))
-        # A plane wave is a product of one in x and one in y: no trigonometry on the full grid.
+        # A plane wave is a product of waves in x and y, which saves trigonometry on the full grid.
         product = waves[1][:, :, None] * waves[0][:, None, :]
         both = torch.stack([product.real, product.imag], dim=1)
         first = 2 * (start // 2)
@@ -188,42 +187,6 @@ class FourierModes:
         waves_x = torch.complex(torch.cos(in_x), torch.sin(in_x))
         waves_y = torch.complex(torch.cos(in_y), torch.sin(in_y))
         return math.sqrt(2) * (waves_y @ table @ waves_x).real
-
-
-class ZernikeModes:
-    """Zernike polynomials over the whole pupil.
-
-    Global aberrations such as those that vary over the field of the telescope: single segments
-    would have to move together to make them.
-
-    Parameters
-    ----------
-    first, last : int
-        Noll indices. Tip and tilt (2 and 3) are the star's position.
-    """
-
-    groups = ("global",)
-
-    def __init__(self, first: int = 4, last: int = 21) -> None:
-        self.first, self.last = first, last
-
-    def __len__(self) -> int:
-        return self.last - self.first + 1
-
-    @property
-    def group_index(self) -> Tensor:
-        return torch.zeros(len(self), dtype=torch.int64)
-
-    @property
-    def frequencies(self) -> Tensor:
-        return torch.zeros(len(self), dtype=torch.float64)
-
-    def modes(self, grid: PupilGrid, start: int, stop: int) -> Tensor:
-        every = zernike_basis(self.last, grid.x, grid.y, grid.diameter / 2)
-        return every[self.first - 1 + start : self.first - 1 + stop]
-
-    def opd(self, coefficients: Tensor, grid: PupilGrid) -> Tensor:
-        return torch.tensordot(coefficients.double(), self.modes(grid, 0, len(self)), dims=1)
 
 
 class JointBasis:

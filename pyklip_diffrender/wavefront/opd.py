@@ -41,19 +41,19 @@ def read_opd(
 ) -> OPDMap:
     """Read an OPD map from a FITS file.
 
-    Maps of the mission's wavefront sensing, as MAST has them, are recognised by their extension
-    RESULT_PHASE: they are in microns without saying so, and contain the aberrations of the
-    sensing camera. These are subtracted with stpsf's models if stpsf and its data are installed;
-    otherwise they are kept, with a warning. See `bridges.load_wss_opd`.
+    Maps of the mission's wavefront sensing from MAST are recognised by their extension
+    RESULT_PHASE. They are in microns without a unit in the header, and contain the aberrations of
+    the sensing camera. These are subtracted with stpsf's models if stpsf and its data are
+    installed; otherwise they are kept, with a warning. See `bridges.load_wss_opd`.
 
     Parameters
     ----------
     path : path
         FITS file, gzipped or not.
     extension : str or int, optional
-        Which HDU to read as it is; default the first with a two-dimensional image.
+        HDU to read unchanged; default the first with a two-dimensional image.
     unit : str or Unit, optional
-        Unit of the values where the header has no BUNIT.
+        Unit of the values if the header has no BUNIT.
 
     Returns
     -------
@@ -68,13 +68,13 @@ def read_opd(
     ShapeError
         If the map is not square.
     NonFiniteError
-        For NaN or infinity inside the pupil (outside it becomes 0).
+        For NaN or infinity inside the pupil (outside they become 0).
 
     Warns
     -----
     DiffrenderWarning
-        If the rms inside the pupil is not plausible for JWST, with the unit in which it would be,
-        or if a wavefront-sensing map still contains the aberrations of the sensing camera.
+        If the rms inside the pupil is not plausible for JWST, or if a wavefront-sensing map still
+        contains the aberrations of the sensing camera.
 
     Examples
     --------
@@ -143,7 +143,7 @@ def _image(hdus: fits.HDUList, extension: str | int | None, path: Path) -> Any:
 
 @lru_cache(maxsize=8)
 def _inside(npix: int) -> NDArray[np.bool_]:
-    """Samples inside the pupil; kept because making them takes as long as reading a map."""
+    """Samples inside the pupil; cached because this takes as long as reading a map."""
     inside: NDArray[np.bool_] = jwst_pupil(npix).numpy() > 0.5
     inside.setflags(write=False)
     return inside
@@ -207,14 +207,15 @@ def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
     -------
     OPDMap
     """
-    return _random(seed, npix, rms, segment_variance=0.24, knee=8.0, slope=2.0, name="random_opd")
+    return _random(seed, npix, rms, 0.24, "random_opd")
 
 
-def random_drift(seed: int, hours: float, npix: int = 1024, rms_per_86h: float = 9e-9) -> OPDMap:
+def random_drift(seed: int, hours: float, npix: int = 1024) -> OPDMap:
     """Draw a change of the wavefront that grows linearly in time.
 
-    Segment motions carry 62 % of the variance (as in the change from 2022-08-11 to 08-14), low
-    and mid frequencies the rest.
+    Its rms is 9 nm after 86 hours; the published pair of maps differs by 9.06 nm. Segment motions
+    carry 62 % of the variance (as in the change from 2022-08-11 to 08-14), low and mid frequencies
+    the rest.
 
     Parameters
     ----------
@@ -222,23 +223,17 @@ def random_drift(seed: int, hours: float, npix: int = 1024, rms_per_86h: float =
     hours : float
     npix : int
         Samples across the pupil.
-    rms_per_86h : float
-        m; the published pair of maps differs by 9.06 nm.
 
     Returns
     -------
     OPDMap
     """
-    unit = _random(
-        seed, npix, 1e-8, segment_variance=0.62, knee=8.0, slope=2.0, name="random_drift"
-    )
-    data = unit.data * (rms_per_86h / 1e-8 * hours / 86.0)
+    unit = _random(seed, npix, 1e-8, 0.62, "random_drift")
+    data = unit.data * (9e-9 / 1e-8 * hours / 86.0)
     return OPDMap(data, None, f"random_drift(seed={seed}, hours={hours})", unit.sha256)
 
 
-def _random(
-    seed: int, npix: int, rms: float, segment_variance: float, knee: float, slope: float, name: str
-) -> OPDMap:
+def _random(seed: int, npix: int, rms: float, segment_variance: float, name: str) -> OPDMap:
     generator = np.random.default_rng(seed)
     grid = PupilGrid.full(npix)
     pupil = jwst_pupil(npix)
@@ -246,7 +241,7 @@ def _random(
     # Pistons twice as large as tips and tilts, as measured.
     motions = torch.from_numpy(generator.normal(size=(18, 3)) * np.array([2.0, 1.0, 0.8]))
     texture = torch.from_numpy(generator.normal(size=len(fourier)))
-    texture = texture / (1 + (fourier.frequencies / knee) ** slope)
+    texture = texture / (1 + (fourier.frequencies / 8.0) ** 2.0)
     parts = [segments.opd(motions.flatten(), grid), fourier.opd(texture, grid)]
     weight = pupil / pupil.sum()
 

@@ -1,9 +1,8 @@
-"""Gaussian priors on wavefront changes, and their scales from the evidence of the data.
+"""Gaussian priors on wavefront changes, with scales that maximise the evidence of the data.
 
-Each group of modes (segment motions, texture) has one scale; within a group the standard
-deviation follows a fixed shape. The scale is where the evidence, the probability of the data with
-the modes integrated out, is stationary (D. MacKay, "Bayesian interpolation", Neural Computation 4,
-415, 1992).
+Each group of modes (segment motions, texture) has one scale; within a group the standard deviation
+follows a fixed shape. At the scale the evidence, the probability of the data marginalised over the
+modes, is stationary (D. MacKay, "Bayesian interpolation", Neural Computation 4, 415, 1992).
 """
 
 from __future__ import annotations
@@ -35,6 +34,14 @@ __all__ = [
 _ROUNDING = 1e-12
 """Relative error of the curvature's elements."""
 
+_SCALE_LIMITS = (1e-4, 100.0)
+"""Smallest and largest scale. Without a floor, a group without any signal ends in a division by
+zero; without a ceiling, a bright companion that is missing from the model makes the prior so wide
+that the equations cannot be solved."""
+
+_ENOUGH_MODES = 20.0
+"""Number of determined modes below which nothing can be said about the scale of a group."""
+
 
 @dataclass(frozen=True)
 class WavefrontPrior:
@@ -52,10 +59,10 @@ class WavefrontPrior:
     fit_scales : bool
         Maximise the evidence over the scales.
     amplitude_cycles : float
-        Modes up to this frequency may change the amplitude across the pupil as well.
+        Modes up to this frequency may also change the amplitude across the pupil.
     amplitude_scale : float
         Prior deviation of amplitude modes, nm of an imaginary OPD (at 4.4 um 1 nm changes the
-        amplitude by 0.14 %); 0 keeps the amplitude as it is.
+        amplitude by 0.14 %); 0 for a fixed amplitude.
     amplitude_slope : float
         Beyond the knee the amplitude's deviation falls as frequency to minus this power.
     """
@@ -69,7 +76,7 @@ class WavefrontPrior:
     amplitude_slope: float = 1.0
 
     def amplitude_modes(self, basis: Basis) -> int:
-        """Number of modes, the first of the basis, that the pupil's amplitude has as well."""
+        """Number of modes, from the first, that may also change the pupil's amplitude."""
         if self.amplitude_scale <= 0:
             return 0
         beyond = torch.nonzero(basis.frequencies > self.amplitude_cycles).flatten()
@@ -110,7 +117,7 @@ class EvidenceUpdate:
     log_evidence: float
 
     def in_units(self, unit: Tensor) -> EvidenceUpdate:
-        """The same for unknowns measured in other units, `unit` of the new ones to the old."""
+        """The same in other units, of which `unit` make up one old unit, (parameters,)."""
         variance = None if self.variance is None else self.variance * unit**2
         return replace(self, step=self.step * unit, variance=variance)
 
@@ -123,7 +130,7 @@ def learn_prior(
     npix: int = 128,
     ridge: float = 1e-3,
 ) -> WavefrontPrior:
-    """A prior for wavefront changes from the differences of successive wavefront maps.
+    """Derive a prior from the differences of successive wavefront maps.
 
     Parameters
     ----------
@@ -135,21 +142,21 @@ def learn_prior(
     npix : int
         Samples on which modes are fitted; the maps are averaged onto them.
     ridge : float
-        Of the fit, relative to the modes' own norms: modes that the mirror does not tell apart
-        share what they explain.
+        Ridge of the fit, relative to the norms of the modes. Modes that are degenerate on the
+        mirror share what they explain.
 
     Returns
     -------
     WavefrontPrior
-        Scales of the groups, knee and slope at which the fitted coefficients are most probable.
-        Scales are not fixed: `refine` starts from them.
+        Most probable scales of the groups, knee and slope for the fitted coefficients. `refine`
+        starts from these scales and fits them.
 
     Raises
     ------
     ShapeError
         For fewer than two maps, or maps of different shapes.
     """
-    stack = np.asarray([np.asarray(each, dtype=float) for each in maps])
+    stack = np.asarray([np.asarray(opd, dtype=float) for opd in maps])
     if stack.ndim != 3 or len(stack) < 2:
         raise ShapeError(f"maps: got shape {stack.shape}, expected at least two square maps")
     changes = np.diff(stack, axis=0) * 1e9
@@ -188,8 +195,8 @@ def learn_prior(
 
 
 def _inverse_of_lower(factor: Tensor) -> Tensor:
-    """Inverse of a lower triangle, in half the time that solving for the identity takes."""
-    # LAPACK wants columns contiguous: the transpose of a row-major lower triangle is an upper one.
+    """Inverse of a lower triangle, in half the time of solving for the identity."""
+    # LAPACK has contiguous columns, for which a row-major lower triangle is an upper one.
     inverse, failure = dtrtri(factor.numpy().T, lower=0)
     assert not failure, "a Cholesky factor has no zero on its diagonal"
     return torch.from_numpy(inverse.T)
@@ -207,8 +214,6 @@ def solve_with_evidence(
     damping: float = 0.0,
     current: Tensor | None = None,
     errors: bool = False,
-    floor: float = 1e-4,
-    ceiling: float = 100.0,
 ) -> EvidenceUpdate:
     """Solve a whitened linear least-squares problem with Gaussian priors about zero.
 
@@ -225,19 +230,15 @@ def solve_with_evidence(
     scales : Tensor, (groups,)
         Starting scales.
     fixed_deviation : Tensor, (n - modes,)
-        Prior deviation of what comes before those modes; inf where there is none.
+        Prior deviation of the parameters before the modes; inf without a prior.
     iterations : int
         Updates of the scales; 0 keeps them.
     damping : float
-        Levenberg-Marquardt: steps away from `current` cost this much of the prior's penalty.
+        Levenberg-Marquardt damping of steps from `current`, as a multiple of the prior's penalty.
     current : Tensor, (n,), optional
-        Where the unknowns are now.
+        Present values of the parameters.
     errors : bool
         Also compute the variances.
-    floor, ceiling : float
-        Smallest and largest scale: an absent group must not end in a division by zero, nor what
-        no wavefront explains (a bright companion that is not in the model) in a prior so wide
-        that the equations cannot be solved.
     """
     others = len(fixed_deviation)
     effective = float("nan")
@@ -245,7 +246,7 @@ def solve_with_evidence(
         deviation = torch.cat([fixed_deviation, scales[group] * shape])
         precision = deviation**-2
         system = curvature.clone()
-        # Rounding in the curvature is as large as a wide prior's precision.
+        # Rounding errors of the curvature can exceed the precision of a wide prior.
         system.diagonal().mul_(1 + _ROUNDING).add_((1 + damping) * precision)
         factor = torch.linalg.cholesky(system)
         pulled = gradient if current is None else gradient + damping * precision * current
@@ -253,7 +254,7 @@ def solve_with_evidence(
         if k == iterations and not errors:
             break
         variance = _inverse_of_lower(factor).square_().sum(dim=0)
-        # How many of a group's modes the data determine, and the scale that they have.
+        # Number of modes of each group that the data determine, and their scale.
         determined = 1 - precision[others:] * variance[others:]
         effective = float(determined.sum())
         if k == iterations:
@@ -261,7 +262,7 @@ def solve_with_evidence(
         power = (step[others:] / shape) ** 2
         counted = torch.zeros_like(scales).index_add(0, group, determined)
         summed = torch.zeros_like(scales).index_add(0, group, power)
-        scales = torch.sqrt(summed / counted.clamp(min=1e-3)).clamp(min=floor, max=ceiling)
+        scales = torch.sqrt(summed / counted.clamp(min=1e-3)).clamp(*_SCALE_LIMITS)
     known = torch.isfinite(deviation)
     log_evidence = float(
         0.5 * gradient @ step - factor.diagonal().log().sum() - deviation[known].log().sum()
@@ -269,10 +270,8 @@ def solve_with_evidence(
     return EvidenceUpdate(step, variance if errors else None, scales, effective, log_evidence)
 
 
-def scale_ratios(
-    step: Tensor, variance: Tensor, deviation: Tensor, group: Tensor, *, enough: float = 20.0
-) -> Tensor:
-    """How large the modes of each group are, relative to what their prior says.
+def scale_ratios(step: Tensor, variance: Tensor, deviation: Tensor, group: Tensor) -> Tensor:
+    """Size of the modes of each group relative to their prior.
 
     At the scales of the highest evidence, the sum of (step / deviation)^2 is the number of modes
     that the data determine.
@@ -282,16 +281,14 @@ def scale_ratios(
     step, variance, deviation : Tensor, (modes,)
         Most probable values, their variance, and the prior's standard deviation.
     group : Tensor, (modes,), int64
-    enough : float
-        Groups of which fewer modes are determined are left out.
 
     Returns
     -------
     Tensor, (groups,)
-        1 where all is well or nothing can be said; above 1 for a prior that is too narrow.
+        Above 1 for a prior that is too narrow; 1 for groups with too few determined modes.
     """
     count = int(group.max()) + 1
     determined = torch.zeros(count, dtype=step.dtype)
     determined.index_add_(0, group, 1 - variance / deviation**2)
     size = torch.zeros_like(determined).index_add_(0, group, (step / deviation) ** 2)
-    return torch.where(determined > enough, (size / determined).clamp(min=0).sqrt(), 1.0)
+    return torch.where(determined > _ENOUGH_MODES, (size / determined).clamp(min=0).sqrt(), 1.0)

@@ -17,9 +17,7 @@ from stability_fits import error_of, fitted, noise, observed, star
 from pyklip_diffrender.io.files import open_fits, write_fits
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
 from pyklip_diffrender.optics.masks import FourierMask
-from pyklip_diffrender.optics.orientation import Orientation
 from pyklip_diffrender.optics.planes import Wavefront
-from pyklip_diffrender.optics.sampled_planes import AberrationOptic
 from pyklip_diffrender.scene.objects import Planet, Scene
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
@@ -122,35 +120,6 @@ def test_two_callers_of_a_padded_mask_at_two_wavelengths() -> None:
         np.testing.assert_allclose(second.result().real, 5.0, rtol=1e-12)
         other_is_done.set()
         np.testing.assert_allclose(first.result().real, 4.0, rtol=1e-12)
-
-
-def test_two_callers_of_an_aberration_on_two_windows() -> None:
-    """As above: the second basis comes between the first one's store and its use."""
-    other_is_done, first_has_stored = threading.Event(), threading.Event()
-    small_, large = PupilGrid.full(8), PupilGrid.full(12)
-
-    class Interrupted(AberrationOptic):
-        def __setattr__(self, name: str, value: object) -> None:
-            super().__setattr__(name, value)
-            if name == "_known" and isinstance(value, tuple) and value[0] == small_:
-                first_has_stored.set()
-                other_is_done.wait(5)
-
-    ones = {4e-6: torch.ones(8, 8, dtype=torch.complex128)}
-    optic = Interrupted(
-        ones, 8, JWST_DIAMETER, torch.float64, torch.device("cpu"), "shared", Orientation()
-    )
-
-    def basis(grid: PupilGrid) -> torch.Tensor:
-        field = torch.ones(grid.shape, dtype=torch.complex128)
-        return optic._basis(3, Wavefront(field, 4e-6, grid))
-
-    with ThreadPoolExecutor(2) as pool:
-        first = pool.submit(basis, small_)
-        assert first_has_stored.wait(5)
-        assert pool.submit(basis, large).result().shape == (3, 12, 12)
-        other_is_done.set()
-        assert first.result().shape == (3, 8, 8)
 
 
 @pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])

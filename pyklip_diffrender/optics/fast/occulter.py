@@ -1,7 +1,7 @@
 """A round occulter by convolution on cells that fit the detector.
 
 Behind an occulter with complement 1 - t the pupil holds E - F^-1[(1 - t) F[E]]. With L for all
-that follows in the pupil, the field on the detector at x is
+planes that follow in the pupil, the field on the detector at x is
 
     A(x) = F[L E](x) - (cell / lambda) sum_c (1 - t)(c) F[E](c) F[L](x - c),
 
@@ -9,9 +9,9 @@ summed over the cells c of the mask's disc. Where the cells lie on the lattice o
 samples, or on a refinement of it, the differences x - c do so too, and the sum is a small FFT
 convolution: no transform back to the pupil. Pixels may be rectangular and sheared.
 
-The sum is exact where the spectrum of 1 - t ends below what aliases onto that of F[E] F[L]. That
-of a mask with an edge does not end, so it is cut off on a finer lattice before it is sampled; the
-plane-by-plane route samples the mask as it is.
+The sum is exact if the spectrum of 1 - t ends below the frequencies that alias onto that of
+F[E] F[L]. A mask with an edge has no such limit, so its spectrum is cut off on a finer lattice
+before it is sampled. The plane-by-plane route samples the mask directly.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from pyklip_diffrender.optics.planes import CompactOcculter, Wavefront
 __all__ = ["DEFAULT_SAMPLING", "OcculterLattice", "finest_spacing"]
 
 DEFAULT_SAMPLING = 2.0
-"""Cells per lambda/D, at least, where nobody asks for more: 4e-9 of the star's peak at 4.5 um."""
+"""Default minimum of cells per lambda/D: errors of 4e-9 of the star's peak at 4.5 um."""
 
 _FINER = 4
-"""Points per cell, along each axis, on which the mask is known before it is band-limited."""
+"""Points per cell, along each axis, at which the mask is sampled before it is band-limited."""
 
 _ROLL_OFF = 0.06
-"""Width of the edge of the band, cycles per cell: from 2 cells per lambda/D on, the band that the
-pupils use (0.87 D / lambda) and the one that aliases onto it are well to either side of it."""
+"""Width of the edge of the band, cycles per cell. From 2 cells per lambda/D on, the band used by
+the pupils (0.87 D / lambda) and the band that aliases onto it are well below and above the edge."""
 
 _MARGIN = 4
-"""Cells beyond the mask's edge that are kept of its band-limited form."""
+"""Cells of the band-limited mask beyond its edge."""
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,15 @@ class _Axis:
     Attributes
     ----------
     samples : int
-        Of the detector.
+        Number of detector samples.
     phases : int
-        Samples per cell, where those are finer; every one of them has its own kernel.
+        Samples per cell, if those are finer; each has its own kernel.
     cells : int
-        Cells per sample, where those are finer.
+        Cells per sample, if those are finer.
     half : int
-        There are cells from -half to half.
+        Cells are numbered from -half to half.
     spacing : float
-        Of the cells, radians.
+        Distance between cells, radians.
     """
 
     samples: int
@@ -75,7 +75,7 @@ class _Axis:
     def fit(cls, samples: int, step: float, oversample: int, finest: float, reach: float) -> _Axis:
         """The coarsest cells that fit the samples and are no wider than `finest` (radians).
 
-        A pixel holds a whole number of cells, so that sources in pixel centres fit as well.
+        A pixel has a whole number of cells, so that sources at pixel centres fit as well.
         """
         phases = max(
             (k for k in range(1, oversample + 1) if oversample % k == 0 and k * step <= finest),
@@ -87,7 +87,7 @@ class _Axis:
 
     @property
     def positions(self) -> Tensor:
-        """Of the cells, radians, float64."""
+        """Positions of the cells, radians, float64."""
         return torch.arange(-self.half, self.half + 1, dtype=torch.float64) * self.spacing
 
     @property
@@ -97,7 +97,7 @@ class _Axis:
 
     @property
     def period(self) -> int:
-        """Of the convolution, in steps between samples of one phase."""
+        """Period of the convolution, in steps between samples of one phase."""
         cells = (self.count - 1) * self.cells + 2 * self.half + 1
         return int(next_fast_len(math.ceil(cells / self.cells)))
 
@@ -108,7 +108,7 @@ class _Axis:
         return first + offsets.to(first.device)
 
     def band_limiting(self) -> Tensor:
-        """From the mask on a finer lattice to its band-limited form on the cells."""
+        """Matrix from the mask on a finer lattice to its band-limited form on the cells."""
         inside = self.half - _MARGIN
         fine = torch.arange(-inside * _FINER, inside * _FINER + 1, dtype=torch.float64) / _FINER
         cells = torch.arange(-self.half, self.half + 1, dtype=torch.float64)
@@ -134,7 +134,7 @@ def _axes(
 def finest_spacing(
     occulter: CompactOcculter, detector: Detector, wavelength: float, sampling: float
 ) -> float:
-    """Of the cells that fit the detector, the smaller of the two, radians.
+    """The smaller spacing of the cells that fit the detector, radians.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ class OcculterLattice:
     ----------
     x, y : _Axis
     blocked : Tensor, (cells in y, cells in x)
-        1 - t on the cells, times what turns the sum into the field on a sample.
+        1 - t on the cells, with the scale of the field on a sample.
     """
 
     def __init__(
@@ -199,12 +199,12 @@ class OcculterLattice:
         return transform.forward(wavefront.field)
 
     def kernel(self, stop: Wavefront, axes: Sequence[Tensor]) -> Tensor:
-        """What the convolution multiplies with, (phases in y, phases in x, n, m).
+        """Transform of the kernel of the convolution, (phases in y, phases in x, n, m).
 
         Parameters
         ----------
         stop : Wavefront
-            The factor that stands for all planes behind the occulter.
+            The product of all planes behind the occulter.
         axes : two Tensor
             Sample positions x, y, radians.
         """
@@ -218,11 +218,11 @@ class OcculterLattice:
                 values = pad(values, (0, size[1] - len(x), 0, size[0] - len(y)))
                 rows.append(values.roll((-2 * self.y.half, -2 * self.x.half), dims=(-2, -1)))
         kernels = torch.stack(rows).unflatten(0, (self.y.phases, self.x.phases))
-        # The inverse transform is the smaller by this when its spectrum has been folded.
+        # The inverse transform of a folded spectrum is smaller by this factor.
         return torch.fft.fft2(kernels) / (self.x.cells * self.y.cells)
 
     def convolve(self, light: Tensor, kernel: Tensor) -> Tensor:
-        """Field on the detector's samples from what the mask takes away on the cells.
+        """Field on the detector's samples of the light that the mask removes on the cells.
 
         Parameters
         ----------

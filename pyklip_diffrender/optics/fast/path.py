@@ -1,7 +1,7 @@
-"""The way through a coronagraph with one round occulter by convolution on `cells`.
+"""Propagation through a coronagraph with one round occulter by convolution (`occulter`).
 
-One star without moving planes goes block by block through `streaming`, all else by torch's own
-operations, which every kind of derivative passes.
+A single star behind fixed planes is computed block by block in `streaming`, everything else by
+ordinary torch operations, which have derivatives of every kind.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from pyklip_diffrender.optics.planes import (
     InternalAberration,
     LyotStop,
     Plane,
-    PupilStop,
     Values,
     Wavefront,
 )
@@ -40,12 +39,11 @@ from pyklip_diffrender.optics.sampled_planes import Gain, PupilOptic
 
 __all__ = ["LatticeRoute", "is_pointwise"]
 
-_POINTWISE = (Gain, InternalAberration, LyotStop, PupilOptic, PupilStop)
-
+_POINTWISE = (Gain, InternalAberration, LyotStop, PupilOptic)
 
 _LARGE = 512
-"""Samples across a pupil whose arrays do not fit into the cache: only there does it pay to compute
-the field a second time."""
+"""Samples across a pupil whose arrays do not fit into the cache. Only then is it faster to compute
+the field a second time for its derivative."""
 
 
 def is_pointwise(plane: Plane) -> bool:
@@ -56,7 +54,7 @@ def is_pointwise(plane: Plane) -> bool:
 
 
 class LatticeRoute:
-    """The way through planes with one round occulter by `OcculterLattice`.
+    """Propagation through planes with one round occulter by `OcculterLattice`.
 
     Parameters
     ----------
@@ -71,7 +69,7 @@ class LatticeRoute:
         behind = planes[self._place + 1 :]
         self._moving = {name for plane in behind for name in plane.parameters} | {"detector_shift"}
         self._lattices: dict[float, OcculterLattice] = {}
-        # The latest at each wavelength, with where the planes behind the occulter stood.
+        # The latest at each wavelength, with the parameters of the planes behind the occulter.
         self._stops: dict[float, tuple[Position, Wavefront]] = {}
         self._kernels: dict[float, tuple[Position, Tensor]] = {}
         self._stars: dict[float, tuple[Position, _StreamedStar]] = {}
@@ -79,7 +77,7 @@ class LatticeRoute:
 
     @staticmethod
     def serves(planes: Sequence[Plane]) -> bool:
-        """Whether there is one `CompactOcculter`, and nothing but factors in pupils."""
+        """Whether the planes are one `CompactOcculter` and otherwise factors in pupils."""
         others = [plane for plane in planes if not isinstance(plane, CompactOcculter)]
         return len(planes) - len(others) == 1 and all(is_pointwise(plane) for plane in others)
 
@@ -96,13 +94,12 @@ class LatticeRoute:
         return self.occulter.sampling or DEFAULT_SAMPLING
 
     def pays(self, wavelengths: Sequence[float]) -> bool:
-        """Whether the cells are not much finer than asked for, to fit a detector that is."""
-        for wavelength in wavelengths:
-            wanted = wavelength / self.occulter.diameter / self.sampling
-            found = finest_spacing(self.occulter, self.detector, wavelength, self.sampling)
-            if found < wanted / 2.5:
-                return False
-        return True
+        """Whether the detector allows cells that are not much finer than requested."""
+        return all(
+            finest_spacing(self.occulter, self.detector, wavelength, self.sampling)
+            >= wavelength / self.occulter.diameter / self.sampling / 2.5
+            for wavelength in wavelengths
+        )
 
     def lattice(self, wavelength: float) -> OcculterLattice:
         """The cells at a wavelength."""
@@ -113,9 +110,9 @@ class LatticeRoute:
         return self._lattices[wavelength]
 
     def _stop(self, onto: Sequence[PupilGrid], wavelength: float, values: Values) -> Wavefront:
-        """What the planes behind the occulter make of a field of ones.
+        """The product of all planes behind the occulter.
 
-        A shift of the detector is a tilt there, so that the rest does not see it.
+        A shift of the detector is included as a tilt, so that the rest need not depend on it.
         """
         return kept(
             self._stops,
@@ -160,7 +157,7 @@ class LatticeRoute:
         wavefront : Wavefront
         values : mapping of str to Tensor
         onto : sequence of PupilGrid
-            For every plane, the window to hand on (`OpticalSystem.windows`).
+            For every plane, the window to pass on (`OpticalSystem.windows`).
         """
         for plane, window in zip(self.planes[: self._place], onto, strict=False):
             wavefront = plane.apply(wavefront, values, window)
@@ -179,13 +176,13 @@ class LatticeRoute:
         values: Values,
         onto: Sequence[PupilGrid],
     ) -> Tensor | None:
-        """The same as `field`, for one star, in a third of the time.
+        """As `field` for one star, in a third of the time.
 
         Returns
         -------
         Tensor or None
-            It can be differentiated in reverse mode with respect to the OPD and to the star's
-            offset. None where other derivatives or several stars are asked for.
+            Differentiable in reverse mode with respect to the OPD and the star's offset. None if
+            other derivatives or several stars are needed.
         """
         offset = values.get("star_offset")
         fixed = [value for name, value in values.items() if name != "star_offset"]
@@ -203,32 +200,23 @@ class LatticeRoute:
         if varied and (opd.is_complex() or opd.shape[-1] < _LARGE):
             return None
         with torch.no_grad():
-            star = self._streamed(entrance, wavelength, values, onto)
+            star = kept(
+                self._stars,
+                wavelength,
+                position_of(values, self._moving),
+                lambda: self._streamed(entrance, wavelength, values, onto),
+            )
             if not varied:
                 return star.field(star.products(opd, offset))
 
         def again(opd: Tensor, offset: Tensor | None) -> Tensor:
-            given = dict(values) if offset is None else {**values, "star_offset": offset}
-            return self.field(entrance.field(opd, wavelength, offset), given, onto)
+            moved = dict(values) if offset is None else {**values, "star_offset": offset}
+            return self.field(entrance.field(opd, wavelength, offset), moved, onto)
 
-        found: Tensor = _ReverseMode.apply(opd, offset, star, again)
-        return found
+        field: Tensor = _ReverseMode.apply(opd, offset, star, again)
+        return field
 
     def _streamed(
-        self,
-        entrance: EntrancePupil,
-        wavelength: float,
-        values: Values,
-        onto: Sequence[PupilGrid],
-    ) -> _StreamedStar:
-        return kept(
-            self._stars,
-            wavelength,
-            position_of(values, self._moving),
-            lambda: self._make_streamed(entrance, wavelength, values, onto),
-        )
-
-    def _make_streamed(
         self,
         entrance: EntrancePupil,
         wavelength: float,
@@ -254,7 +242,7 @@ class LatticeRoute:
 
 @dataclass(frozen=True)
 class _StreamedStar:
-    """What turns an OPD into the field of the star, when nothing else varies.
+    """Computes the field of the star from an OPD, when nothing else varies.
 
     Attributes
     ----------
@@ -263,7 +251,7 @@ class _StreamedStar:
         To the cells in front of the mask, and to the detector.
     lattice : OcculterLattice
     kernel : Tensor
-        Of the convolution.
+        Transform of the kernel of the convolution.
     per_sample : float
         See `Detector`.
     """
@@ -275,7 +263,7 @@ class _StreamedStar:
     per_sample: float
 
     def products(self, opd: Tensor, offset: Tensor | None) -> list[Tensor]:
-        """Of the field along x, see `PupilStream.products`; the star's offset in arcsec."""
+        """Products of the field along x, see `PupilStream.products`; the offset is in arcsec."""
         with torch.no_grad():
             return self.stream.products(opd, _radians(offset), self.branches)
 
@@ -298,9 +286,9 @@ def _radians(offset: Tensor | None) -> Tensor | None:
 
 
 class _ReverseMode(torch.autograd.Function):
-    """The field of a `_StreamedStar` with the derivatives that reverse mode asks for.
+    """The field of a `_StreamedStar` with its derivatives in reverse mode.
 
-    The field in the pupil is computed again on the way back, block by block, instead of kept.
+    The field in the pupil is computed again in the backward pass, block by block, not stored.
     """
 
     @staticmethod
@@ -313,7 +301,7 @@ class _ReverseMode(torch.autograd.Function):
     ) -> Tensor:
         products = star.products(opd, offset)
         with torch.enable_grad():
-            # What follows the products is small, and autograd may keep all of it.
+            # The arrays after the products are small enough for autograd to keep.
             products = [product.requires_grad_() for product in products]
             field = star.field(products)
         ctx.save_for_backward(opd, offset)
@@ -328,11 +316,11 @@ class _ReverseMode(torch.autograd.Function):
             along_x = torch.autograd.grad(field, products, slope, retain_graph=True)
             by_opd, by_offset = ctx.star.slopes(opd, offset, along_x)
             return by_opd.to(opd.dtype), by_offset, None, None
-        # These derivatives will be differentiated: through operations that autograd knows.
+        # For second derivatives, use operations that autograd knows.
         both = opd, offset
         wanted = [t for t in both if t is not None and t.requires_grad]
         by_each = iter(
             torch.autograd.grad(ctx.again(opd, offset), wanted, slope, create_graph=True)
         )
-        found = [next(by_each) if t is not None and t.requires_grad else None for t in both]
-        return found[0], found[1], None, None
+        slopes = [next(by_each) if t is not None and t.requires_grad else None for t in both]
+        return slopes[0], slopes[1], None, None

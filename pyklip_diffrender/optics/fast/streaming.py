@@ -1,10 +1,10 @@
-"""From the pupil to images in blocks of rows, and the derivative in reverse mode the way back.
+"""From the pupil to images in blocks of rows, with the derivative in reverse mode.
 
-A megapixel field and the arrays on the way to it do not fit into a processor's cache, and making
-room for them takes longer than filling them. Here the field exists for some rows at a time, and
-goes through the product along x before the next. It is kept as real and imaginary parts of the
-half to the right of the axis and of the other, mirrored: sums and differences of the two halves
-take half-size products with cosines and sines.
+A megapixel field and the arrays needed for it do not fit into a processor's cache, and allocating
+them takes longer than filling them. Here the field exists for some rows at a time, which go through
+the product along x before the next. It is stored as real and imaginary parts of the half to the
+right of the axis and of the other half, mirrored: sums and differences of the two halves need
+products of half the size, with cosines and sines.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def _sides(array: Tensor) -> Tensor:
 def _reach(lit: Tensor) -> list[int]:
     """For every row of (sides, rows, half), the columns up to the last one that is lit."""
     column = torch.arange(1, lit.shape[-1] + 1, device=lit.device)
-    found: list[int] = (lit.any(dim=0) * column).amax(dim=-1).tolist()
-    return found
+    reach: list[int] = (lit.any(dim=0) * column).amax(dim=-1).tolist()
+    return reach
 
 
 def _part(room: Tensor, *shape: int) -> Tensor:
@@ -49,14 +49,14 @@ def _part(room: Tensor, *shape: int) -> Tensor:
 
 @dataclass
 class Branch:
-    """One image that is made of the field.
+    """One image made from the field.
 
     Parameters
     ----------
     grid : PupilGrid
         Window outside of which `factor` is zero.
     factor : Tensor or None
-        What the field is multiplied with on `grid`, complex; None for 1.
+        Complex factor of the field on `grid`; None for 1.
     x, y : Tensor
         Positions of the image, radians.
     wavelength : float
@@ -149,20 +149,20 @@ class PupilStream:
         opd : Tensor, (npix, npix)
             m; see `EntrancePupil.field`.
         offset : Tensor, (2,), or None
-            Of the source, radians.
+            Offset of the source, radians.
         branches : sequence of Branch
             All at one wavelength.
 
         Returns
         -------
         list of Tensor, (even and odd, k, real and imaginary, rows)
-            What `Branch.finish` takes.
+            Input of `Branch.finish`.
         """
-        found = [branch.room(self.dtype) for branch in branches]
+        products = [branch.room(self.dtype) for branch in branches]
         for rows, field, room in self._blocks(opd, offset, branches[0].wavelength):
-            for branch, product in zip(branches, found, strict=True):
+            for branch, product in zip(branches, products, strict=True):
                 self._along_x(field, rows, branch, product, room)
-        return found
+        return products
 
     def slopes(
         self,
@@ -188,7 +188,7 @@ class PupilStream:
             Per radian.
         """
         wavelength = branches[0].wavelength
-        # Of the phase, 2 pi / lambda times the OPD; put here, where arrays are small.
+        # From OPD to phase; applied here, where arrays are small.
         along_x = [slope * (2 * math.pi / wavelength) for slope in along_x]
         by_opd = torch.zeros(opd.shape, dtype=self.dtype, device=opd.device)
         window = PupilGrid.full(self.grid.npix, self.grid.diameter).crop(by_opd, self.grid)
@@ -202,11 +202,11 @@ class PupilStream:
             # d(field) = i field d(phase)
             right, left = back[1].mul_(field[0]).addcmul_(back[0], field[1], value=-1)
             window[rows, middle : middle + width] = right
-            # Added, for of an odd number of columns the middle one is on both sides.
+            # Added, because the middle of an odd number of columns is on both sides.
             window[rows, before - width : before] += left.flip(-1)
         by_offset = None
         if offset is not None:
-            # A tilt in OPD: by -x of the pupil for the source's x, by y for its y.
+            # As an OPD, an offset in x is a tilt along -x of the pupil, one in y along y.
             x, y = (axis.to(opd.device) for axis in (self.grid.x, self.grid.y))
             by_offset = torch.stack(
                 [-(window.sum(dim=0).to(x.dtype) @ x), window.sum(dim=1).to(y.dtype) @ y]
@@ -216,7 +216,7 @@ class PupilStream:
     def _blocks(
         self, opd: Tensor, offset: Tensor | None, wavelength: float
     ) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Rows, the field on them (real and imaginary, sides, rows, width), room for work."""
+        """Rows, the field on them (real and imaginary, sides, rows, width), work space."""
         opd = PupilGrid.full(self.grid.npix, self.grid.diameter).crop(opd, self.grid)
         tilt = None
         if offset is not None:
@@ -271,25 +271,25 @@ class PupilStream:
         if part is None:
             return
         inside, top, stop, width = part
-        here = field[:, :, inside]
+        light = field[:, :, inside]
         if branch.parts is not None:
             factor = branch.parts[:, :, top:stop, :width]
             passed = _part(room[:2].view(-1), 2, 2, stop - top, width)
-            real, imaginary = here[0, ..., :width], here[1, ..., :width]
+            real, imaginary = light[0, ..., :width], light[1, ..., :width]
             torch.mul(real, factor[0], out=passed[0]).addcmul_(imaginary, factor[1], value=-1)
             torch.mul(real, factor[1], out=passed[1]).addcmul_(imaginary, factor[0])
-            here = passed
+            light = passed
         for k, combine in enumerate((torch.add, torch.sub)):
             folded = _part(room[2 + k], 2, stop - top, width)
-            combine(here[:, 0], here[:, 1], out=folded)
-            # In this order: a product of few columns takes twice as long as one of few rows.
-            found = branch.products[k][:, :width] @ folded.view(-1, width).T
-            product[k, :, :, top:stop] = found.view(-1, 2, stop - top)
+            combine(light[:, 0], light[:, 1], out=folded)
+            # In this order: a product with few columns takes twice as long as one with few rows.
+            folded_product = branch.products[k][:, :width] @ folded.view(-1, width).T
+            product[k, :, :, top:stop] = folded_product.view(-1, 2, stop - top)
 
     def _overlap(
         self, rows: slice, branch: Branch, width: int
     ) -> tuple[slice, int, int, int] | None:
-        """Which of some rows a branch has, its first and last of them, and how wide they are."""
+        """Slice of the given rows that a branch has, their range on its grid, and their width."""
         first = self.grid.rows[0] - branch.grid.rows[0]  # Row 0 of this grid in the branch's.
         top, stop = max(rows.start + first, 0), min(rows.stop + first, branch.grid.shape[0])
         if top >= stop:
@@ -327,14 +327,14 @@ class PupilStream:
             ).view(2, stop - top, width)
             for k in range(2)
         )
-        here = back[:, :, inside, :width]
+        target = back[:, :, inside, :width]
         if branch.parts is None:
-            here[:, 0].add_(even).add_(odd)
-            here[:, 1].add_(even).sub_(odd)
+            target[:, 0].add_(even).add_(odd)
+            target[:, 1].add_(even).sub_(odd)
             return
         factor = branch.parts[:, :, top:stop, :width]
         for side, combine in enumerate((torch.add, torch.sub)):
             real, imaginary = combine(even, odd, out=_part(room[2], 2, stop - top, width))
-            here[0, side].addcmul_(real, factor[0, side]).addcmul_(imaginary, factor[1, side])
-            here[1, side].addcmul_(imaginary, factor[0, side])
-            here[1, side].addcmul_(real, factor[1, side], value=-1)
+            target[0, side].addcmul_(real, factor[0, side]).addcmul_(imaginary, factor[1, side])
+            target[1, side].addcmul_(imaginary, factor[0, side])
+            target[1, side].addcmul_(real, factor[1, side], value=-1)

@@ -1,4 +1,4 @@
-"""Exchange what a function or method does, in place, so that it can be put back exactly."""
+"""Replace what a function or method of pyKLIP does, in place, and restore it exactly."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 
-__all__ = ["ExchangedFunction", "ExchangedMethod"]
+__all__ = ["PatchedFunction", "PatchedMethod"]
 
 logger = logging.getLogger(__name__)
 
 
-class ExchangedFunction:
-    """A function that keeps its identity but runs other code until `restore`.
+class PatchedFunction:
+    """A function that keeps its identity but runs other code between `apply` and `restore`.
 
-    Whoever imported the function earlier holds this very object, and so gets the other code too.
+    Code that imported the function earlier holds this same object, so the patch reaches it too.
 
     Parameters
     ----------
     function : function
-        The one to exchange.
+        The function to patch.
     trampoline : function
-        Its code replaces the function's. It is run with the *globals of the exchanged function*,
+        Its code replaces that of `function`. It runs with the *globals of the patched function*,
         so it must import what it uses.
     uses : sequence of str
-        Names that the function must look up in its module, for `body` to replace.
+        Names that the function must look up in its module, which `original` can replace.
 
     Raises
     ------
     IncompatibleSetupError
-        If the function is not as expected, such as after a change in pyKLIP.
+        If the function is not as expected, for example after a change in pyKLIP.
     """
 
     def __init__(
@@ -55,44 +55,39 @@ class ExchangedFunction:
         assert isinstance(trampoline, FunctionType)
         self.function = function
         self.signature = inspect.signature(function)
-        self._code = function.__code__
-        self._defaults = function.__defaults__
-        self._kwdefaults = function.__kwdefaults__
+        self._saved = function.__code__, function.__defaults__, function.__kwdefaults__
         self._trampoline = trampoline.__code__
 
-    def exchange(self) -> None:
-        """Put the other code in."""
-        self.function.__code__ = self._trampoline
-        self.function.__defaults__ = None
-        self.function.__kwdefaults__ = None
-        # help() and inspect go on showing the arguments that count.
+    def _set(self, code: Any, defaults: Any, kwdefaults: Any) -> None:
+        self.function.__code__ = code
+        self.function.__defaults__ = defaults
+        self.function.__kwdefaults__ = kwdefaults
+
+    def apply(self) -> None:
+        """Put the trampoline in."""
+        self._set(self._trampoline, None, None)
+        # So that help() and inspect still show the arguments of the original.
         self.function.__signature__ = self.signature  # type: ignore[attr-defined]
 
     def restore(self) -> None:
-        """Put back the code and defaults there were, the same objects."""
+        """Put back the same code and default objects as before."""
         if self.function.__code__ is not self._trampoline:
             logger.warning("%s was changed by another package meanwhile", self.function.__name__)
             return
-        self.function.__code__ = self._code
-        self.function.__defaults__ = self._defaults
-        self.function.__kwdefaults__ = self._kwdefaults
+        self._set(*self._saved)
         del self.function.__signature__  # type: ignore[attr-defined]
 
-    def body(self, **replaced: Callable[..., Any]) -> Callable[..., Any]:
-        """The function as it was, with other functions behind some of its module's names."""
-        module = self.function.__globals__
-        copy = FunctionType(
-            self._code,
-            {**module, **replaced} if replaced else module,
-            self.function.__name__,
-            self._defaults,
-        )
-        copy.__kwdefaults__ = self._kwdefaults
+    def original(self, **replaced: Callable[..., Any]) -> Callable[..., Any]:
+        """The unpatched function, with other functions behind some of its module's names."""
+        module, (code, defaults, kwdefaults) = self.function.__globals__, self._saved
+        namespace = {**module, **replaced} if replaced else module
+        copy = FunctionType(code, namespace, self.function.__name__, defaults)
+        copy.__kwdefaults__ = kwdefaults
         return copy
 
 
-class ExchangedMethod:
-    """A method of a class that is wrapped until `restore`."""
+class PatchedMethod:
+    """A method of a class that is wrapped between `apply` and `restore`."""
 
     def __init__(
         self, owner: type, name: str, wrap: Callable[[Callable[..., None]], Callable[..., None]]
@@ -101,12 +96,12 @@ class ExchangedMethod:
         self._original = vars(owner)[name]
         self._wrapped = wrap(self._original)
 
-    def exchange(self) -> None:
+    def apply(self) -> None:
         """Put the wrapped method in."""
         setattr(self._owner, self._name, self._wrapped)
 
     def restore(self) -> None:
-        """Put back the method there was, the same object."""
+        """Put back the same method object as before."""
         if vars(self._owner)[self._name] is not self._wrapped:
             logger.warning("%s was changed by another package meanwhile", self._name)
             return

@@ -1,0 +1,296 @@
+"""`Propagation`: from a wavefront through the planes of a coronagraph to the image of a star.
+
+At every wavelength the entrance pupil makes a field of the OPD, each plane takes it linearly to
+the next, and the detector samples it. The image is the weighted sum of the intensities.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.io.units import require_finite, to_metres, to_unit, warn_of_rms
+from pyklip_diffrender.optics.bandpass import Bandpass
+from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.fast.path import LatticeRoute
+from pyklip_diffrender.optics.grid import PupilGrid, resample
+from pyklip_diffrender.optics.planes import (
+    CompactOcculter,
+    EntrancePupil,
+    Plane,
+    Values,
+    Wavefront,
+)
+from pyklip_diffrender.parameters import parameter
+
+__all__ = ["Propagation", "Value"]
+
+Value = Tensor | ArrayLike | float
+
+_ON_AXIS = (0.0, 0.0)
+
+
+class Propagation:
+    """The path of light through a coronagraph; see `OpticalSystem` for the arguments."""
+
+    def __init__(
+        self,
+        entrance: EntrancePupil,
+        planes: Sequence[Plane],
+        detector: Detector,
+        bandpass: Bandpass,
+        route: str = "auto",
+        defaults: Mapping[str, Value] | None = None,
+    ) -> None:
+        self.entrance = entrance
+        self.planes = tuple(planes)
+        self.detector = detector
+        self.bandpass = bandpass
+        self._lattice = self._choose_route(route)
+        if defaults and "star_offset" in defaults:
+            raise IncompatibleSetupError(
+                "defaults: star_offset belongs to a source; give it in the call, or move the "
+                "optical axis with detector_shift"
+            )
+        self.defaults: dict[str, Tensor] = {}
+        self.defaults = self.values(defaults or {})
+
+    def _choose_route(self, route: str) -> LatticeRoute | None:
+        if route not in ("auto", "lattice", "planes"):
+            raise IncompatibleSetupError(
+                f"route: got {route!r}, expected 'auto', 'lattice' or 'planes'"
+            )
+        if route == "planes":
+            return None
+        if not LatticeRoute.serves(self.planes):
+            if route == "auto":
+                return None
+            raise IncompatibleSetupError(
+                "route 'lattice': the planes are not one round occulter between factors in "
+                "pupils; use 'auto' or 'planes'"
+            )
+        lattice = LatticeRoute(self.planes, self.detector)
+        return lattice if route == "lattice" or lattice.pays(self.bandpass.wavelengths) else None
+
+    @property
+    def route(self) -> str:
+        """How light gets to the detector: "lattice" or "planes"."""
+        return "planes" if self._lattice is None else "lattice"
+
+    @property
+    def npix(self) -> int:
+        """Samples across the pupil array."""
+        return self.entrance.full.npix
+
+    @property
+    def diameter(self) -> float:
+        """Side of the pupil array, m."""
+        return self.entrance.full.diameter
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Real type of the computation."""
+        return self.entrance.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the computation."""
+        return self.detector.device
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that this system takes besides the OPD."""
+        between = [name for plane in self.planes for name in plane.parameters]
+        return (*self.entrance.parameters, *between, *self.detector.parameters)
+
+    def opd(self, opd: Value | None) -> Tensor:
+        """Check an OPD and bring it to the system's device: (..., npix, npix) in m.
+
+        Arrays, Quantities and maps with another number of pixels across the pupil are resampled,
+        see `grid.resample`. Tensors keep their values, so that gradients flow, and must have the
+        system's own size. None stands for the system's own wavefront, which is flat unless it was
+        made with one.
+
+        Raises
+        ------
+        ShapeError
+            For a map that is not square, or a tensor of another size.
+        UnitError, NonFiniteError
+            For a Quantity that is not a length, or values that are not finite.
+
+        Warns
+        -----
+        DiffrenderWarning
+            For an array whose rms inside the pupil is that of a wavefront in another unit.
+        """
+        if opd is None and self.entrance.opd is not None:
+            return self.entrance.opd
+        if opd is None:
+            return torch.zeros(self.npix, self.npix, dtype=self.dtype, device=self.device)
+        if isinstance(opd, str | os.PathLike):
+            raise TypeError(f"opd: got the path {opd!r}; read it first, with read_opd(path)")
+        if isinstance(opd, Tensor):
+            if opd.shape[-2:] != (self.npix, self.npix):
+                raise ShapeError(
+                    f"opd: got a tensor of shape {tuple(opd.shape)}, expected (..., {self.npix}, "
+                    f"{self.npix}). Tensors are not resampled, because gradients may flow through "
+                    f"them: pass opd.numpy(), or make the system with npix={opd.shape[-1]}"
+                )
+            return opd.to(self.device)
+        array = to_metres(opd, "opd")
+        require_finite(array, "opd (NaN is only allowed outside the pupil; set it to 0)")
+        array = resample(array, self.npix)
+        lit = self.entrance.lit.cpu().numpy()
+        # Maps and Quantities have units. A small rms is fine: a mode of 1 pm, for example.
+        if isinstance(opd, np.ndarray) and lit.any():
+            rms = float(array[..., lit].std(axis=-1).max())
+            warn_of_rms(rms, "opd", stacklevel=5, small=False)
+        return torch.from_numpy(array).to(self.device)
+
+    def values(self, given: Mapping[str, Value | None]) -> dict[str, Tensor]:
+        """Check named parameter values and make them float64 tensors, (components,) each.
+
+        Quantities are converted to the unit of the parameter table. Parameters that are missing or
+        None get the system's `defaults`, if it has them.
+
+        Raises
+        ------
+        TypeError
+            For a name that this system does not take.
+        ShapeError
+            For a wrong number of components.
+        UnitError
+            For a Quantity of another kind.
+        """
+        checked = dict(self.defaults)
+        for name, value in given.items():
+            if value is None:
+                continue
+            if name not in self.parameters:
+                raise TypeError(f"{name!r} is not a parameter of this system: {self.parameters}")
+            if not isinstance(value, Tensor):
+                value = to_unit(value, parameter(name).unit, name)
+            tensor = torch.as_tensor(value, dtype=torch.float64).to(self.device)
+            tensor = tensor.reshape(1) if tensor.ndim == 0 else tensor
+            if tensor.shape[-1] != parameter(name).size:
+                raise ShapeError(
+                    f"{name}: got {tensor.shape[-1]} components, expected {parameter(name).size}"
+                )
+            checked[name] = tensor
+        return checked
+
+    def pupil_field(self, opd: Tensor, wavelength: float, values: Values) -> Wavefront:
+        """The field behind the entrance pupil, the only step that is not linear."""
+        return self.entrance.field(opd, wavelength, values.get("star_offset"))
+
+    def windows(self, values: Values) -> list[PupilGrid]:
+        """For every plane, the pupil window that it must pass on, given the planes behind it."""
+        needed = self.entrance.full
+        passed: list[PupilGrid] = []
+        for plane in reversed(self.planes):
+            passed.append(needed)
+            needed = plane.window(values) or needed
+        return passed[::-1]
+
+    def propagate(self, wavefront: Wavefront, values: Values) -> Tensor:
+        """Field on the detector's samples from the field behind the entrance pupil; linear."""
+        windows = self.windows(values)
+        if self._lattice is not None:
+            return self._lattice.field(wavefront, values, windows)
+        for plane, onto in zip(self.planes, windows, strict=True):
+            wavefront = plane.apply(wavefront, values, onto)
+        return self.detector.field(wavefront, values)
+
+    def _field(self, opd: Tensor, wavelength: float, values: Values) -> Tensor:
+        if self._lattice is not None:
+            windows = self.windows(values)
+            field = self._lattice.star(self.entrance, opd, wavelength, values, windows)
+            if field is not None:
+                return field
+        return self.propagate(self.pupil_field(opd, wavelength, values), values)
+
+    def fields(self, opd: Value | None = None, **parameters: Value) -> list[Tensor]:
+        """Complex field on the detector's samples at each wavelength, each (..., ny, nx)."""
+        tensor, values = self.opd(opd), self.values(parameters)
+        return [self._field(tensor, wavelength, values) for wavelength in self.bandpass.wavelengths]
+
+    def image_of(
+        self, fields: Sequence[Tensor], values: Values, weights: Tensor | None = None
+    ) -> Tensor:
+        """Image from the fields at all wavelengths.
+
+        Parameters
+        ----------
+        fields : sequence of Tensor
+            See `fields`.
+        values : mapping of str to Tensor
+            See `values`; only the detector's parameters matter.
+        weights : Tensor, (wavelengths,), optional
+            Replace the weights of the bandpass.
+        """
+        spectrum = self.bandpass.weights if weights is None else weights
+        intensity = torch.zeros((), dtype=self.dtype, device=self.device)
+        for field, weight in zip(fields, spectrum, strict=True):
+            intensity = intensity + weight * (field.real**2 + field.imag**2)
+        return self.detector.image(intensity, values)
+
+    def __call__(
+        self,
+        opd: Value | None = None,
+        star_offset: Value = _ON_AXIS,
+        *,
+        weights: Tensor | None = None,
+        **parameters: Value,
+    ) -> Tensor:
+        """Image of a point source.
+
+        Parameters
+        ----------
+        opd : Tensor, Quantity or array, (..., npix, npix), optional
+            OTE OPD in entrance-pupil orientation; bare numbers are metres.
+        star_offset : (..., 2)
+            x, y of the source in arcsec, image orientation. Batches broadcast against `opd`.
+        weights : Tensor, (wavelengths,), optional
+            Replace the weights of the bandpass.
+        **parameters
+            Any of `self.parameters`, in the units of the parameter table.
+
+        Returns
+        -------
+        Tensor, (..., ny, nx)
+            Light per detector pixel as a fraction of the light that the entrance pupil collects.
+        """
+        if star_offset is not _ON_AXIS:  # Explicit zeros are kept, for their derivative.
+            parameters["star_offset"] = star_offset
+        return self.image_of(self.fields(opd, **parameters), self.values(parameters), weights)
+
+    def debug(
+        self, opd: Value | None = None, wavelength: float | None = None, **parameters: Value
+    ) -> dict[str, Tensor]:
+        """The field at every named plane, in order.
+
+        Returns
+        -------
+        dict of str to Tensor
+            Pupil planes: the field behind the plane on its window of the pupil. Occulters: the
+            field in front of the mask, on its cells ("... focus"), then the field back in the
+            pupil. The detector: the field on its samples.
+        """
+        tensor, values = self.opd(opd), self.values(parameters)
+        wavelength = wavelength or self.bandpass.wavelengths[0]
+        wavefront = self.pupil_field(tensor, wavelength, values)
+        fields = {self.entrance.name: wavefront.field}
+        for plane, onto in zip(self.planes, self.windows(values), strict=True):
+            if isinstance(plane, CompactOcculter):
+                fields[f"{plane.name} focus"] = plane.focal_field(wavefront)
+            wavefront = plane.apply(wavefront, values, onto)
+            fields[plane.name] = wavefront.field
+        # As in a call, which may take another route than the planes above.
+        fields[self.detector.name] = self._field(tensor, wavelength, values)
+        return fields
