@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from pyklip_diffrender.detection import Detection, detect
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import (
     GaussNewton,
     Refinement,
@@ -18,10 +19,11 @@ from pyklip_diffrender.refinement import (
     known_systematics,
     refine,
 )
+from pyklip_diffrender.refinement.registration import register
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.wavefront.opd import as_opd_map
+from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
 
 __all__ = ["Reduction", "reduce"]
 
@@ -140,17 +142,41 @@ def reduce(
                 failed.append((star, str(error)))
         pattern = known_systematics(sequence.science[0], references)
         _log.info("pattern of the model's error: %s", pattern)
+        if pattern is not None and not references:
+            sequence, pattern = _registered(sequence, pattern, model, wavefront, common)
     elif systematics != "off" and pattern is None:
         raise IncompatibleSetupError(
             f"systematics: got {systematics!r}, expected 'auto', 'off' or a Systematics"
         )
     if pattern is not None and settings is None and sequence.science[0].is_nircam:
-        common["settings"] = GaussNewton.nircam(
-            min_model_error=_KNOWN_MODEL_ERROR, max_companions=0
-        )
+        common["settings"] = GaussNewton.nircam(min_model_error=_KNOWN_MODEL_ERROR)
     fit = refine(model, sequence.science, wavefront, systematics=pattern, **common)
     detection = detect(fit, threshold=threshold, progress=progress)
     return Reduction(sequence, fit, detection, tuple(references), pattern, tuple(failed))
+
+
+def _registered(
+    sequence: Sequence,
+    pattern: Systematics,
+    model: OpticalSystem,
+    wavefront: OPDMap,
+    common: dict[str, Any],
+) -> tuple[Sequence, Systematics | None]:
+    """The sequence on the pixels of the library's pattern; no pattern if one frame is not."""
+    frames = []
+    for each in sequence.science:
+        frame: Observation | None = each
+        if each.first_pixel is None:
+            _log.info("%s: looking for its place on the detector", each.name)
+            frame = register(refine(model, each, wavefront, **common), pattern)
+        if frame is None:
+            _log.warning(
+                "%s: the file does not say which pixels of the detector its frames show, and the "
+                "known pattern of the flat field is not seen in them; it is not used", each.name
+            )  # fmt: skip
+            return sequence, None
+        frames.append(frame)
+    return replace(sequence, science=tuple(frames)), pattern
 
 
 def _by_star(observations: Iterable[Observation]) -> dict[str, list[Observation]]:

@@ -69,7 +69,8 @@ def detect(
         Of the contrast curve, arcsec. Default every 0.1 from 0.2 to the nearest edge.
     relinearise : float
         S/N of a candidate above which the star is refined once more with the candidates in the
-        model, so that the linear model holds where the star is.
+        model, so that the linear model holds where the star is. Where a fit does not explain its
+        data, any candidate may be the reason, and `threshold` takes its place.
     progress : bool
         Show progress bars.
 
@@ -100,6 +101,8 @@ def detect(
     groups = _groups(fits)
     maps = Maps(groups, progress)
     candidates, factor = _search(maps, fits, threshold, inner, scatter, Candidates.of_fit(fits[0]))
+    if not all(fit.status.calibrated for fit in fits):
+        relinearise = min(relinearise, threshold)
     bright = candidates.contrasts > relinearise * factor * candidates.errors[:, 0]
     if bool(bright.any()) and lacks_candidates(fits, candidates):
         fits = with_companions(fits, candidates, progress)

@@ -59,7 +59,8 @@ def known_systematics(
     """
     patterns = measure_patterns(references)
     stars = {_plain(pattern.star) for pattern in patterns} | {_plain(observation.target)}
-    patterns += [each for each in _library_for(observation) if _plain(each.star) not in stars]
+    if all(pattern.first_pixel is not None for pattern in patterns):
+        patterns += [each for each in _library_for(observation) if _plain(each.star) not in stars]
     return combine_patterns(patterns) if len(patterns) > 1 else None
 
 
@@ -69,8 +70,11 @@ def _plain(name: str) -> str:
 
 
 def _library_for(observation: Observation) -> list[MeasuredPattern]:
-    """The library's patterns of the observation's filter and mask, if they cover its pixels."""
-    if observation.first_pixel is None or observation.header.get("DETECTOR") != "NRCALONG":
+    """The library's patterns of the observation's filter and mask, if they cover its pixels.
+
+    Frames that do not say where their pixels are on the detector may be anywhere.
+    """
+    if observation.header.get("DETECTOR") != "NRCALONG":
         return []
     mask = str(observation.header.get("CORONMSK", "")).strip().upper()
     return [
@@ -85,7 +89,7 @@ def _library_for(observation: Observation) -> list[MeasuredPattern]:
 def _covered(pattern: MeasuredPattern, observation: Observation) -> float:
     """The part of the observation's pixels that a pattern covers."""
     if pattern.first_pixel is None or observation.first_pixel is None:
-        return 0.0
+        return 1.0
     starts = np.array([pattern.first_pixel, observation.first_pixel])
     shapes = np.array([pattern.value.shape[::-1], observation.shape[::-1]])
     overlap = (starts + shapes).min(axis=0) - starts.max(axis=0)

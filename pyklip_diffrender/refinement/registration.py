@@ -1,0 +1,116 @@
+"""Find which pixels of the detector frames show, from the pattern of the flat field itself.
+
+Frames that were moved without a record of it do not say where their pixels are on the detector.
+What a fit leaves of the star does: it correlates with the known pattern at one place only.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import fourier_shift
+
+from pyklip_diffrender.refinement.learning import measure_patterns
+from pyklip_diffrender.refinement.result import Refinement
+from pyklip_diffrender.refinement.systematics import Systematics
+from pyklip_diffrender.scene.detector_pixels import shift_frames
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["register"]
+
+_log = logging.getLogger(__name__)
+
+_REACH = 3.0
+"""Pixels by which stars behind the same mask may be apart."""
+
+_COARSE, _FINE = 0.25, 0.05
+"""Steps of the search, pixels."""
+
+_SIGNIFICANT = 6.0
+"""Height of the peak in units of the correlation's scatter elsewhere."""
+
+_BESIDE = 1.5
+"""Pixels from the peak beyond which the correlation is elsewhere."""
+
+_MODEL_ERROR = 0.05
+"""Error of the ratio of residual and star that the pattern does not explain."""
+
+_INNER = 0.3
+"""arcsec, inside which the ratio says little."""
+
+
+def register(fit: Refinement, known: Systematics) -> Observation | None:
+    """Move the frames of a fit onto the pixels of the detector that a pattern was measured on.
+
+    Parameters
+    ----------
+    fit : Refinement
+        Of one observation, without a pattern.
+    known : Systematics
+        With `first_pixel`.
+
+    Returns
+    -------
+    Observation or None
+        Shifted by less than a pixel, with `first_pixel`; None where the pattern is not seen.
+    """
+    frame, (measured,) = fit.frames[0], measure_patterns(fit)
+    observation = frame.observation
+    if known.first_pixel is None:
+        return None
+    start = np.round(np.subtract(measured.center, known.center)).astype(int)
+    column, row = np.subtract(known.first_pixel, start).tolist()
+    pattern = known.at(replace(observation, first_pixel=(column, row)))[0]
+    y, x = np.indices(pattern.shape)
+    scale_x, scale_y = frame.model.detector.pixelscale
+    away = np.hypot((x - measured.center[0]) * scale_x, (y - measured.center[1]) * scale_y)
+    weight = np.where(away > _INNER, 1 / (measured.variance + _MODEL_ERROR**2), 0.0)
+    steps = np.arange(-_REACH, _REACH + _COARSE / 2, _COARSE)
+    coarse = _correlation(measured.value, pattern, weight, steps, steps)
+    row, column = np.unravel_index(int(coarse.argmax()), coarse.shape)
+    best = np.array([steps[column], steps[row]])
+    elsewhere = np.hypot(*np.meshgrid(steps - best[0], steps - best[1])) > _BESIDE
+    scatter = float(coarse[elsewhere].std())
+    _log.info("pattern seen at %s pixels, correlation %.2f, elsewhere %.3f",
+              best, coarse.max(), scatter)  # fmt: skip
+    if coarse.max() < _SIGNIFICANT * scatter:
+        return None
+    near = np.arange(-_COARSE, _COARSE + _FINE / 2, _FINE)
+    fine = _correlation(measured.value, pattern, weight, best[0] + near, best[1] + near)
+    row, column = np.unravel_index(int(fine.argmax()), fine.shape)
+    moved = start + best + (near[column], near[row])
+    whole = np.round(moved).astype(int)
+    shift = np.broadcast_to(whole - moved, (len(observation), 2))
+    column, row = np.subtract(known.first_pixel, whole).tolist()
+    return replace(
+        observation,
+        data=np.where(observation.valid, shift_frames(observation.data, shift), 0.0),
+        error=np.where(observation.valid, shift_frames(observation.error, shift), 1.0),
+        center=observation.center + shift,
+        first_pixel=(column, row),
+    )
+
+
+def _correlation(
+    value: NDArray[np.float64],
+    pattern: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    right: NDArray[np.floating],
+    up: NDArray[np.floating],
+) -> NDArray[np.float64]:
+    """Weighted correlation of a ratio with the pattern shifted, (up, right)."""
+    transform = np.fft.fft2(pattern)
+    total = weight.sum()
+    centred = value - (weight * value).sum() / total
+    length = np.sqrt((weight * centred**2).sum())
+    correlation = np.empty((len(up), len(right)))
+    for row, y in enumerate(up):
+        for column, x in enumerate(right):
+            moved = np.fft.ifft2(fourier_shift(transform, (y, x))).real
+            moved -= (weight * moved).sum() / total
+            product = (weight * centred * moved).sum()
+            correlation[row, column] = product / (length * np.sqrt((weight * moved**2).sum()))
+    return correlation
