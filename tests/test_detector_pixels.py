@@ -1,0 +1,261 @@
+"""The detector's own pixels: undoing a shift, the library of patterns, finding lost pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from astropy.io import fits
+from numpy.typing import NDArray
+from scipy.ndimage import fourier_shift, gaussian_filter
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, ShapeError
+from pyklip_diffrender.optics.fast.point_sources import PointSources
+from pyklip_diffrender.refinement.learning import (
+    MeasuredPattern,
+    average_by_star,
+    combine_patterns,
+)
+from pyklip_diffrender.refinement.library import read_patterns, write_patterns
+from pyklip_diffrender.refinement.registration import register
+
+SIDE = 320
+SHIFTS = np.array([[10.6, -13.3], [10.4, -13.4]])
+MASK = np.array([149.2 + 0.177, 173.6 - 0.205])
+"""Centre of MASK335R on the subarray in F444W, 0-indexed."""
+
+
+def on_detector() -> NDArray[np.float64]:
+    """A smooth scene on the detector, with the pixel-scale pattern of a flat field."""
+    rng = np.random.default_rng(1)
+    smooth = gaussian_filter(rng.normal(size=(SIDE, SIDE)), 2, mode="wrap")
+    flat = 1 + 0.05 * rng.normal(size=(SIDE, SIDE))
+    return np.asarray(100 * (2 + smooth / smooth.std()) * flat)
+
+
+def aligned_file(path: Path, shifts: NDArray[np.float64] = SHIFTS, **cards: object) -> Path:
+    """Two frames as an alignment leaves them: star at (160, 160), cut so that it is at (150, 174).
+
+    The scene is shifted with the Fourier transform; DQ stays where it was.
+    """
+    frames = []
+    for x, y in shifts:
+        # The whole pixels of the shift are those of the cut.
+        net = (y + 14, x - 10)
+        frames.append(np.fft.ifft2(fourier_shift(np.fft.fft2(on_detector()), net)).real)
+    primary = fits.PrimaryHDU()
+    for key, value in {
+        "INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "FILTER": "F444W", "PUPIL": "MASKRND",
+        "CORONMSK": "MASKA335R", "APERNAME": "NRCA5_MASK335R", "TARGPROP": "A STAR",
+        "SUBSTRT1": 492, "SUBSTRT2": 1502, "DATE-BEG": "2022-10-03T00:00:00",
+    }.items():  # fmt: skip
+        primary.header[key] = value
+    science = fits.ImageHDU(np.stack(frames), name="SCI")
+    for key, value in {
+        "BUNIT": "MJy/sr", "PIXAR_A2": 0.0039, "CRPIX1": 151.0, "CRPIX2": 175.0, "ROLL_REF": 10.0,
+    }.items():  # fmt: skip
+        science.header[key] = value
+    for key, value in cards.items():
+        primary.header[key] = value
+    quality = np.zeros((2, SIDE, SIDE), dtype=np.int32)
+    quality[:, 100, 60] = 1
+    hdus = [primary, science, fits.ImageHDU(np.ones_like(frames), name="ERR"),
+            fits.ImageHDU(quality, name="DQ"), fits.ImageHDU(shifts, name="IMSHIFTS")]  # fmt: skip
+    fits.HDUList(hdus).writeto(path)
+    return path
+
+
+def test_the_shift_of_aligned_frames_is_undone(tmp_path: Path) -> None:
+    observation = dr.Observation.from_fits(aligned_file(tmp_path / "aligned.fits"))
+    assert observation.first_pixel is not None
+    x, y = np.subtract(observation.first_pixel, (491, 1501))
+    assert (x, y) == (0, -1)  # Net shifts of about (0.5, 0.65): the nearest whole pixels.
+    # Far from the edges, both frames show the detector's pixels, however they were shifted.
+    inside = slice(40, -40)
+    for frame in observation.data:
+        native = np.roll(on_detector(), (-y, -x), axis=(0, 1))
+        error = np.where(observation.valid[0], frame - native, 0.0)[inside, inside]
+        assert np.abs(error).max() < 0.05 * native[inside, inside].std()
+    np.testing.assert_allclose(
+        observation.center, [[149.4, 173.3 + 1], [149.6, 173.4 + 1]], atol=1e-9
+    )
+    assert np.argwhere(~observation.valid)[0].tolist() == [0, 101, 60]  # DQ follows its pixel.
+    cut = observation.cutout(80)
+    assert cut.first_pixel == (491 + 110, 1500 + 135)
+
+
+def test_shifts_that_do_not_fit_the_frames_are_refused(tmp_path: Path) -> None:
+    path = aligned_file(tmp_path / "one.fits")
+    with fits.open(path, mode="update") as hdus:
+        hdus["IMSHIFTS"].data = SHIFTS[:1]
+    with pytest.raises(ShapeError, match=r"IMSHIFTS: got shape \(1, 2\), expected \(2, 2\)"):
+        dr.Observation.from_fits(path)
+
+
+def test_plain_calints_know_their_pixels(tmp_path: Path) -> None:
+    path = aligned_file(tmp_path / "plain.fits")
+    with fits.open(path, mode="update") as hdus:
+        del hdus["IMSHIFTS"]
+    observation = dr.Observation.from_fits(path)
+    assert observation.first_pixel == (491, 1501)
+    with fits.open(path, mode="update") as hdus:
+        hdus[0].header["STARCENX"] = 151.0
+    # Somebody has moved the star, and does not say how.
+    assert dr.Observation.from_fits(path).first_pixel is None
+
+
+def measured(star: str, first: tuple[int, int] = (600, 1630), **changes: object) -> MeasuredPattern:
+    rng = np.random.default_rng(5)
+    truth = 0.05 * rng.normal(size=(60, 60))
+    noise = np.random.default_rng(len(star)).normal(size=truth.shape)
+    window = np.s_[first[1] - 1625 : first[1] - 1625 + 40, first[0] - 595 : first[0] - 595 + 40]
+    pattern = MeasuredPattern(
+        star,
+        (truth + 0.01 * noise)[window],
+        np.full((40, 40), 0.01**2),
+        (20.0 - first[0] + 600, 20.0 - first[1] + 1630),
+        first,
+        "F444W",
+        "MASKA335R",
+        (f"{star}.fits",),
+        ("2022-10-03",),
+    )
+    return replace(pattern, **changes)
+
+
+def test_patterns_are_combined_pixel_by_pixel_of_the_detector() -> None:
+    one, other = measured("A"), measured("BB", (602, 1629))
+    known = combine_patterns([one, other])
+    assert known.first_pixel == (600, 1629)
+    truth = 0.05 * np.random.default_rng(5).normal(size=(60, 60))
+    inside = known.pattern[3:38, 3:38] - truth[7:42, 8:43]
+    # The average of two, shrunk a little.
+    assert inside.std() == pytest.approx(0.01 / np.sqrt(2), rel=0.1)
+    assert known.provenance["stars"] == ["A", "BB"]
+    with pytest.raises(IncompatibleSetupError, match="F356W"):
+        combine_patterns([one, replace(other, filter="F356W")])
+    (both,) = average_by_star([one, replace(other, star="A")])
+    assert both.frames == ("A.fits", "BB.fits")
+    assert np.median(both.variance[np.isfinite(both.variance)]) == pytest.approx(0.5e-4)
+
+
+def test_patterns_survive_the_file(tmp_path: Path) -> None:
+    pattern = measured("A")
+    variance = pattern.variance.copy()
+    variance[3, 4] = np.inf
+    path = write_patterns([replace(pattern, variance=variance)], tmp_path / "patterns.fits.gz")
+    (back,) = read_patterns(path)
+    np.testing.assert_allclose(back.value[5:], pattern.value[5:], rtol=1e-6)
+    np.testing.assert_allclose(back.variance, variance, rtol=1e-6)
+    assert (back.star, back.first_pixel, back.filter) == ("A", (600, 1630), "F444W")
+    assert (back.frames, back.dates) == (("A.fits",), ("2022-10-03",))
+    with pytest.raises(CorruptFileError):
+        read_patterns(tmp_path / "none.fits")
+
+
+@pytest.mark.parametrize("name", ["F444W", "F356W"])
+def test_the_library_knows_other_stars_on_the_same_pixels(tmp_path: Path, name: str) -> None:
+    frames = dr.Observation.from_fits(aligned_file(tmp_path / "a.fits", FILTER=name))
+    cut = frames.cutout(80)
+    known = dr.known_systematics(cut)
+    assert known is not None
+    assert known.filter == name
+    assert known.provenance["stars"] == ["HIP17695", "G-7-34"]
+    pattern, error = known.at(cut)
+    # A few percent, measured to a percent or so near the star.
+    y, x = np.indices(pattern.shape) - 39.5
+    near = np.hypot(x, y) < 20
+    assert 0.02 < pattern[near].std() < 0.08
+    assert np.median(error[near]) < 0.5 * pattern[near].std()
+
+
+def test_the_library_leaves_out_the_target_and_what_it_does_not_cover(tmp_path: Path) -> None:
+    frames = dr.Observation.from_fits(aligned_file(tmp_path / "a.fits")).cutout(80)
+    # One star is left, and a pattern needs two.
+    frames.header["TARGPROP"] = "HIP 17695"
+    assert dr.known_systematics(frames) is None
+    frames.header["TARGPROP"] = "A STAR"
+    assert dr.known_systematics(replace(frames, first_pixel=(100, 100))) is None
+    assert dr.known_systematics(replace(frames, filter="F335M")) is None
+    frames.header["DETECTOR"] = "NRCBLONG"
+    assert dr.known_systematics(frames) is None
+
+
+# -- images of sources off the pixels' centres -----------------------------------------------------
+
+
+@cache
+def system() -> dr.OpticalSystem:
+    return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+
+
+def test_sources_off_the_pixels_centres_are_those_of_the_model() -> None:
+    offset = (0.011, -0.02)
+    sources = PointSources(system(), None, {"detector_shift": (0.02, -0.01)}, offset=offset)
+    assert sources.route == "lattice"
+    rows, columns = [4, 20, 27], [9, 22, 3]
+    places = sources.positions(rows, columns)
+    exact = system()(None, places, detector_shift=(0.02, -0.01))
+    images = sources.images(rows, columns).double()
+    assert float((images - exact).norm() / exact.norm()) < 1e-4
+    centred = PointSources(system(), None, {"detector_shift": (0.02, -0.01)})
+    np.testing.assert_allclose(places - centred.positions(rows, columns), [offset] * 3, atol=1e-12)
+
+
+def test_templates_of_rolled_frames_stand_where_the_planet_is() -> None:
+    opd = dr.random_opd(1, npix=128)
+    frames = [
+        replace(dr.simulate(system(), dr.Scene(), opd, seed=seed), position_angles=np.array([roll]))
+        for seed, roll in ((1, 0.0), (2, 10.0))
+    ]
+    fit = dr.refine(system(), frames, opd, settings=dr.GaussNewton(cycles=4), plan="off")
+    templates = Templates(fit, fit.frames[0])
+    rows, columns = np.array([6, 16, 25]), np.array([16, 28, 8])
+    images = templates.at_pixels(rows, columns)
+    exact = templates.at(torch.from_numpy(templates.grid[rows, columns]))
+    for k, least in ((0, 0.9999), (1, 0.985)):
+        one, other = images[k].double().flatten(1), exact[k].flatten(1)
+        overlap = (one * other).sum(1) / (one.norm(dim=1) * other.norm(dim=1))
+        assert float(overlap.min()) > least
+    # Outside the second frame there is no light.
+    corner = templates.at_pixels(np.array([31]), np.array([31]))
+    assert float(corner[1].abs().max()) == 0 < float(corner[0].max())
+
+
+# -- frames that do not say where they are ---------------------------------------------------------
+
+
+@pytest.mark.parametrize("moved", [(0.3, 1.2), None], ids=["seen", "not there"])
+def test_lost_pixels_are_found_by_the_pattern(moved: tuple[float, float] | None) -> None:
+    rng = np.random.default_rng(8)
+    flat = 0.06 * rng.normal(size=(38, 38))
+    opd = dr.random_opd(1, npix=128)
+    frames = dr.simulate(system(), dr.Scene(dr.Star(exposure=20.0)), opd, seed=3)
+    data = frames.data[0]
+    if moved is not None:
+        # The star falls `moved` off its place among the pixels of the pattern's detector.
+        x, y = moved
+        whole = np.round(moved).astype(int)
+        onto = np.fft.ifft2(fourier_shift(np.fft.fft2(data), (whole[1] - y, whole[0] - x))).real
+        own = flat[3 - whole[1] : 35 - whole[1], 3 - whole[0] : 35 - whole[0]]
+        onto = onto * (1 + own)
+        data = np.fft.ifft2(fourier_shift(np.fft.fft2(onto), (y - whole[1], x - whole[0]))).real
+    observation = replace(frames, data=data[None], header=fits.Header({"DETECTOR": "NRCALONG"}))
+    settings = dr.GaussNewton(cycles=6, min_model_error=0.05)
+    fit = dr.refine(system(), observation, opd, settings=settings, plan="off")
+    known = dr.Systematics(
+        flat, np.full(flat.shape, 0.01), (18.5, 18.5), unknown=0.06, first_pixel=(100, 200)
+    )
+    frame = register(fit, known)
+    if moved is None:
+        assert frame is None
+        return
+    assert frame is not None
+    assert frame.first_pixel == (103 - 0, 203 - 1)
+    np.testing.assert_allclose(frame.center - observation.center, [[-0.3, -0.2]], atol=0.11)
