@@ -16,7 +16,6 @@ from pathlib import Path
 import pyklip_diffrender as dr
 from pyklip_diffrender.refinement.learning import (
     MeasuredPattern,
-    average_by_star,
     combine_patterns,
     measure_patterns,
 )
@@ -43,7 +42,7 @@ def patterns_of(
 
 
 def main() -> None:
-    """Fit all stars twice through every filter and write the patterns, averaged by star."""
+    """Fit all stars twice through every filter and write the patterns of their frames."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="calints or aligned files")
     parser.add_argument("--opd", type=Path, required=True)
@@ -59,7 +58,7 @@ def main() -> None:
         first = {star: patterns_of(star, name, files, options.opd, []) for star in options.stars}
         for star in options.stars:
             others = [p for other, own in first.items() if other != star for p in own]
-            library += average_by_star(patterns_of(star, name, files, options.opd, others))
+            library += patterns_of(star, name, files, options.opd, others)
             write_patterns(library, options.output)
 
 

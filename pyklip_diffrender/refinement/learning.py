@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from pyklip_diffrender.refinement.systematics import Systematics
 
 __all__ = [
     "MeasuredPattern",
-    "average_by_star",
     "combine_patterns",
     "learn_systematics",
     "measure_patterns",
@@ -33,7 +32,7 @@ a companion or background source of that star, or a cosmic ray."""
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPattern:
-    """Residual over star, as one frame, or all frames of one star, show it.
+    """Residual over star, as one frame shows it.
 
     Attributes
     ----------
@@ -47,8 +46,8 @@ class MeasuredPattern:
     first_pixel : tuple of int or None
         Column and row of the first pixel on the full detector, as of an `Observation`.
     filter, image_mask : str or None
-    frames, dates : tuple of str
-        Where it was measured.
+    frame, date : str
+        Where and when it was measured.
     """
 
     star: str
@@ -58,8 +57,8 @@ class MeasuredPattern:
     first_pixel: tuple[int, int] | None = None
     filter: str | None = None
     image_mask: str | None = None
-    frames: tuple[str, ...] = ()
-    dates: tuple[str, ...] = ()
+    frame: str = ""
+    date: str = ""
 
 
 def learn_systematics(
@@ -141,33 +140,10 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
         name=name or ", ".join(names),
         provenance={
             "stars": names,
-            "frames": [frame for each in patterns for frame in each.frames],
-            "dates": [date for each in patterns for date in each.dates],
+            "frames": [pattern.frame for pattern in patterns],
+            "dates": [pattern.date for pattern in patterns],
         },
     )
-
-
-def average_by_star(patterns: Sequence[MeasuredPattern]) -> list[MeasuredPattern]:
-    """Average the frames of each star with their inverse variances."""
-    averaged = []
-    for star in dict.fromkeys(pattern.star for pattern in patterns):
-        own = [pattern for pattern in patterns if pattern.star == star]
-        values, variances, center, first_pixel = _on_common_pixels(own)
-        total = (1 / variances).sum(axis=0)
-        seen = total > 0
-        value = np.divide((values / variances).sum(axis=0), total, where=seen, out=0 * total)
-        averaged.append(
-            replace(
-                own[0],
-                value=value,
-                variance=np.divide(1.0, total, where=seen, out=np.full_like(total, np.inf)),
-                center=center,
-                first_pixel=first_pixel,
-                frames=tuple(frame for each in own for frame in each.frames),
-                dates=tuple(date for each in own for date in each.dates),
-            )
-        )
-    return averaged
 
 
 def _text(value: object) -> str | None:
@@ -191,8 +167,8 @@ def _measured(frame: FrameFit) -> MeasuredPattern:
         first_pixel=observation.first_pixel,
         filter=observation.filter,
         image_mask=_text(observation.header.get("CORONMSK")),
-        frames=(observation.name,),
-        dates=() if observation.date is None else (observation.date.isot,),
+        frame=observation.name,
+        date="" if observation.date is None else observation.date.isot,
     )
 
 

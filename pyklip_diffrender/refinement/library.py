@@ -47,7 +47,7 @@ def known_systematics(
     Returns
     -------
     Systematics or None
-        None if there are fewer than two frames, or stars of the library, to learn from.
+        None if there are fewer than two frames to learn from.
 
     Examples
     --------
@@ -115,12 +115,7 @@ def write_patterns(patterns: Sequence[MeasuredPattern], path: str | os.PathLike[
         header["STARX"], header["STARY"] = pattern.center
         if pattern.first_pixel is not None:
             header["COLUMN"], header["ROW"] = pattern.first_pixel
-        header["NFRAMES"] = len(pattern.frames)
-        for n, frame in enumerate(pattern.frames, 1):
-            header[f"FRAME{n}"] = frame
-        header["NDATES"] = len(pattern.dates)
-        for n, date in enumerate(pattern.dates, 1):
-            header[f"DATE{n}"] = date
+        header["FRAME"], header["DATE-BEG"] = pattern.frame, pattern.date
         hdus += [value, fits.ImageHDU(error.astype(np.float32), name="ERROR", ver=k)]
     write_fits(fits.HDUList(hdus), path)
     return Path(path)
@@ -149,8 +144,8 @@ def read_patterns(path: str | os.PathLike[str]) -> list[MeasuredPattern]:
                     first_pixel=(header["COLUMN"], header["ROW"]) if "COLUMN" in header else None,
                     filter=header["FILTER"] or None,
                     image_mask=header["CORONMSK"] or None,
-                    frames=tuple(header[f"FRAME{n + 1}"] for n in range(header["NFRAMES"])),
-                    dates=tuple(header[f"DATE{n + 1}"] for n in range(header["NDATES"])),
+                    frame=header["FRAME"],
+                    date=header["DATE-BEG"],
                 )
             )
     return patterns
