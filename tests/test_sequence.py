@@ -20,6 +20,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.reduction import reduce
 from pyklip_diffrender.refinement import (
     GaussNewton,
     Refinement,
@@ -241,3 +242,9 @@ def test_half_a_file_is_no_refinement(tmp_path: Path, percent: int) -> None:
     path.write_bytes(whole[: len(whole) * percent // 100])
     with pytest.raises(CorruptFileError, match=r"fit\.fits"):
         Refinement.read(path)
+
+
+def test_reduce_says_what_systematics_it_takes() -> None:
+    sequence = Sequence("TARGET", (frame("TARGET", 20),))
+    with pytest.raises(IncompatibleSetupError, match=r"'maybe', expected 'auto', 'off' or a Sys"):
+        reduce(sequence, opd(), size=SIZE, systematics="maybe")  # type: ignore[arg-type]
