@@ -201,8 +201,10 @@ def test_the_summary_has_the_numbers_of_the_result(folder: Path) -> None:
         "taken through F356W, not F444W",
         "too faint",
     ]
+    assert (summary["settings"]["cycles"], summary["settings"]["robust"]) == ([6.0], "inf")
     assert summary["versions"]["pyklip_diffrender"] == dr.__version__
-    assert summary["sentence"] in (folder / "report.html").read_text(encoding="utf-8")
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert summary["sentence"] in page.replace("\u00a0", " ")
 
 
 def test_every_picture_has_words_and_nothing_is_loaded(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
@@ -99,7 +100,8 @@ def page(
         "title": f"{summary['target']}, {summary['filter'] or 'no filter'}: report",
         "target": summary["target"],
         "setup": _setup(summary),
-        "sentence": summary["sentence"],
+        # Numbers are not broken over lines.
+        "sentence": re.sub(" ([±×]) ", "\u00a0\\1\u00a0", summary["sentence"]),
         "tone": tone,
         "status": message[:1].upper() + message[1:] + ("" if message.endswith(".") else "."),
         "advice": status["advice"],
@@ -267,7 +269,10 @@ def _provenance(summary: Mapping[str, Any], files: Sequence[str]) -> str:
         ("Chi-squared per pixel", number(summary["fit"]["chi2_per_pixel"])),
     ]
     long = [("Software", versions), ("SHA-256 of the wavefront map", map_["sha256"])]
-    settings = [[name, str(value)] for name, value in summary["settings"].items()]
+    settings = [
+        [name, "none" if value is None else str(value)]
+        for name, value in summary["settings"].items()
+    ]
     known = [[name, _PRODUCTS.get(name, "")] for name in files]
     parts = [_facts(facts), _facts(long, "facts long")]
     if known:

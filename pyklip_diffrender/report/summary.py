@@ -219,7 +219,9 @@ def _seconds(reduction: Reduction, fit: Refinement) -> float:
 
 
 def _settings(settings: Any) -> dict[str, Any]:
-    return {each.name: getattr(settings, each.name) for each in fields(settings)}
+    values = {each.name: getattr(settings, each.name) for each in fields(settings)}
+    # JSON has no infinity, and None means something else here.
+    return {name: "inf" if value == math.inf else value for name, value in values.items()}
 
 
 def _plain(value: Any) -> Any:
