@@ -61,7 +61,9 @@ def draw_star(found: Detection, frame: int = 0) -> list[Figure]:
     extent = detector_extent(part.model.detector, part.optical_values)
     unit, norm = unit_label(observation.unit), light_norm(data, noise[valid])
     figures, axes = _panels(3)
-    light = {"bar": unit, "cmap": "magma", "norm": norm}
+    # Powers of ten in the logarithmic part; those of the linear part would overlap.
+    decades = np.arange(np.ceil(np.log10(norm.linear_width)), np.log10(norm.vmax))
+    light = {"bar": unit, "cmap": "magma", "norm": norm, "ticks": [0.0, *10.0**decades]}
     show(axes[0], data, extent, title="Data", **light)
     show(axes[1], part.star, extent, title="Model of the star", **light)
     show(
