@@ -67,13 +67,15 @@ class Reduction:
         return f"{self.sequence!r}\n{self.fit.status.message}\n{self.detection}"
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write maps, tables, the fit and the systematics; returns the paths."""
+        """Write maps, tables, the fit, the systematics and a report; returns the paths."""
+        from pyklip_diffrender import report
+
         folder = Path(folder)
         written = self.detection.write(folder)
         written.append(self.fit.write(folder / "fit.fits"))
         if self.systematics is not None:
             written.append(self.systematics.write(folder / "systematics.fits"))
-        return written
+        return written + report.write_report(self, folder, written)
 
 
 def reduce(

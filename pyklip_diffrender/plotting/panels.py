@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from math import cos, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.io.units import ARCSEC
 
 if TYPE_CHECKING:
     from astropy.units import UnitBase
@@ -19,19 +21,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
+    from pyklip_diffrender.optics.detector import Detector
+    from pyklip_diffrender.optics.planes import Values
+    from pyklip_diffrender.scene.observation import Observation
+
 __all__ = [
     "ACCENT",
     "INK",
     "Extent",
     "axes_for",
+    "detector_extent",
     "draw_compass",
     "draw_image",
     "extent_of",
     "halo",
+    "label_sky",
     "light_norm",
     "mark",
     "save",
     "show",
+    "to_png",
+    "turned",
     "unit_label",
 ]
 
@@ -50,6 +60,13 @@ def save(figure: Figure, path: str | Path, dpi: int = 150) -> None:
     """Write a figure in one step."""
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=dpi, facecolor="white")
+
+
+def to_png(figure: Figure, dpi: int = 150) -> bytes:
+    """The file that `save` would write."""
+    stream = BytesIO()
+    figure.savefig(stream, format="png", dpi=dpi, facecolor="white")
+    return stream.getvalue()
 
 
 def draw_image(
@@ -107,6 +124,31 @@ def extent_of(x: NDArray[np.float64], y: NDArray[np.float64]) -> Extent:
     """Edges of an image whose pixels have their centres at `x` and `y`."""
     half_x, half_y = (abs(axis[-1] - axis[0]) / (2 * max(len(axis) - 1, 1)) for axis in (x, y))
     return x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y
+
+
+def detector_extent(detector: Detector, values: Values) -> Extent:
+    """Edges of a detector in arcsec from the star."""
+    star = values["star_offset"].cpu().numpy() if "star_offset" in values else np.zeros(2)
+    x, y = (
+        axis.reshape(-1, detector.oversample).mean(dim=1).cpu().numpy() / ARCSEC
+        for axis in detector.axes(values)
+    )
+    return extent_of(x - star[0], y - star[1])
+
+
+def label_sky(*axes: Axes) -> None:
+    """Axes from the star, which gets a cross."""
+    for ax in axes:
+        ax.plot(0, 0, "+", color=INK, ms=11, mew=1.6, label="star", path_effects=halo())
+        ax.set_xlabel("x from the star (arcsec)")
+    axes[0].set_ylabel("y from the star (arcsec)")
+
+
+def turned(places: ArrayLike, frame: Observation, first: Observation) -> NDArray[np.float64]:
+    """Places (k, 2) on the sky as a frame shows them, from where they are in the first frame."""
+    turn = np.deg2rad(frame.roll_from(first))
+    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return np.reshape(places, (-1, 2)) @ matrix.T
 
 
 def show(

@@ -11,18 +11,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.plotting.panels import (
     ACCENT,
     INK,
-    Extent,
     axes_for,
+    detector_extent,
     draw_compass,
     extent_of,
-    halo,
+    label_sky,
     light_norm,
     mark,
     show,
+    turned,
     unit_label,
 )
 
@@ -30,9 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from pyklip_diffrender.detection import Detection
-    from pyklip_diffrender.optics.detector import Detector
     from pyklip_diffrender.optics.grid import PupilGrid
-    from pyklip_diffrender.optics.planes import Values, Wavefront
+    from pyklip_diffrender.optics.planes import Wavefront
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.refinement import Refinement
     from pyklip_diffrender.scene.observation import Observation
@@ -64,7 +63,7 @@ def plot_observation(observation: Observation, ax: Any = None, *, frame: int = 0
     details = [observation.target, observation.filter]
     title = ", ".join(each for each in details if each)
     show(ax, image, extent, bar=unit_label(observation.unit), title=title, cmap=_LIGHT, norm=norm)
-    _label_sky(ax)
+    label_sky(ax)
     if observation.position_angles is not None:
         draw_compass(ax, float(observation.position_angles[frame]))
     return ax
@@ -104,7 +103,7 @@ def plot_system(system: OpticalSystem, ax: Any = None, *, opd: Any = None) -> ND
         axes.set_xlabel("m")
     title = f"star on the axis, {1e6 * mean:.2f} um"
     show(
-        image, light, _extent(system.detector, values), bar="fraction of the star's light",
+        image, light, detector_extent(system.detector, values), bar="fraction of the star's light",
         title=title, cmap=_LIGHT, norm=_log(light),
     )  # fmt: skip
     image.set_xlabel("x from the optical axis (arcsec)")
@@ -119,7 +118,8 @@ def plot_refinement(fit: Refinement, ax: Any = None, *, frame: int = 0) -> NDArr
     observation = part.observation.combined()
     valid, noise = observation.valid[0], observation.error[0]
     data = np.where(valid, observation.data[0], np.nan)
-    extent, unit = _extent(part.model.detector, part.optical_values), unit_label(observation.unit)
+    extent = detector_extent(part.model.detector, part.optical_values)
+    unit = unit_label(observation.unit)
     norm = light_norm(data, noise[valid])
     show(left, data, extent, bar=unit, title="data", cmap=_LIGHT, norm=norm)
     show(middle, part.star, extent, bar=unit, title="star model", cmap=_LIGHT, norm=norm)
@@ -127,11 +127,9 @@ def plot_refinement(fit: Refinement, ax: Any = None, *, frame: int = 0) -> NDArr
         right, (data - part.star) / noise, extent, bar="standard deviations",
         title="residual / noise", cmap=_SIGNED, vmin=-_LIMIT, vmax=_LIMIT,
     )  # fmt: skip
-    _label_sky(left, middle, right)
+    label_sky(left, middle, right)
     if len(fit.companions) and not observation.reference:
-        turn = np.deg2rad(observation.roll_from(fit.frames[0].observation))
-        matrix = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-        mark(right, fit.companions[:, 1:] @ np.transpose(matrix))
+        mark(right, turned(fit.companions[:, 1:], observation, fit.frames[0].observation))
     if observation.position_angles is not None:
         draw_compass(left, observation.position_angle)
     return np.array([left, middle, right])
@@ -147,7 +145,7 @@ def plot_detection(found: Detection, ax: Any = None) -> NDArray[Any]:
         left, found.snr, extent, bar="S/N of a point source", title=title, cmap=_SIGNED,
         norm=_snr_norm(found.snr), ticks=_SNR_TICKS,
     )  # fmt: skip
-    _label_sky(left)
+    label_sky(left)
     places = np.stack([table["x"].value, table["y"].value], axis=1)
     mark(left, places, [f"S/N {snr:.1f}" for snr in table["snr"]])
     if found.fits[0].frames[0].observation.position_angles is not None:
@@ -177,14 +175,6 @@ def plot_detection(found: Detection, ax: Any = None) -> NDArray[Any]:
     return np.array([left, right])
 
 
-def _label_sky(*axes: Axes) -> None:
-    """Axes from the star, which gets a cross."""
-    for ax in axes:
-        ax.plot(0, 0, "+", color=INK, ms=11, mew=1.6, label="star", path_effects=halo())
-        ax.set_xlabel("x from the star (arcsec)")
-    axes[0].set_ylabel("y from the star (arcsec)")
-
-
 def _snr_norm(snr: NDArray[np.float64]) -> Any:
     """Linear where there is noise, logarithmic beyond, so that bright sources keep their shape."""
     from matplotlib.colors import AsinhNorm
@@ -196,16 +186,6 @@ def _snr_norm(snr: NDArray[np.float64]) -> Any:
 def _whole(wavefront: Wavefront, full: PupilGrid) -> NDArray[np.float64]:
     """Amplitude of a wavefront on the whole pupil array."""
     return np.asarray(wavefront.grid.crop(wavefront.field.abs(), full).double().cpu().numpy())
-
-
-def _extent(detector: Detector, values: Values) -> Extent:
-    """Edges of the detector in arcsec from the star."""
-    star = values.get("star_offset", torch.zeros(2)).cpu().numpy()
-    x, y = (
-        axis.reshape(-1, detector.oversample).mean(dim=1).cpu().numpy() / ARCSEC
-        for axis in detector.axes(values)
-    )
-    return extent_of(x - star[0], y - star[1])
 
 
 def _log(light: NDArray[np.float64]) -> Any:

@@ -1,0 +1,337 @@
+"""The report as one HTML page that loads nothing from anywhere."""
+
+from __future__ import annotations
+
+import re
+from base64 import b64encode
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from importlib import resources
+from string import Template
+from typing import Any
+
+from pyklip_diffrender.report.pictures import Picture
+from pyklip_diffrender.report.words import (
+    number,
+    plus_minus,
+    probability,
+    scientific,
+)
+
+__all__ = ["page"]
+
+_PAGE = Template("""\
+<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>$title</title>
+<style>
+$style</style>
+</head>
+<body>
+<header>
+<h1>$target</h1>
+<p class="setup">$setup</p>
+<p class="result">$sentence</p>
+<div class="status $tone">
+<strong>$status</strong>
+<p>$advice</p>
+</div>
+$facts
+</header>
+<main>
+$sections
+</main>
+</body>
+</html>
+""")
+
+_PRODUCTS = {
+    "detection.fits": "S/N, contrast and error maps, and the frames without the star",
+    "candidates.ecsv": "the candidates with all columns",
+    "contrast.ecsv": "the contrast curve",
+    "fit.fits": "the fit, which Refinement.read makes again",
+    "systematics.fits": "the pattern of the model's error, for other reductions",
+    "summary.json": "what this page says, for programs",
+    "report.html": "this page",
+}
+
+
+def page(
+    summary: Mapping[str, Any],
+    search: Sequence[Picture],
+    stars: Sequence[Sequence[Picture]],
+    wavefront: Sequence[Picture],
+    files: Sequence[str] = (),
+) -> str:
+    """The report.
+
+    Parameters
+    ----------
+    summary : dict
+        See `summarise`.
+    search, wavefront : sequence of Picture
+    stars : sequence of sequence of Picture
+        One for each frame of the target that is shown.
+    files : sequence of str
+        Names of the files that were written with it.
+
+    Returns
+    -------
+    str
+        Every value in it is escaped: headers of files may hold anything.
+    """
+    status = summary["status"]
+    message = status["message"]
+    tone = "good" if status["name"] == "CONVERGED" else "warn" if status["usable"] else "bad"
+    sections = [
+        _section("Search", _pictures(search, "pair"), _candidates(summary), _limits(summary)),
+        _section("Star subtraction", *_star(summary, stars)),
+        _section("Wavefront", _wavefront(summary), _pictures(wavefront)),
+        _section("Frames", _frames(summary), _left_out(summary)),
+        _section("Provenance", _provenance(summary, files)),
+    ]
+    text = {
+        "title": f"{summary['target']}, {summary['filter'] or 'no filter'}: report",
+        "target": summary["target"],
+        "setup": _setup(summary),
+        # Numbers are not broken over lines.
+        "sentence": re.sub(" ([±×]) ", "\u00a0\\1\u00a0", summary["sentence"]),
+        "tone": tone,
+        "status": message[:1].upper() + message[1:] + ("" if message.endswith(".") else "."),
+        "advice": status["advice"],
+    }
+    style = resources.files("pyklip_diffrender.report").joinpath("page.css")
+    return _PAGE.substitute(
+        {name: escape(str(value)) for name, value in text.items()},
+        style=style.read_text(encoding="utf-8"),
+        facts=_facts(_key_facts(summary)),
+        sections="\n".join(sections),
+    )
+
+
+def _setup(summary: Mapping[str, Any]) -> str:
+    """Instrument, filter, mask and dates in a line."""
+    dates = [str(summary[key] or "")[:10] for key in ("first_date", "last_date")]
+    targets = [each for each in summary["frames"] if each["use"] == "target"]
+    references = len(summary["frames"]) - len(targets)
+    parts = [
+        summary["instrument"],
+        summary["filter"],
+        summary["image_mask"],
+        summary["program"] and f"program {summary['program']}",
+        " to ".join(dict.fromkeys(filter(None, dates))),
+        _count(len(targets), "frame") + " of the target",
+        _count(references, "reference frame") if references else None,
+    ]
+    return " · ".join(str(part) for part in parts if part)
+
+
+def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    fit, map_, used = summary["fit"], summary["wavefront_map"], summary["systematics"]
+    error = fit["model_error"]
+    pattern = "none known"
+    if used is not None:
+        stars = ", ".join(used["stars"])
+        pattern = used["name"] if stars in ("", used["name"]) else f"{used['name']} ({stars})"
+    return [
+        ("Reduced chi-squared without model error", number(fit["reduced_chi2"])),
+        (
+            "Error of the star model",
+            "none needed" if error == 0 else number(error and 100 * error, ".2g", "% of the star"),
+        ),
+        ("Errors multiplied by", number(fit["error_factor"])),
+        ("Wavefront map", f"{map_['name']}, {_age(map_['days_before_first_frame'])}"),
+        ("Pattern of the model's error learned from", pattern),
+    ]
+
+
+def _age(days: float | None) -> str:
+    if days is None:
+        return "date not known"
+    return f"sensed {abs(days):.1f} days {'before' if days >= 0 else 'after'} the first frame"
+
+
+def _candidates(summary: Mapping[str, Any]) -> str:
+    if not summary["candidates"]:
+        return _note(f"No candidate has an S/N above {summary['threshold_snr']:g}.")
+    rows = [
+        [
+            str(k),
+            plus_minus(each["separation_arcsec"], each["separation_error_arcsec"]),
+            plus_minus(each["position_angle_deg"], each["position_angle_error_deg"]),
+            scientific(each["contrast"], each["contrast_error"]),
+            plus_minus(each["delta_mag"], each["delta_mag_error"]),
+            f"{each['snr']:.1f}",
+            probability(each["false_alarm_probability"]),
+        ]
+        for k, each in enumerate(summary["candidates"], 1)
+    ]
+    angle = "east of north" if summary["oriented"] else "from +y of the first frame"
+    header = [
+        "", "Separation (arcsec)", f"Position angle (deg, {angle})", "Contrast",
+        "Magnitude difference (mag)", "S/N", "False-alarm probability",
+    ]  # fmt: skip
+    note = (
+        "Contrast is relative to the star without coronagraph; errors are standard deviations. The "
+        "false-alarm probability is that of noise alone making such a peak anywhere in the field; "
+        "errors of the star model are not Gaussian and can be more frequent. Whether a candidate "
+        "is bound or in the background, one epoch does not tell."
+    )
+    return "<h3>Candidates</h3>" + _table(header, rows) + _note(note)
+
+
+def _limits(summary: Mapping[str, Any]) -> str:
+    if not summary["limits"]:
+        return ""
+    sigmas = summary["contrast_curve"]["sigmas"]
+    rows = [
+        [
+            f"{each['separation_arcsec']:.3g}",
+            scientific(each["contrast"]),
+            f"{each['delta_mag']:.2f}",
+            f"{scientific(each['lowest'])} to {scientific(each['highest'])}",
+            scientific(each["known_star"]),
+        ]
+        for each in summary["limits"]
+    ]
+    header = [
+        "Separation (arcsec)", "Contrast, median", "Magnitude difference (mag)",
+        "Contrast, all angles", "Contrast if the star were known",
+    ]  # fmt: skip
+    return f"<h3>Limits at {sigmas:g} sigma</h3>" + _table(header, rows)
+
+
+def _star(summary: Mapping[str, Any], stars: Sequence[Sequence[Picture]]) -> Iterable[str]:
+    targets = [each for each in summary["frames"] if each["use"] == "target"]
+    for frame, pictures in zip(targets, stars, strict=False):
+        if len(targets) > 1:
+            yield f"<h3>{escape(_label(frame))}</h3>"
+        yield _pictures(pictures)
+    if len(stars) < len(targets):
+        yield _note(
+            f"The first {len(stars)} of {len(targets)} frames are shown; detection.fits has all."
+        )
+
+
+def _label(frame: Mapping[str, Any]) -> str:
+    angle = frame["position_angle_deg"]
+    roll = "" if angle is None else f", +y at position angle {angle:.1f} deg"
+    return f"{frame['file']}{roll}"
+
+
+def _wavefront(summary: Mapping[str, Any]) -> str:
+    map_ = summary["wavefront_map"]
+    sensed = "" if map_["date"] is None else f" of {map_['date'][:16].replace('T', ' ')} UTC"
+    return (
+        f"<p>Started from {escape(map_['name'])}{escape(sensed)}, "
+        f"{_age(map_['days_before_first_frame'])}. The fit changed the wavefront by "
+        f"{number(map_['change_rms_nm'], '.1f', 'nm')} rms.</p>"
+    )
+
+
+def _frames(summary: Mapping[str, Any]) -> str:
+    rows = [
+        [
+            each["use"],
+            each["star"],
+            (each["date"] or "not known")[:16].replace("T", " "),
+            number(each["position_angle_deg"], ".2f"),
+            str(each["integrations"]),
+            f"{100 * each['pixels_used']:.1f}",
+            each["file"],
+        ]
+        for each in summary["frames"]
+    ]
+    header = ["Use", "Star", "Date (UTC)", "Position angle of +y (deg)", "Integrations",
+              "Pixels used (%)", "File"]  # fmt: skip
+    return _table(header, rows)
+
+
+def _left_out(summary: Mapping[str, Any]) -> str:
+    rows = [[each["name"], each["reason"]] for each in summary["left_out"]]
+    if not rows:
+        return _note("No frame was left out.")
+    return "<h3>Left out</h3>" + _table(["Name", "Reason"], rows, wrap=1)
+
+
+def _provenance(summary: Mapping[str, Any], files: Sequence[str]) -> str:
+    seconds, map_ = summary["seconds"], summary["wavefront_map"]
+    versions = ", ".join(" ".join(each) for each in summary["versions"].items())
+    facts = [
+        ("Time of the fits", number(seconds, ".1f", "s")),
+        ("Seed", str(summary["seed"])),
+        ("Chi-squared per pixel", number(summary["fit"]["chi2_per_pixel"])),
+    ]
+    long = [("Software", versions), ("SHA-256 of the wavefront map", map_["sha256"])]
+    settings = [
+        [name, "none" if value is None else str(value)]
+        for name, value in summary["settings"].items()
+    ]
+    known = [[name, _PRODUCTS.get(name, "")] for name in files]
+    parts = [_facts(facts), _facts(long, "facts long")]
+    if known:
+        parts += [
+            "<h3>Files written with this page</h3>",
+            _table(["Name", "Content"], known, wrap=1),
+        ]
+    parts += [
+        "<details><summary>Settings of the fit</summary>",
+        _table(["Setting", "Value"], settings, wrap=1),
+        "</details>",
+    ]
+    return "\n".join(parts)
+
+
+# -- pieces of HTML --------------------------------------------------------------------------------
+
+
+def _section(title: str, *parts: str) -> str:
+    return "\n".join([f"<section>\n<h2>{title}</h2>", *filter(None, parts), "</section>"])
+
+
+def _pictures(pictures: Sequence[Picture], style: str = "") -> str:
+    figures = [
+        f'<figure><img src="data:image/png;base64,{b64encode(each.png).decode()}" '
+        f'alt="{escape(each.alt)}"><figcaption>{escape(each.caption)}</figcaption></figure>'
+        for each in pictures
+    ]
+    return "\n".join([f'<div class="pictures {style}">', *figures, "</div>"])
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]], wrap: int | None = None) -> str:
+    """A table that scrolls in its own box; column `wrap` may have several lines."""
+    titles = "".join(f'<th scope="col">{escape(each)}</th>' for each in header)
+    opening = '<td class="wrap">'
+    lines = [
+        "".join(
+            f"{opening if k == wrap else '<td>'}{escape(str(each))}</td>"
+            for k, each in enumerate(row)
+        )
+        for row in rows
+    ]
+    body = "\n".join(f"<tr>{line}</tr>" for line in lines)
+    return (
+        f'<div class="scroll" tabindex="0"><table><thead><tr>{titles}</tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def _facts(facts: Iterable[tuple[str, str]], style: str = "facts") -> str:
+    items = "\n".join(
+        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in facts
+    )
+    return f'<dl class="{style}">\n{items}\n</dl>'
+
+
+def _note(text: str) -> str:
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"

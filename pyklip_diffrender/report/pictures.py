@@ -1,0 +1,141 @@
+"""The pictures of the report, with what they show in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pyklip_diffrender.plotting import draw_search, draw_star, draw_wavefronts, to_png
+from pyklip_diffrender.plotting.panels import unit_label
+from pyklip_diffrender.reduction import Reduction
+from pyklip_diffrender.report.summary import wavefronts
+from pyklip_diffrender.report.words import number
+
+__all__ = ["MOST_FRAMES", "Picture", "search_pictures", "star_pictures", "wavefront_pictures"]
+
+MOST_FRAMES = 4
+"""Frames of which pictures are shown."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture and its words.
+
+    Attributes
+    ----------
+    png : bytes
+    alt : str
+        What it shows, for readers who do not see it.
+    caption : str
+    """
+
+    png: bytes
+    alt: str
+    caption: str
+
+
+def search_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Picture]:
+    """The S/N map and the contrast curve."""
+    found = reduction.detection
+    count, threshold = len(found.table), found.threshold
+    candidates = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {threshold:g}"
+    places = "; ".join(
+        f"S/N {row['snr']:.1f} at {row['separation_arcsec']:.2f} arcsec"
+        for row in summary["candidates"]
+    )
+    circles = "Circles mark the candidates. " if count else ""
+    compass = "N and E point to north and east. " if summary["oriented"] else ""
+    scaled = f"Errors were multiplied by {found.scatter:.2f}, " + (
+        "the square root of the reduced chi-squared without the candidates."
+        if summary["status"]["calibrated"]
+        else "so that S/N away from candidates has a standard deviation of 1."
+    )
+    if found.scatter == 1:
+        scaled = "Errors are those of the fit, not scaled."
+    limits = "; ".join(
+        f"{row['contrast']:.1e} at {row['separation_arcsec']:.3g} arcsec"
+        for row in summary["limits"]
+    )
+    sigmas = summary["contrast_curve"]["sigmas"]
+    few = (
+        " Dotted: the median, corrected for the small number of resolution elements near the star."
+        if found.scatter > 1
+        else ""
+    )
+    return _pictures(
+        draw_search(found),
+        (
+            f"Map of the signal-to-noise ratio of a point source, {candidates}"
+            f"{': ' if places else ''}{places}.",
+            "S/N of a point source at every pixel, all frames of the target together, on the "
+            f"pixels of the first. The scale is linear within ±5. {circles}{compass}{scaled}",
+        ),
+        (
+            f"Curve of the contrast at {sigmas:g} sigma against separation in arcsec"
+            f"{': ' if limits else ''}{limits}.",
+            f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "
+            "median of all position angles and their range. Dashed: the same if the image of the "
+            f"star were known exactly.{few}",
+        ),
+    )
+
+
+def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
+    """Data, model and residual of a frame."""
+    found = reduction.detection
+    observation = found.fits[0].frames[frame].observation
+    unit, count = unit_label(observation.unit), len(observation)
+    kept = (
+        " The star was estimated together with the candidates (circles), whose light is kept."
+        if len(found.table)
+        else ""
+    )
+    mean = f", the mean of {count} integrations" if count > 1 else ""
+    return _pictures(
+        draw_star(found, frame),
+        (
+            f"Image of {observation.target} behind the coronagraph, in {unit}.",
+            f"What was observed{mean}. The scale is linear near 0 and logarithmic in bright parts; "
+            "the cross marks the star.",
+        ),
+        (
+            f"Modelled image of {observation.target}, in {unit}.",
+            "What the fit says the star and the background look like, on the same scale.",
+        ),
+        (
+            f"What is left of the image of {observation.target} without the star, in standard "
+            "deviations of the noise.",
+            f"Data without the star, over the noise of each pixel.{kept}",
+        ),
+    )
+
+
+def wavefront_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Picture]:
+    """The wavefront before and after the fit."""
+    fit, about = reduction.detection.fits[0], summary["wavefront_map"]
+    before, after = wavefronts(fit)
+    rms = [number(about[f"{key}rms_nm"], ".1f", "nm") for key in ("", "refined_", "change_")]
+    return _pictures(
+        draw_wavefronts(before, after, fit.model.diameter),
+        (
+            f"Map of the wavefront error before the fit, {rms[0]} rms.",
+            f"The map that the fit started from ({about['name']}), {rms[0]} rms.",
+        ),
+        (
+            f"Map of the wavefront error after the fit, {rms[1]} rms.",
+            f"The wavefront of the first frame after the fit, {rms[1]} rms.",
+        ),
+        (
+            f"Map of the change of the wavefront error, {rms[2]} rms.",
+            f"After minus before, {rms[2]} rms. The frames measure only what the Lyot stop lets "
+            "through and what reaches the fitted pixels; the rest follows from the prior.",
+        ),
+    )
+
+
+def _pictures(figures: Sequence[Any], *words: tuple[str, str]) -> list[Picture]:
+    return [
+        Picture(to_png(figure), alt, caption)
+        for figure, (alt, caption) in zip(figures, words, strict=True)
+    ]

@@ -1,0 +1,241 @@
+"""Everything worth saying about a reduction, as plain values that go into JSON."""
+
+from __future__ import annotations
+
+import math
+import platform
+from dataclasses import fields, is_dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from numpy.typing import NDArray
+from scipy import stats
+
+from pyklip_diffrender import __version__
+from pyklip_diffrender.detection import Detection
+from pyklip_diffrender.optics.grid import resample
+from pyklip_diffrender.reduction import Reduction
+from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.report.words import advice, sentence
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["summarise", "wavefronts"]
+
+_LIMITS = (0.5, 1.0, 1.5, 2.0)
+"""Separations at which limits are stated, arcsec."""
+
+_LIBRARIES = ("torch", "numpy", "scipy", "astropy", "photutils", "matplotlib")
+
+
+def summarise(reduction: Reduction) -> dict[str, Any]:
+    """Return what a reduction shows as nested dicts and lists of plain values.
+
+    Parameters
+    ----------
+    reduction : Reduction
+
+    Returns
+    -------
+    dict
+        Keys end in the unit of their values; None stands for what is not known.
+    """
+    sequence, found = reduction.sequence, reduction.detection
+    # What was searched: a bright companion is fitted once more, with the star.
+    fit = found.fits[0]
+    first = sequence.science[0]
+    dates = [each.date for each in sequence.science if each.date is not None]
+    summary = {
+        "target": sequence.target,
+        "instrument": first.header.get("INSTRUME"),
+        "filter": sequence.filter,
+        "image_mask": first.header.get("CORONMSK"),
+        "program": first.header.get("PROGRAM"),
+        "first_date": min(dates).isot if dates else None,
+        "last_date": max(dates).isot if dates else None,
+        "threshold_snr": found.threshold,
+        "oriented": first.position_angles is not None,
+        "status": {
+            "name": fit.status.name,
+            "message": fit.status.message,
+            "advice": advice(fit.status, patterned=reduction.systematics is not None),
+            "usable": fit.status.usable,
+            "calibrated": fit.status.calibrated,
+        },
+        "fit": {
+            "reduced_chi2": fit.reduced_chi2,
+            "chi2_per_pixel": fit.chi2_per_pixel,
+            "model_error": fit.model_error,
+            "error_factor": found.scatter,
+        },
+        "wavefront_map": _wavefront_map(fit, first),
+        "systematics": _systematics(reduction),
+        "candidates": _candidates(found),
+        "limits": _limits(found),
+        "contrast_curve": _curve(found),
+        "frames": [
+            *(_frame(each, "target") for each in sequence.science),
+            *(_frame(each, "reference") for each in sequence.references),
+        ],
+        "left_out": [
+            *({"name": name, "reason": reason} for name, reason in sequence.excluded),
+            *({"name": f"reference star {n}", "reason": why} for n, why in reduction.failed),
+        ],
+        "settings": _settings(fit.settings),
+        "seed": fit.seed,
+        "seconds": _seconds(reduction, fit),
+        "versions": {
+            "pyklip_diffrender": __version__,
+            "python": platform.python_version(),
+            **{name: version(name) for name in _LIBRARIES},
+        },
+    }
+    summary = {"sentence": sentence(summary), **summary}
+    plain: dict[str, Any] = _plain(summary)
+    return plain
+
+
+def wavefronts(fit: Refinement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The wavefront before and after the fit, nm, without piston; NaN outside the pupil.
+
+    After the fit it is that of the first frame.
+    """
+    lit = fit.model.entrance.lit.cpu().numpy()
+    before = resample(fit.initial.data, len(fit.wavefront))
+    maps = [1e9 * np.real(opd) for opd in (before, fit.wavefront)]
+    before, after = (np.where(lit, each - each[lit].mean(), np.nan) for each in maps)
+    return before, after
+
+
+def _wavefront_map(fit: Refinement, frame: Observation) -> dict[str, Any]:
+    date, days = fit.initial.date, None
+    if date is not None and frame.date is not None:
+        days = frame.date.mjd - date.mjd
+    before, after = wavefronts(fit)
+    return {
+        "name": fit.initial.name,
+        "date": None if date is None else date.isot,
+        "days_before_first_frame": days,
+        "sha256": fit.initial.sha256,
+        "rms_nm": np.nanstd(before),
+        "refined_rms_nm": np.nanstd(after),
+        "change_rms_nm": np.nanstd(after - before),
+    }
+
+
+def _systematics(reduction: Reduction) -> dict[str, Any] | None:
+    used = reduction.systematics
+    if used is None:
+        return None
+    known = {key: used.provenance.get(key, []) for key in ("stars", "frames")}
+    return {"name": used.name, **known}
+
+
+def _candidates(found: Detection) -> list[dict[str, Any]]:
+    """The table of candidates, with the unit in the names and the probability of a false alarm."""
+    table, rows = found.table, []
+    for row in table:
+        values = {}
+        for name in table.colnames:
+            unit = table[name].unit
+            # The names of magnitudes say what they are.
+            label = name if unit in (None, u.mag) else f"{name}_{unit}"
+            values[label] = getattr(row[name], "value", row[name])
+        chance = _false_alarm(found, float(row["snr"]), row["separation"].to_value("arcsec"))
+        rows.append({**values, "false_alarm_probability": chance})
+    return rows
+
+
+def _false_alarm(found: Detection, snr: float, separation: float) -> float:
+    """Probability that noise alone makes a peak of this S/N anywhere in the field.
+
+    Gaussian noise where the fit explains its data; Student's t, as in the small-sample column of
+    the contrast curve, where the errors were scaled to the scatter of the S/N.
+    """
+    resolution = found.contrast_curve.meta["resolution_arcsec"]
+    elements = math.floor(2 * math.pi * separation / resolution)
+    single = stats.norm.sf(snr)
+    if not found.fits[0].status.calibrated and elements >= 3:
+        single = stats.t.sf(snr / math.sqrt(1 + 1 / (elements - 1)), elements - 2)
+    pixel = abs(found.grid[0, 1, 0] - found.grid[0, 0, 0]) * abs(
+        found.grid[1, 0, 1] - found.grid[0, 0, 1]
+    )
+    trials = max(1.0, np.isfinite(found.snr).sum() * pixel / resolution**2)
+    return float(-math.expm1(trials * math.log1p(-single)))
+
+
+def _curve(found: Detection) -> dict[str, Any]:
+    curve = found.contrast_curve
+    columns = {name: np.asarray(curve[name]) for name in curve.colnames if name != "separation"}
+    return {
+        "sigmas": curve.meta["sigmas"],
+        "separation_arcsec": curve["separation"].to_value("arcsec"),
+        **columns,
+    }
+
+
+def _limits(found: Detection) -> list[dict[str, Any]]:
+    """The contrast curve at a few separations, or at its end if it reaches none of them."""
+    curve = found.contrast_curve
+    if not len(curve):
+        return []
+    separation = curve["separation"].to_value("arcsec")
+    inside = [s for s in _LIMITS if separation[0] - 1e-6 <= s <= separation[-1] + 1e-6]
+    rows = []
+    for wanted in inside or [separation[-1]]:
+        values = {
+            name: float(np.exp(np.interp(wanted, separation, np.log(curve[name]))))
+            for name in ("contrast", "lowest", "highest", "known_star", "small_sample")
+        }
+        rows.append(
+            {
+                "separation_arcsec": float(wanted),
+                "delta_mag": -2.5 * math.log10(values["contrast"]),
+                **values,
+            }
+        )
+    return rows
+
+
+def _frame(observation: Observation, use: str) -> dict[str, Any]:
+    known = observation.position_angles is not None
+    return {
+        "use": use,
+        "star": observation.target,
+        "date": None if observation.date is None else observation.date.isot,
+        "position_angle_deg": observation.position_angle if known else None,
+        "integrations": len(observation),
+        "exposure_s": observation.header.get("EFFEXPTM"),
+        "pixels_used": observation.valid.mean(),
+        "file": observation.name,
+    }
+
+
+def _seconds(reduction: Reduction, fit: Refinement) -> float:
+    """Of all fits; those that never ran again count once."""
+    fits = {id(each): each.seconds for each in (reduction.fit, fit, *reduction.references)}
+    return sum(fits.values())
+
+
+def _settings(settings: Any) -> dict[str, Any]:
+    values = {each.name: getattr(settings, each.name) for each in fields(settings)}
+    # JSON has no infinity, and None means something else here.
+    return {name: "inf" if value == math.inf else value for name, value in values.items()}
+
+
+def _plain(value: Any) -> Any:
+    """Nested values as JSON has them; what is not a finite number becomes None."""
+    if isinstance(value, dict):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if is_dataclass(value) and not isinstance(value, type):
+        return _plain(_settings(value))
+    return str(value)

@@ -1,0 +1,141 @@
+"""Numbers and results in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pyklip_diffrender.refinement import Status
+
+__all__ = [
+    "advice",
+    "number",
+    "plus_minus",
+    "position_angle",
+    "probability",
+    "scientific",
+    "sentence",
+]
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+_SENTENCE_AT = 1.5
+"""Separation, arcsec, near which the first sentence states the limit."""
+
+_TINY = 1e-9
+"""Probabilities below this rest on tails that no noise is known to follow."""
+
+_ADVICE = {
+    Status.CONVERGED: "The stated errors and limits can be used as they are.",
+    Status.MODEL_MISMATCH: (
+        "This is usual for real frames. The errors have been scaled to the scatter in the S/N map, "
+        "but faint candidates deserve a second look: see whether they are in every roll and "
+        "whether they look like a point source. Check the filter, the masks and the date of the "
+        "wavefront map."
+    ),
+    Status.PRIOR_MISMATCH: (
+        "The errors have been scaled to the scatter in the S/N map. Repeat the fit with "
+        "fit_scales=True, with wider scales, or with a wavefront map nearer in time."
+    ),
+    Status.ITERATION_LIMIT: (
+        "Look at the history of the fit. If chi-squared was still falling, repeat the fit with a "
+        "larger max_iterations; if it hardly changed, try a wavefront map nearer in time."
+    ),
+    Status.COMPLETED: (
+        "This method has no test of convergence: compare chi-squared per pixel with 1."
+    ),
+    Status.DIVERGED: (
+        "Do not use this result. Check the unit and orientation of the wavefront map, the position "
+        "of the star and the pixel mask."
+    ),
+}
+
+_REFERENCES = (
+    " The pattern of the model's error was not known: add reference stars, or the systematics of "
+    "an earlier reduction."
+)
+
+
+def advice(status: Status, *, patterned: bool) -> str:
+    """What to do about the status of a fit, with or without a known pattern of its error."""
+    missing = status is Status.MODEL_MISMATCH and not patterned
+    return _ADVICE[status] + (_REFERENCES if missing else "")
+
+
+def sentence(summary: Mapping[str, Any]) -> str:
+    """The result in a sentence or two."""
+    candidates, threshold = summary["candidates"], summary["threshold_snr"]
+    if not candidates:
+        return " ".join([f"No companion above {threshold:g} sigma.", *_limit(summary)])
+    first = candidates[0]
+    measured = (
+        f"{plus_minus(first['separation_arcsec'], first['separation_error_arcsec'])} arcsec, "
+        f"position angle {position_angle(first, oriented=summary['oriented'])}, contrast "
+        f"{scientific(first['contrast'], first['contrast_error'])}, S/N {first['snr']:.1f}."
+    )
+    if len(candidates) == 1:
+        return f"One companion candidate at {measured}"
+    return (
+        f"{len(candidates)} companion candidates above {threshold:g} sigma, the most significant "
+        f"at {measured}"
+    )
+
+
+def _limit(summary: Mapping[str, Any]) -> Sequence[str]:
+    """What would have been seen, if that is known anywhere."""
+    if not summary["limits"]:
+        return []
+    row = min(summary["limits"], key=lambda each: abs(each["separation_arcsec"] - _SENTENCE_AT))
+    threshold = summary["threshold_snr"]
+    contrast = row["contrast"] * threshold / summary["contrast_curve"]["sigmas"]
+    return [
+        f"A planet of contrast {scientific(contrast)} ({-2.5 * math.log10(contrast):.1f} mag "
+        f"fainter than the star) at {row['separation_arcsec']:.3g} arcsec would have had an S/N of "
+        f"{threshold:g}."
+    ]
+
+
+def position_angle(candidate: Mapping[str, Any], *, oriented: bool) -> str:
+    """Position angle of a candidate, and what it is counted from."""
+    angle = plus_minus(candidate["position_angle_deg"], candidate["position_angle_error_deg"])
+    origin = "east of north" if oriented else "counter-clockwise from up in the frame"
+    return f"{angle} deg {origin}"
+
+
+def plus_minus(value: float, error: float) -> str:
+    """Value and error, to the digits that the error allows."""
+    places = _places(error)
+    return f"{value:.{places}f} ± {error:.{places}f}"
+
+
+def scientific(value: float, error: float | None = None) -> str:
+    """A number times a power of ten, such as 4.5 × 10⁻⁶, perhaps with its error."""
+    if value == 0:
+        return "0"
+    digits, exponent = f"{value:.1e}".split("e")
+    power = int(exponent)
+    ten = f"10{str(power).translate(_SUPERSCRIPTS)}"
+    if error is None:
+        return f"{digits} × {ten}"
+    return f"({plus_minus(value / 10**power, error / 10**power)}) × {ten}"
+
+
+def probability(value: float) -> str:
+    """A probability of a false alarm."""
+    if value < _TINY:
+        return f"< {scientific(_TINY).replace('1.0 × ', '')}"
+    return scientific(value) if value < 0.01 else f"{value:.2f}"
+
+
+def number(value: Any, form: str = ".3g", unit: str = "") -> str:
+    """A number with its unit; "not known" for None."""
+    return "not known" if value is None else f"{value:{form}}{unit and f' {unit}'}"
+
+
+def _places(error: float) -> int:
+    """Decimals that show an error with one digit, or two if the first is a 1."""
+    if not error > 0 or not math.isfinite(error):
+        return 3
+    power = math.floor(math.log10(error))
+    return max(0, -power + (error / 10**power < 2))

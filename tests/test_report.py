@@ -1,0 +1,305 @@
+"""The report: what it says is what was measured, and headers cannot change the page."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from functools import cache
+from html import escape
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.time import Time
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.refinement import Status
+from pyklip_diffrender.report import summarise, write_report
+from pyklip_diffrender.report.words import (
+    advice,
+    plus_minus,
+    probability,
+    scientific,
+)
+
+PLANET = dr.Planet(2e-5, 0.6, 40.0)
+ROLL = 30.0
+HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(2)>'
+
+
+@cache
+def reduction(planet: bool = True, target: str = "HD 1") -> dr.Reduction:
+    """Of one frame, whose +y axis is at position angle 30 degrees."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    opd = replace(dr.random_opd(1, npix=128), date=Time("2022-10-01T12:00:00"))
+    on_frame = replace(PLANET, position_angle=PLANET.position_angle - ROLL)
+    scene = dr.Scene(dr.Star(exposure=20.0), (on_frame,) if planet else ())
+    frame = replace(
+        dr.simulate(model, scene, opd, seed=3),
+        header=fits.Header({"TARGPROP": target, "INSTRUME": "TEST"}),
+        position_angles=np.array([ROLL]),
+        date=Time("2022-10-03T00:00:00"),
+        filter="F444W",
+        name="frame <1>.fits",
+    )
+    left_out = (("other & co.fits", "taken through F356W, not F444W"),)
+    sequence = dr.Sequence(target, (frame,), (), left_out)
+    fit = dr.refine(model, [frame], opd, settings=dr.GaussNewton(cycles=6))
+    return dr.Reduction(sequence, fit, dr.detect(fit), failed=(("HD 2", "too faint"),))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("products")
+    assert [each.name for each in reduction().write(path)][-2:] == ["report.html", "summary.json"]
+    return path
+
+
+class Tags(HTMLParser):
+    """All start tags of a page with their attributes, and its text outside the style sheet."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        if self.tags and self.tags[-1][0] != "style":
+            self.words.append(data)
+
+
+# -- what is said ----------------------------------------------------------------------------------
+
+
+def test_the_first_sentence_has_the_numbers_of_the_planet() -> None:
+    (row,) = reduction().detection.table
+    said = summarise(reduction())["sentence"]
+    numbers = re.fullmatch(
+        r"One companion candidate at ([\d.]+) ± ([\d.]+) arcsec, position angle ([\d.]+) ± [\d.]+ "
+        r"deg east of north, contrast \(([\d.]+) ± ([\d.]+)\) × 10⁻⁵, S/N ([\d.]+)\.",
+        said,
+    )
+    assert numbers, said
+    separation, error, angle, contrast, contrast_error, snr = map(float, numbers.groups())
+    assert separation == pytest.approx(row["separation"].to_value(u.arcsec), abs=error)
+    assert error == pytest.approx(row["separation_error"].to_value(u.arcsec), rel=0.5)
+    assert angle == pytest.approx(row["position_angle"].to_value(u.deg), abs=0.5)
+    assert contrast == pytest.approx(1e5 * row["contrast"], abs=contrast_error)
+    assert snr == pytest.approx(row["snr"], abs=0.051)
+    # And they are the true ones: 40 degrees on the sky, not the 10 degrees on the frame.
+    assert angle == pytest.approx(PLANET.position_angle, abs=3)
+    assert separation == pytest.approx(PLANET.separation, abs=0.03)
+
+
+def test_without_a_planet_the_sentence_states_the_limit() -> None:
+    bare = reduction(planet=False)
+    said = summarise(bare)["sentence"]
+    assert said.startswith("No companion above 5 sigma. A planet of contrast ")
+    curve = bare.detection.contrast_curve
+    # The field ends before 1 arcsec: the limit at 0.5 is the only one.
+    limit = np.interp(0.5, curve["separation"].to_value(u.arcsec), curve["contrast"])
+    assert f"contrast {scientific(limit)} (" in said
+    assert f"({-2.5 * np.log10(limit):.1f} mag fainter than the star) at 0.5 arcsec" in said
+
+
+def test_a_limit_is_that_of_the_threshold() -> None:
+    """The contrast curve is at 5 sigma whatever the threshold of candidates is."""
+    bare = reduction(planet=False)
+    usual = summarise(bare)
+    strict = summarise(replace(bare, detection=replace(bare.detection, threshold=10.0)))
+    contrast = usual["limits"][0]["contrast"]
+    assert scientific(2 * contrast) in strict["sentence"]
+    assert strict["limits"] == usual["limits"]
+
+
+def test_without_orientation_no_north_is_claimed() -> None:
+    whole = reduction()
+    sequence = whole.sequence
+    blind = replace(sequence.science[0], position_angles=None)
+    summary = summarise(replace(whole, sequence=replace(sequence, science=(blind,))))
+    assert "north" not in summary["sentence"]
+    assert "counter-clockwise from up in the frame" in summary["sentence"]
+    assert summary["frames"][0]["position_angle_deg"] is None
+
+
+@pytest.mark.parametrize("status", Status)
+def test_every_status_comes_with_advice(status: Status) -> None:
+    assert advice(status, patterned=True).endswith(".")
+    missing = "reference stars" in advice(status, patterned=False)
+    assert missing == (status is Status.MODEL_MISMATCH)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (0.82345, 0.00213, "0.823 ± 0.002"),
+        (149.64, 0.134, "149.64 ± 0.13"),
+        (149.64, 13.4, "150 ± 13"),
+        (0.5, float("nan"), "0.500 ± nan"),
+    ],
+)
+def test_errors_decide_on_the_digits(value: float, error: float, text: str) -> None:
+    assert plus_minus(value, error) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(4.5e-6, "4.5 × 10⁻⁶"), (9.99e-6, "1.0 × 10⁻⁵"), (0.0, "0")]
+)
+def test_powers_of_ten(value: float, text: str) -> None:
+    assert scientific(value) == text
+
+
+def test_probabilities_of_false_alarms() -> None:
+    assert [probability(p) for p in (0.25, 3e-5, 1e-300)] == ["0.25", "3.0 × 10⁻⁵", "< 10⁻⁹"]
+    (row,) = summarise(reduction())["candidates"]
+    assert row["snr"] > 8
+    assert 0 <= row["false_alarm_probability"] < 1e-9
+    # A 5 sigma peak: 3e-7 times as many places as the field has resolution elements.
+    found = reduction().detection
+    weak = replace(found)
+    weak.__dict__["table"] = found.table.copy()
+    weak.table["snr"] = 5.0
+    (row,) = summarise(replace(reduction(), detection=weak))["candidates"]
+    assert found.fits[0].status.calibrated
+    elements = (2.0 / (4.5e-6 / 6.6) * np.pi / 180 / 3600) ** 2
+    assert row["false_alarm_probability"] == pytest.approx(2.87e-7 * elements, rel=0.15)
+    # Student's t has wider tails: noise whose level was read off few places is known less well.
+    fit = replace(found.fits[0], status=Status.MODEL_MISMATCH)
+    weak.__dict__["fits"] = (fit,)
+    (wide,) = summarise(replace(reduction(), detection=weak))["candidates"]
+    assert wide["false_alarm_probability"] > 10 * row["false_alarm_probability"]
+
+
+# -- the files -------------------------------------------------------------------------------------
+
+
+def test_the_summary_has_the_numbers_of_the_result(folder: Path) -> None:
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    result = reduction()
+    (row,), (entry,) = result.detection.table, summary["candidates"]
+    assert entry["contrast"] == row["contrast"]
+    assert entry["separation_arcsec"] == row["separation"].to_value(u.arcsec)
+    assert entry["position_angle_deg"] == row["position_angle"].to_value(u.deg)
+    assert entry["delta_mag"] == row["delta_mag"].value
+    assert summary["target"] == "HD 1"
+    assert summary["status"]["name"] == result.fit.status.name
+    assert summary["fit"]["reduced_chi2"] == result.fit.reduced_chi2
+    assert summary["wavefront_map"]["days_before_first_frame"] == pytest.approx(1.5)
+    assert [each["file"] for each in summary["frames"]] == ["frame <1>.fits"]
+    assert [each["reason"] for each in summary["left_out"]] == [
+        "taken through F356W, not F444W",
+        "too faint",
+    ]
+    assert (summary["settings"]["cycles"], summary["settings"]["robust"]) == ([6.0], "inf")
+    assert summary["versions"]["pyklip_diffrender"] == dr.__version__
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert summary["sentence"] in page.replace("\u00a0", " ")
+
+
+def test_every_picture_has_words_and_nothing_is_loaded(folder: Path) -> None:
+    page = Tags((folder / "report.html").read_text(encoding="utf-8"))
+    pictures = [attributes for tag, attributes in page.tags if tag == "img"]
+    assert len(pictures) == 8
+    for attributes in pictures:
+        assert len(attributes["alt"] or "") > 30
+        assert (attributes["src"] or "").startswith("data:image/png;base64,iVBOR")
+    assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.tags}
+    loaded = [a.get("src") or a.get("href") or "data:" for _, a in page.tags]
+    assert all(each.startswith("data:") for each in loaded)
+    assert "http" not in " ".join(page.words)
+
+
+def test_a_header_cannot_write_into_the_page(tmp_path: Path) -> None:
+    whole = reduction()
+    frame = whole.sequence.science[0]
+    evil = replace(frame, header=fits.Header({"TARGPROP": HOSTILE}), name=HOSTILE, filter=HOSTILE)
+    excluded = ((HOSTILE, HOSTILE),)
+    part = replace(whole.fit.frames[0], observation=evil)
+    map_ = replace(whole.fit.initial, name=HOSTILE)
+    fit = replace(whole.fit, frames=(part,), initial=map_)
+    result = replace(
+        whole,
+        sequence=dr.Sequence(evil.target, (evil,), (), excluded),
+        detection=replace(whole.detection, fits=(fit,)),
+        failed=((HOSTILE, HOSTILE),),
+    )
+    html, data = write_report(result, tmp_path, [tmp_path / HOSTILE.replace("/", "")])
+    text = html.read_text(encoding="utf-8")
+    assert text.count(escape(HOSTILE)) > 8
+    tags = Tags(text).tags
+    assert not [tag for tag, attributes in tags if tag == "script" or "onerror" in attributes]
+    assert len([tag for tag, _ in tags if tag == "img"]) == 8
+    assert json.loads(data.read_text(encoding="utf-8"))["target"] == HOSTILE
+
+
+def test_a_report_that_fails_leaves_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "report.html").write_text("old")
+
+    def broken(*_: Any, **__: Any) -> str:
+        raise ValueError("no disk")
+
+    monkeypatch.setattr("pyklip_diffrender.report.write.json.dumps", broken)
+    with pytest.raises(ValueError, match="no disk"):
+        write_report(reduction(), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    assert (tmp_path / "report.html").read_text() == "old"
+
+
+# -- in a browser ----------------------------------------------------------------------------------
+
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+
+SCRIPT = """
+const page = frame.contentDocument.documentElement;
+const pictures = [...page.querySelectorAll("img")];
+report.textContent = JSON.stringify({
+  scroll: page.scrollWidth, width: page.clientWidth,
+  seen: pictures.every(each => each.naturalWidth > 300),
+  dark: frame.contentWindow.matchMedia("(prefers-color-scheme: dark)").matches,
+  ground: getComputedStyle(page.querySelector("body")).backgroundColor,
+});
+"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs chromium or google-chrome in PATH")
+@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_the_page_fits_the_screen(folder: Path, tmp_path: Path, width: int, dark: bool) -> None:
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    holder = tmp_path / "holder.html"
+    holder.write_text(
+        f'<iframe id="frame" style="width:{width}px;height:900px" srcdoc="{escape(page)}"></iframe>'
+        f'<pre id="report"></pre><script>onload = () => {{ {SCRIPT} }};</script>',
+        encoding="utf-8",
+    )
+    done = subprocess.run(
+        [
+            str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+            f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000",
+            f"--blink-settings=preferredColorScheme={0 if dark else 1}",
+            f"--window-size={width + 100},1000", "--dump-dom", holder.as_uri(),
+        ],
+        capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    (said,) = re.findall(r'<pre id="report">(.+?)</pre>', done.stdout)
+    seen = json.loads(said)
+    assert seen["width"] == width
+    assert seen["scroll"] == width
+    assert seen["seen"]
+    assert seen["dark"] == dark
+    assert seen["ground"] == ("rgb(20, 23, 26)" if dark else "rgb(255, 255, 255)")
