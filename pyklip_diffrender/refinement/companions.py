@@ -1,9 +1,8 @@
-"""Bright companions in what a star model leaves: found so that a fit does not bend to them.
+"""Bright companions in the residual of a fit.
 
-A companion as bright as the star's own speckles pulls the wavefront towards itself. One that
-stands out of the residual of a fit is given parameters of its own. This is no search
-for planets: faint ones are the business of the detection step, where the wavefront is
-marginalised.
+A companion as bright as the speckles of the star biases the fitted wavefront. A companion that
+stands out of the residual therefore gets parameters of its own. Faint planets are left to the
+detection, which marginalises the wavefront.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ from pyklip_diffrender.scene.objects import Planet
 __all__ = ["bright_companions", "standing_out"]
 
 _INNER = 0.35
-"""arcsec; closer in, the occulter distorts and the star's own errors dominate."""
+"""arcsec; closer to the star, the occulter distorts images and the star's errors dominate."""
 
 _APART = 0.15
-"""arcsec, about lambda/D; nearer to a known companion, what stands out is what is left of it."""
+"""arcsec, about lambda/D; closer to a known companion, peaks are its own residuals."""
 
 
 def bright_companions(
@@ -54,26 +53,26 @@ def bright_companions(
     residual : ndarray, (ny, nx)
         Data minus star; 0 where masked.
     sigma : ndarray, (ny, nx)
-        Its standard deviation, model error included; inf where masked.
+        Standard deviation of the residual, model error included; inf where masked.
     flux : float
-        The star's light, so that amplitudes are contrasts.
+        Flux of the star, which turns amplitudes into contrasts.
     most : int
-        How many at most, brightest first.
+        Largest number of companions; the most significant are returned.
     threshold : float
         In units of the scatter (median absolute deviation) of the matched-filter map.
     known : ndarray, (k, 2), optional
-        Offsets x, y from the star of companions that are in the model already, arcsec.
+        Offsets x, y from the star of companions that are part of the model, arcsec.
 
     Returns
     -------
     list of Planet
-        To the nearest pixel; relative to the star.
+        Positions are those of pixels, highest S/N first.
     """
     scale_x, scale_y = model.detector.pixelscale
     ny, nx = residual.shape
     star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu()
     axis = values.get("detector_shift", torch.zeros(2, dtype=torch.float64)).cpu()
-    # The off-axis image in the middle of the array: half-way out, where the occulter is clear.
+    # The template is an image in the middle of the array of a source beyond the occulter.
     away = torch.tensor([1.5, 0.0], dtype=torch.float64)
     centred = {**values, "star_offset": star + away, "detector_shift": -(star + away)}
     with torch.no_grad():
@@ -92,32 +91,51 @@ def bright_companions(
     for x_known, y_known in () if known is None else known.tolist():
         allowed &= np.hypot(x_sky - x_known, y_sky - y_known) > _APART
     scatter = 1.4826 * float(np.median(np.abs(snr[allowed] - np.median(snr[allowed]))))
-    peaks = (snr == maximum_filter(snr, size=7)) & allowed & (snr > threshold * scatter)
-    order = np.argsort(-snr[peaks])[:most]
-    found = []
-    for row, column in np.argwhere(peaks)[order]:
-        contrast = numerator[row, column] / information[row, column]
-        found.append(
-            Planet(
-                float(contrast),
-                float(distance[row, column]),
-                math.degrees(math.atan2(-x_sky[row, column], y_sky[row, column])),
-            )
+    return [
+        Planet.from_offset(
+            float(numerator[peak] / information[peak]), float(x_sky[peak]), float(y_sky[peak])
         )
-    return found
+        for peak in local_maxima(snr, allowed, threshold * scatter, size=7)[:most]
+    ]
 
 
-def standing_out(
-    misfit: Objective, state: State, kappa: float, *, most: int, threshold: float
-) -> list[Planet]:
-    """Companions that stand out of the first science frame, as they stand in the first frame.
+def local_maxima(
+    image: NDArray[np.float64], allowed: NDArray[np.bool_], threshold: float, *, size: int
+) -> list[tuple[int, int]]:
+    """Find pixels above a threshold that are the maximum of the square around them.
 
     Parameters
     ----------
-    misfit : Objective
+    image : ndarray, (ny, nx)
+        NaN where unknown.
+    allowed : ndarray of bool, (ny, nx)
+        Where maxima are accepted.
+    threshold : float
+    size : int
+        Side of the square, pixels.
+
+    Returns
+    -------
+    list of (row, column)
+        Highest first.
+    """
+    filled = np.where(np.isnan(image), -math.inf, image)
+    peaks = (filled == maximum_filter(filled, size=size)) & allowed & (filled > threshold)
+    places = np.argwhere(peaks)[np.argsort(-filled[peaks], kind="stable")]
+    return [(int(row), int(column)) for row, column in places]
+
+
+def standing_out(
+    objective: Objective, state: State, kappa: float, *, most: int, threshold: float
+) -> list[Planet]:
+    """Find companions in the first science frame; positions refer to the first frame.
+
+    Parameters
+    ----------
+    objective : Objective
     state : State
     kappa : float
-        Share of the star that the model may miss.
+        Assumed error of the star model, as a fraction of the star.
     most, threshold
         See `bright_companions`.
     """
@@ -126,11 +144,11 @@ def standing_out(
     if most < 1 or True not in shown:
         return []
     k = shown.index(True)
-    point, forward = state.points[k], misfit.forwards[k]
+    point, forward = state.points[k], objective.forwards[k]
     problem = forward.problem
-    sigma = misfit.sigma(k, point, kappa)
+    sigma = objective.sigma(k, point, kappa)
     residual = torch.where(problem.valid, problem.data - point.total, 0.0)
-    found = bright_companions(
+    companions = bright_companions(
         forward.coarse,
         forward.coarse_opd(point),
         point.unknowns.values(point.vector),
@@ -141,5 +159,4 @@ def standing_out(
         threshold=threshold,
         known=(point.unknowns.sources(point.vector)[:, 1:] @ point.unknowns.turn.T).numpy(),
     )
-    turn = joint.frames[k].roll
-    return [Planet(p.contrast, p.separation, p.position_angle - turn) for p in found]
+    return [planet.rotated(-joint.frames[k].roll) for planet in companions]
