@@ -17,18 +17,19 @@ __all__ = ["NormalEquations", "linearise"]
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """A state's normal equations, for the unknowns as distances from their starts.
+    """Normal equations of a state, for the unknowns minus their starting values.
 
     Attributes
     ----------
     state : State
     kappa : float
-    curvature : Tensor
-        G G^T.
-    gradient : Tensor
-        G r at the unknowns' starts.
-    current : Tensor
-        Where they are now.
+        Assumed error of the star model, as a fraction of the star.
+    curvature : Tensor, (unknowns, unknowns)
+        G G^T, with the whitened Jacobian G.
+    gradient : Tensor, (unknowns,)
+        G r, with the residual r at the starting values.
+    current : Tensor, (unknowns,)
+        Unknowns of the state minus their starting values.
     frames : tuple of LinearFrame
     """
 
@@ -41,7 +42,7 @@ class NormalEquations:
 
 
 _PIXELS = 1024
-"""Pixels whose whitened Jacobian is held in double precision at a time."""
+"""Number of pixels whose Jacobian is converted to double precision at a time."""
 
 
 def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -67,17 +68,17 @@ def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Ten
 
 
 def linearise(objective: Objective, state: State, kappa: float, modes: int) -> NormalEquations:
-    """Normal equations about a state.
+    """Linearise all frames about a state.
 
     Parameters
     ----------
     objective : Objective
     state : State
     kappa : float
-        Share of the star that the model may miss.
+        Assumed error of the star model, as a fraction of the star.
     modes : int
-        How many of the wavefront's modes are free, the first ones: all, or fewer where frames do
-        not drift apart; 0 for none and no amplitude.
+        Number of leading wavefront modes that are free; all of them if the wavefront drifts
+        between frames, 0 for the alignment only.
     """
     joint = state.joint
     size = joint.unknowns_with(modes)
