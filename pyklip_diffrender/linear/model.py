@@ -94,6 +94,11 @@ class LinearFrame:
         rows[self.first_mode : self.first_mode + len(self.drift)] += values[self.drift]
         return rows
 
+    def image(self, values: Tensor) -> Tensor:
+        """Change of the image, (..., ny, nx), for changes of the unknowns, (size, ...)."""
+        on_rows = self.of_unknowns(values).float()
+        return torch.tensordot(on_rows, self.jacobian, dims=([0], [0])).double()
+
 
 class TemplateProducts(NamedTuple):
     """Inner products of templates p with the data r, (k,) each.
@@ -185,12 +190,9 @@ class LinearModel:
     @cached_property
     def cleaned(self) -> tuple[Tensor, ...]:
         """Sigma^-1 r of every frame, (ny, nx): the whitened residual of the most probable model."""
-        residuals = []
-        for frame in self.frames:
-            on_rows = frame.of_unknowns(self.step).float()
-            explained = torch.tensordot(on_rows, frame.jacobian, dims=1).double()
-            residuals.append(frame.weight * (frame.residual - explained))
-        return tuple(residuals)
+        return tuple(
+            frame.weight * (frame.residual - frame.image(self.step)) for frame in self.frames
+        )
 
     def projected(self, templates: Mapping[int, Tensor]) -> Tensor:
         """Projection L^-1 G p of templates onto the unknowns, with P + G G^T = L L^T.
@@ -255,10 +257,7 @@ class LinearModel:
         solved = solved * self._scale[:, None]
         residuals = {}
         for k, frame in enumerate(self.frames):
-            explained = torch.tensordot(
-                frame.of_unknowns(solved).float(), frame.jacobian, dims=([0], [0])
-            )
-            left = -explained.double()
+            left = -frame.image(solved)
             if k in templates:
                 left += templates[k].double()
             residuals[k] = frame.weight * left

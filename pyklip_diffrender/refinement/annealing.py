@@ -17,7 +17,7 @@ from typing import Any
 from tqdm import tqdm
 
 from pyklip_diffrender.linear.model import Unknown
-from pyklip_diffrender.refinement.companions import standing_out
+from pyklip_diffrender.refinement.companions import bright_companions
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.gauss_newton import Solver, count_modes_below
 from pyklip_diffrender.refinement.objective import State
@@ -127,7 +127,7 @@ class Annealing:
             settled = gain < settings.tolerance
             if not modes:
                 kappa = max(floor, min(kappa, error))
-                bright = self._standing_out(state, kappa) if gain < _ALIGNED else []
+                bright = self._new_companions(state, kappa, False) if gain < _ALIGNED else []
                 if bright:
                     state = self._with_companions(state, bright)
                 elif gain < _ALIGNED and settings.wavefront:
@@ -138,7 +138,7 @@ class Annealing:
                     break
                 continue
             stalled = error > max(kappa, _NEGLIGIBLE)
-            bright = self._stalling(state, error) if stalled else []
+            bright = self._new_companions(state, error, True) if stalled else []
             if bright:
                 # Near the solution the model is linear, so that further steps remove the bias of
                 # the wavefront. Otherwise the fit starts again from the alignment.
@@ -182,26 +182,16 @@ class Annealing:
         everything = self.settings.min_model_error > 0 or amplitude or several
         return len(self.basis) if everything or kappa <= _COARSE else self._few_modes
 
-    def _standing_out(self, state: State, kappa: float) -> list[Planet]:
-        """Companions in the residual of the fit of the alignment."""
-        known = len(state.joint.frames[0].companions)
-        return standing_out(
-            self.objective,
-            state,
-            kappa,
-            most=self.settings.max_companions - known,
-            threshold=self.settings.companion_threshold,
-        )
-
-    def _stalling(self, state: State, kappa: float) -> list[Planet]:
-        """The companion that keeps the fit of the wavefront from converging, if there is one."""
-        known = len(state.joint.frames[0].companions)
-        if self.settings.min_model_error > 0:
-            return []  # Peaks may be due to the assumed model error.
-        if known >= self.settings.max_companions + _MOST_BRIGHT:
-            return []
-        # One at a time, because the side lobes of a bright companion are peaks as well.
-        return standing_out(self.objective, state, kappa, most=1, threshold=_BRIGHT)
+    def _new_companions(self, state: State, kappa: float, stalled: bool) -> list[Planet]:
+        """Companions in the residual of the alignment, or of a wavefront fit that stalled."""
+        room = self.settings.max_companions - len(state.joint.frames[0].companions)
+        threshold = self.settings.companion_threshold
+        if stalled:
+            if self.settings.min_model_error > 0:
+                return []  # Peaks may be due to the assumed model error.
+            # One at a time, because the side lobes of a bright companion are peaks as well.
+            room, threshold = min(1, room + _MOST_BRIGHT), _BRIGHT
+        return bright_companions(self.objective, state, kappa, most=room, threshold=threshold)
 
     def _with_companions(self, state: State, added: Sequence[Planet]) -> State:
         _log.info("companions given parameters of their own: %s", added)

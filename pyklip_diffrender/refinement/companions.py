@@ -14,13 +14,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.signal import fftconvolve
-from torch import Tensor
 
-from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.objective import Objective, State
 from pyklip_diffrender.scene.objects import Planet
 
-__all__ = ["bright_companions", "standing_out"]
+__all__ = ["bright_companions", "local_maxima"]
 
 _INNER = 0.35
 """arcsec; closer to the star, the occulter distorts images and the star's errors dominate."""
@@ -30,71 +28,66 @@ _APART = 0.15
 
 
 def bright_companions(
-    model: OpticalSystem,
-    opd: Tensor,
-    values: dict[str, Tensor],
-    residual: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    flux: float,
-    *,
-    most: int,
-    threshold: float,
-    known: NDArray[np.float64] | None = None,
+    objective: Objective, state: State, kappa: float, *, most: int, threshold: float
 ) -> list[Planet]:
-    """Find point sources that stand out of a residual image.
+    """Find point sources in the residual of the first frame that is not of a reference star.
 
     Parameters
     ----------
-    model : OpticalSystem
-    opd : Tensor, (npix, npix)
-        m.
-    values : dict of Tensor
-        The model's other parameters.
-    residual : ndarray, (ny, nx)
-        Data minus star; 0 where masked.
-    sigma : ndarray, (ny, nx)
-        Standard deviation of the residual, model error included; inf where masked.
-    flux : float
-        Flux of the star, which turns amplitudes into contrasts.
+    objective : Objective
+    state : State
+    kappa : float
+        Assumed error of the star model, as a fraction of the star.
     most : int
-        Largest number of companions; the most significant are returned.
+        Largest number of companions.
     threshold : float
-        In units of the scatter (median absolute deviation) of the matched-filter map.
-    known : ndarray, (k, 2), optional
-        Offsets x, y from the star of companions that are part of the model, arcsec.
+        Smallest S/N, in units of the scatter (median absolute deviation) of the S/N map.
 
     Returns
     -------
     list of Planet
-        Positions are those of pixels, highest S/N first.
+        Highest S/N first, at the positions of pixels, in the orientation of the first frame.
     """
-    scale_x, scale_y = model.detector.pixelscale
-    ny, nx = residual.shape
+    shown = [layout.shows_companions for layout in state.joint.frames]
+    if most < 1 or True not in shown:
+        return []
+    k = shown.index(True)
+    point, forward = state.points[k], objective.forwards[k]
+    layout, problem, model = point.unknowns, forward.problem, forward.coarse
+    residual = torch.where(problem.valid, problem.data - point.total, 0.0).cpu().numpy()
+    sigma = torch.where(problem.valid, objective.sigma(k, point, kappa), math.inf).cpu().numpy()
+    values = layout.values(point.vector)
     star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu()
     axis = values.get("detector_shift", torch.zeros(2, dtype=torch.float64)).cpu()
     # The template is an image in the middle of the array of a source beyond the occulter.
     away = torch.tensor([1.5, 0.0], dtype=torch.float64)
     centred = {**values, "star_offset": star + away, "detector_shift": -(star + away)}
     with torch.no_grad():
-        template = flux * model(opd, **centred).double().cpu().numpy()
+        image = model(forward.coarse_opd(point), **centred).double().cpu().numpy()
+    template = layout.level("flux", point.vector) * image[::-1, ::-1]
     weight = sigma**-2.0
-    numerator = fftconvolve(residual * weight, template[::-1, ::-1], mode="same")
-    information = fftconvolve(weight, template[::-1, ::-1] ** 2, mode="same")
-    # For an even size the template's centre is half a pixel off the convolution's.
+    numerator = fftconvolve(residual * weight, template, mode="same")
+    information = fftconvolve(weight, template**2, mode="same")
     snr = numerator / np.sqrt(np.maximum(information, 1e-300))
-    middle = np.array([(nx - 1) / 2, (ny - 1) / 2])
-    y, x = np.indices(residual.shape)
-    x_sky = (x - middle[0]) * scale_x - float(axis[0] + star[0])
-    y_sky = (y - middle[1]) * scale_y - float(axis[1] + star[1])
-    distance = np.hypot(x_sky, y_sky)
-    allowed = (distance > _INNER) & np.isfinite(sigma)
-    for x_known, y_known in () if known is None else known.tolist():
-        allowed &= np.hypot(x_sky - x_known, y_sky - y_known) > _APART
+    x, y = (
+        (index - (count - 1) / 2) * scale - float(shift)
+        for index, count, scale, shift in zip(
+            np.indices(residual.shape)[::-1],
+            residual.shape[::-1],
+            model.detector.pixelscale,
+            axis + star,
+            strict=True,
+        )
+    )
+    allowed = (np.hypot(x, y) > _INNER) & np.isfinite(sigma)
+    known = layout.sources(point.vector)[:, 1:] @ layout.turn.T
+    for x_known, y_known in known.tolist():
+        allowed &= np.hypot(x - x_known, y - y_known) > _APART
     scatter = 1.4826 * float(np.median(np.abs(snr[allowed] - np.median(snr[allowed]))))
     return [
         Planet.from_offset(
-            float(numerator[peak] / information[peak]), float(x_sky[peak]), float(y_sky[peak])
-        )
+            float(numerator[peak] / information[peak]), float(x[peak]), float(y[peak])
+        ).rotated(-layout.roll)
         for peak in local_maxima(snr, allowed, threshold * scatter, size=7)[:most]
     ]
 
@@ -123,40 +116,3 @@ def local_maxima(
     peaks = (filled == maximum_filter(filled, size=size)) & allowed & (filled > threshold)
     places = np.argwhere(peaks)[np.argsort(-filled[peaks], kind="stable")]
     return [(int(row), int(column)) for row, column in places]
-
-
-def standing_out(
-    objective: Objective, state: State, kappa: float, *, most: int, threshold: float
-) -> list[Planet]:
-    """Find companions in the first science frame; positions refer to the first frame.
-
-    Parameters
-    ----------
-    objective : Objective
-    state : State
-    kappa : float
-        Assumed error of the star model, as a fraction of the star.
-    most, threshold
-        See `bright_companions`.
-    """
-    joint = state.joint
-    shown = [unknowns.shows_companions for unknowns in joint.frames]
-    if most < 1 or True not in shown:
-        return []
-    k = shown.index(True)
-    point, forward = state.points[k], objective.forwards[k]
-    problem = forward.problem
-    sigma = objective.sigma(k, point, kappa)
-    residual = torch.where(problem.valid, problem.data - point.total, 0.0)
-    companions = bright_companions(
-        forward.coarse,
-        forward.coarse_opd(point),
-        point.unknowns.values(point.vector),
-        residual.cpu().numpy(),
-        torch.where(problem.valid, sigma, math.inf).cpu().numpy(),
-        point.unknowns.level("flux", point.vector),
-        most=most,
-        threshold=threshold,
-        known=(point.unknowns.sources(point.vector)[:, 1:] @ point.unknowns.turn.T).numpy(),
-    )
-    return [planet.rotated(-joint.frames[k].roll) for planet in companions]

@@ -74,17 +74,11 @@ class FrameLayout:
 
     def where(self, name: str) -> slice:
         """Place of a parameter, or of "companions", "amplitude" or "modes"."""
+        sizes = {each: parameter(each).size for each in self.ordered}
+        sizes["companions"] = 3 * len(self.companions)
+        sizes["amplitude"], sizes["modes"] = self.amplitude_modes, self.modes
         begin = 0
-        for each in self.ordered:
-            size = parameter(each).size
-            if each == name:
-                return slice(begin, begin + size)
-            begin += size
-        for each, size in (
-            ("companions", 3 * len(self.companions)),
-            ("amplitude", self.amplitude_modes),
-            ("modes", self.modes),
-        ):
+        for each, size in sizes.items():
             if each == name:
                 return slice(begin, begin + size)
             begin += size

@@ -41,7 +41,7 @@ _FINER = 4
 
 _ROLL_OFF = 0.06
 """Width of the edge of the band, cycles per cell. With at least 2 cells per lambda/D, the band of
-the pupils (0.87 D / lambda) is well below the edge, and the band that aliases onto it well above."""
+the pupils (0.87 D / lambda) is well below the edge and the band that aliases onto it well above."""
 
 _MARGIN = 4
 """Number of cells of the band-limited mask beyond its edge."""
