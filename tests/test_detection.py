@@ -198,7 +198,7 @@ def pulls(seed: int) -> tuple[float, float | None, float | None]:
     change = torch.randn(len(FEW), dtype=torch.float64, generator=generator) * size * 1e-9
     later = opd + FEW.opd(change, PupilGrid.full(64)).numpy()
     flux, planet = 3e10, Planet(1.2e-5, 0.5 + 0.1 * (seed % 4), 47.0 * seed)
-    world = World(model, opd, later)
+    world = World(model, opd, later, JointBasis([FEW]))
     frame = world.observed(flux / FLUX * world.expected(planet), seed)
     fit = refine(model, frame, opd, settings=GaussNewton(basis=FEW, response_npix=64))
     found = dr.detect(fit)

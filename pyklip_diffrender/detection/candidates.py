@@ -52,11 +52,11 @@ class Candidates:
     @classmethod
     def at(cls, offsets: ArrayLike, contrasts: ArrayLike) -> Candidates:
         """Make starting values from x, y (k, 2) and contrasts (k,)."""
-        places = torch.as_tensor(np.reshape(offsets, (-1, 2)), dtype=torch.float64)
+        places = torch.from_numpy(np.asarray(offsets, dtype=float).reshape(-1, 2))
         count = 3 * len(places)
         return cls(
             places,
-            torch.as_tensor(np.asarray(contrasts), dtype=torch.float64),
+            torch.from_numpy(np.asarray(contrasts, dtype=float)),
             torch.zeros(count, count, dtype=torch.float64),
         )
 
