@@ -40,7 +40,7 @@ def pixel_width(grid: Image) -> float:
 
 
 def require_inside(offsets: Image, grid: Image) -> None:
-    """Refuse positions (k, 2) that are farther from the star than any pixel.
+    """Raise an exception for positions (k, 2) outside the field.
 
     Raises
     ------

@@ -237,13 +237,13 @@ class LinearModel:
         total = len(next(iter(templates.values())))
         for start in range(0, total, _BATCH):
             part = {k: images[start : start + _BATCH] for k, images in templates.items()}
-            imitated = (self.projected(part) ** 2).sum(dim=0)
-            numerator, photon = torch.zeros_like(imitated), torch.zeros_like(imitated)
+            lost = (self.projected(part) ** 2).sum(dim=0)
+            numerator, photon = torch.zeros_like(lost), torch.zeros_like(lost)
             for k, images in part.items():
                 whitened = (images * self.frames[k].weight.to(images.dtype)).double()
                 numerator += torch.tensordot(whitened, self.cleaned[k], dims=2)
                 photon += (whitened**2).sum(dim=(1, 2))
-            parts.append(TemplateProducts(numerator, photon - imitated, photon))
+            parts.append(TemplateProducts(numerator, photon - lost, photon))
         return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
     def clean(self, templates: Mapping[int, Tensor]) -> dict[int, Tensor]:
@@ -284,7 +284,7 @@ class LinearModel:
         name : str
             Name of the unknowns.
         light : mapping of int to array, (ny, nx)
-            Light that those unknowns stand for, by frame.
+            Image of those unknowns by frame, in the data's unit.
         """
         keeps = torch.tensor([unknown.name != name for unknown in self.unknowns])
         place = torch.cumsum(keeps, 0) - 1
