@@ -1,6 +1,7 @@
 """Figures of merit of a star-subtracted image.
 
-Apertures consist of the whole pixels whose centres are inside or on the edge. Positions are x, y in pixels, with (0, 0) at the centre of the first pixel.
+Apertures consist of the whole pixels whose centres are inside or on the edge. Positions are x, y in
+pixels, with (0, 0) at the centre of the first pixel.
 """
 
 from __future__ import annotations
