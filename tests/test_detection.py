@@ -21,8 +21,8 @@ from scipy import stats
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Detection, small_sample_factor
+from pyklip_diffrender.detection.calibration import calibration_errors
 from pyklip_diffrender.detection.relinearise import with_companions
-from pyklip_diffrender.detection.scale import scale_errors
 from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     NonFiniteError,
@@ -198,7 +198,7 @@ def pulls(seed: int) -> tuple[float, float | None, float | None]:
     change = torch.randn(len(FEW), dtype=torch.float64, generator=generator) * size * 1e-9
     later = opd + FEW.opd(change, PupilGrid.full(64)).numpy()
     flux, planet = 3e10, Planet(1.2e-5, 0.5 + 0.1 * (seed % 4), 47.0 * seed)
-    world = World(model, opd, later)
+    world = World(model, opd, later, JointBasis([FEW]))
     frame = world.observed(flux / FLUX * world.expected(planet), seed)
     fit = refine(model, frame, opd, settings=GaussNewton(basis=FEW, response_npix=64))
     found = dr.detect(fit)
@@ -435,7 +435,9 @@ def test_what_flux_and_image_do_to_a_contrast_may_cancel(world: World, one: Dete
 
     def error(curvature: torch.Tensor, frames: int = 1) -> float:
         known = replace(linear, deviation=deviation, curvature=curvature)
-        return float(scale_errors([(known, templates)] * frames, offset, torch.tensor([1e3]))[0])
+        return float(
+            calibration_errors([(known, templates)] * frames, offset, torch.tensor([1e3]))[0]
+        )
 
     untied, tied = torch.zeros_like(linear.curvature), 1e14 * torch.outer(changes, changes)
     assert error(untied) == pytest.approx(math.sqrt(2) * 1e-3, rel=1e-5)

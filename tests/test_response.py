@@ -10,12 +10,12 @@ from scipy.stats import multivariate_normal
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
 from pyklip_diffrender.linear.response import (
     NANOMETRE,
     WavefrontResponse,
     coarse_copy,
     downsample,
-    parameter_jacobian,
 )
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem

@@ -1,9 +1,9 @@
 """Detection of point sources with the wavefront marginalised.
 
-The light of a planet and a wavefront error can look alike. Where the fit of the star bends
-towards a planet, a subtracted frame has lost some of its light, and does not say how much. Here a
-planet is estimated together with everything that describes the star, in closed form: unbiased,
-with an error that contains the price of the wavefront's freedom.
+The image of a planet can resemble that of a wavefront error. A fit of the star alone then absorbs
+part of the planet, and the subtracted frame has lost an unknown fraction of its light. Here the
+flux of a planet is estimated together with all parameters of the star, in closed form. The result
+is unbiased, and its error includes the uncertainty of the wavefront.
 """
 
 from __future__ import annotations

@@ -1,21 +1,22 @@
-"""Point sources in a frame: the strongest first, all refined together with the wavefront free."""
+"""Point sources in refined frames, fitted together with the star marginalised."""
 
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from pyklip_diffrender.detection.field import Image, far_from, separation_of
+from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.refinement.companions import local_maxima
+from pyklip_diffrender.scene.objects import Planet
 
 __all__ = ["Candidates", "refine_candidates", "strongest_peak"]
 
@@ -23,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 _ITERATIONS = 12
 _SETTLED = 0.02
-"""Steps of position below this many standard deviations end the refinement."""
+"""The fit ends when all steps are shorter than this many standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Candidates:
         x, y from the star, arcsec.
     contrasts : Tensor, (k,)
     covariance : Tensor, (3 k, 3 k)
-        Of all contrasts, then all x, then all y; wavefront and alignment integrated out.
+        Of all contrasts, then all x, then all y, with the star marginalised; 0 where not known.
     converged : bool
     """
 
@@ -49,38 +50,45 @@ class Candidates:
         return len(self.contrasts)
 
     @classmethod
+    def at(cls, offsets: ArrayLike, contrasts: ArrayLike) -> Candidates:
+        """Make starting values from x, y (k, 2) and contrasts (k,)."""
+        places = torch.from_numpy(np.asarray(offsets, dtype=float).reshape(-1, 2))
+        count = 3 * len(places)
+        return cls(
+            places,
+            torch.from_numpy(np.asarray(contrasts, dtype=float)),
+            torch.zeros(count, count, dtype=torch.float64),
+        )
+
+    @classmethod
     def none(cls) -> Candidates:
-        """No candidate yet."""
-        empty = torch.zeros(0, dtype=torch.float64)
-        return cls(empty.reshape(0, 2), empty, empty.reshape(0, 0))
+        """Return no candidates."""
+        return cls.at([], [])
 
     @classmethod
     def of_fit(cls, fit: Refinement) -> Candidates:
-        """Companions that a refinement had parameters for."""
-        if not len(fit.companions):
-            return cls.none()
-        found = torch.from_numpy(np.asarray(fit.companions, dtype=float))
-        count = 3 * len(found)
-        return cls(found[:, 1:], found[:, 0], torch.zeros(count, count, dtype=torch.float64))
+        """Return the companions that were part of a refinement."""
+        return cls.at(fit.companions[:, 1:], fit.companions[:, 0])
 
-    def with_one_more(self, offset: NDArray[np.float64], contrast: float) -> Candidates:
-        """Starting values with another source; its errors are not known yet."""
-        return replace(
-            self,
-            offsets=torch.cat([self.offsets, torch.as_tensor(offset).reshape(1, 2)]),
-            contrasts=torch.cat([self.contrasts, torch.tensor([contrast], dtype=torch.float64)]),
-        )
+    def with_one_more(self, offset: Image, contrast: float) -> Candidates:
+        """Starting values with one more source."""
+        return Candidates.at(np.vstack([self.offsets, offset]), np.append(self.contrasts, contrast))
 
     def without(self, index: int) -> Candidates:
-        """Starting values less one source; the errors of the others are no longer known."""
-        keep = torch.arange(len(self)) != index
-        count = 3 * int(keep.sum())
-        return Candidates(
-            self.offsets[keep], self.contrasts[keep], torch.zeros(count, count).double()
-        )
+        """Starting values without one source."""
+        keep = np.arange(len(self)) != index
+        return Candidates.at(self.offsets[keep], self.contrasts[keep])
+
+    def planets(self, roll: float = 0.0) -> tuple[Planet, ...]:
+        """As planets in a frame whose sky is turned by `roll` degrees counter-clockwise.
+
+        Negative contrasts become 0.
+        """
+        rows = torch.column_stack([self.contrasts.clamp(min=0), self.offsets]).tolist()
+        return tuple(Planet.from_offset(*row).rotated(roll) for row in rows)
 
     def light(self, templates: Templates) -> dict[int, Tensor]:
-        """All of them together, (1, ny, nx) by frame, in the data's unit."""
+        """Image of all candidates together, (1, ny, nx) by frame, in the data's unit."""
         if not len(self):
             return {}
         return {
@@ -94,28 +102,27 @@ class Candidates:
         return self.covariance.diagonal().clamp(min=0).sqrt().reshape(3, -1).T
 
 
-def refine_candidates(
-    groups: Sequence[tuple[LinearModel, Templates]], candidates: Candidates, reach: float
-) -> Candidates:
+def refine_candidates(groups: Sequence[Group], candidates: Candidates, reach: float) -> Candidates:
     """Fit contrasts and positions of all candidates together.
 
-    Gauss-Newton in the metric of Sigma^-1, in which wavefront and alignment are integrated out.
+    Gauss-Newton steps with the star marginalised.
 
     Parameters
     ----------
     groups : sequence of (LinearModel, Templates)
-        Independent of each other.
     candidates : Candidates
-        Where they start.
+        Starting values.
     reach : float
         Longest step of a position, arcsec.
     """
+    if not len(candidates):
+        return candidates
     count = len(candidates)
     offsets, contrasts = candidates.offsets.clone(), candidates.contrasts.clone()
     identity = torch.eye(3 * count, dtype=torch.float64)
     covariance, converged = identity, False
     for _ in range(_ITERATIONS):
-        # Contrasts enter linearly; a position's column is the slope times the contrast.
+        # The model is linear in contrasts. The column of a position is slope times contrast.
         matrix = torch.zeros(3 * count, 3 * count, dtype=torch.float64)
         vector = torch.zeros(3 * count, dtype=torch.float64)
         for linear, templates in groups:
@@ -126,7 +133,7 @@ def refine_candidates(
             curvature, gradient = linear.normal_equations(columns)
             matrix += curvature
             vector += gradient - curvature[:, :count] @ contrasts
-        # Where the position means nothing (contrast near 0), it stays.
+        # The ridge keeps positions where they are if the contrast is near 0.
         scale = matrix.diagonal().clamp(min=1e-300).sqrt()
         ridge = 1e-9 * identity
         system = matrix / scale[:, None] / scale + ridge
@@ -146,15 +153,9 @@ def refine_candidates(
 
 
 def strongest_peak(
-    snr: NDArray[np.float64],
-    grid: NDArray[np.float64],
-    known: Tensor,
-    *,
-    threshold: float,
-    inner: float,
-    apart: float,
+    snr: Image, grid: Image, known: Tensor, *, threshold: float, inner: float, apart: float
 ) -> tuple[int, int] | None:
-    """Pixel of the highest maximum above the threshold that is no known source's.
+    """Pixel of the highest local maximum above the threshold that belongs to no known source.
 
     Parameters
     ----------
@@ -162,18 +163,13 @@ def strongest_peak(
     grid : ndarray, (ny, nx, 2)
         x, y from the star, arcsec.
     known : Tensor, (k, 2)
+        x, y of known sources.
     threshold : float
     inner : float
-        No source is looked for nearer to the star, arcsec.
+        Smallest separation from the star, arcsec.
     apart : float
-        Nor within this distance of a known one.
+        Smallest distance from known sources, arcsec.
     """
-    allowed = (np.hypot(grid[..., 0], grid[..., 1]) >= inner) & np.isfinite(snr)
-    for x, y in known.tolist():
-        allowed &= np.hypot(grid[..., 0] - x, grid[..., 1] - y) >= apart
-    filled = np.where(np.isfinite(snr), snr, -math.inf)
-    peak = allowed & (filled == maximum_filter(filled, size=3)) & (filled > threshold)
-    if not peak.any():
-        return None
-    row, column = np.unravel_index(int(np.argmax(np.where(peak, filled, -math.inf))), snr.shape)
-    return int(row), int(column)
+    allowed = (separation_of(grid) >= inner) & far_from(grid, known, apart)
+    peaks = local_maxima(snr, allowed, threshold, size=3)
+    return peaks[0] if peaks else None

@@ -1,4 +1,4 @@
-"""Contrast that a planet needs to be seen, in closed form."""
+"""The contrast curve and its small-sample correction."""
 
 from __future__ import annotations
 
@@ -10,20 +10,18 @@ from astropy.table import QTable
 from numpy.typing import NDArray
 from scipy import stats
 
-__all__ = ["contrast_table", "ring_pixels", "small_sample_factor"]
-
-Image = NDArray[np.float64]
+__all__ = ["contrast_table", "small_sample_factor"]
 
 
 def small_sample_factor(
     separation: NDArray[np.float64], resolution: float, sigmas: float = 5.0
 ) -> NDArray[np.float64]:
-    """By how much a threshold must grow when the noise was estimated from few elements.
+    """Factor of a detection threshold when the noise is estimated from few resolution elements.
 
     D. Mawet et al., "Fundamental limitations of high contrast imaging set by small sample
-    statistics", ApJ 792, 97 (2014), section 3.2: with n = 2 pi r / resolution elements the false
-    alarm probability of `sigmas` Gaussian standard deviations is reached at a t value with n - 2
-    degrees of freedom, times sqrt(1 + 1 / (n - 1)).
+    statistics", ApJ 792, 97 (2014), section 3.2. With n = 2 pi r / resolution elements, the false
+    alarm probability of `sigmas` Gaussian standard deviations belongs to a value of Student's t
+    with n - 2 degrees of freedom, times sqrt(1 + 1 / (n - 1)).
 
     Parameters
     ----------
@@ -35,7 +33,7 @@ def small_sample_factor(
     Returns
     -------
     ndarray
-        Threshold over `sigmas`; inf where fewer than three elements fit.
+        Threshold over `sigmas`; inf for fewer than three elements.
     """
     elements = np.floor(2 * math.pi * np.asarray(separation, dtype=float) / resolution)
     freedom = np.maximum(elements - 2, 1)
@@ -45,38 +43,6 @@ def small_sample_factor(
     return np.where(elements >= 3, threshold / sigmas, np.inf)
 
 
-def ring_pixels(
-    grid: Image, separations: NDArray[np.float64], most: int
-) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Pixels at some separations, evenly spread in angle.
-
-    Parameters
-    ----------
-    grid : ndarray, (ny, nx, 2)
-        x, y of the pixels from the star, arcsec.
-    separations : ndarray
-        arcsec.
-    most : int
-        Pixels per separation, at most.
-
-    Returns
-    -------
-    list of (rows, columns)
-        Empty where the ring is not on the detector.
-    """
-    radius = np.hypot(grid[..., 0], grid[..., 1])
-    angle = np.arctan2(grid[..., 0], grid[..., 1])
-    pixel = float(np.abs(np.diff(grid[:, :, 0], axis=1)).mean())
-    found = []
-    for separation in separations:
-        rows, columns = np.nonzero(np.abs(radius - separation) <= pixel / 2)
-        order = np.argsort(angle[rows, columns])
-        if len(order) > most:
-            order = order[np.linspace(0, len(order), most, endpoint=False).astype(int)]
-        found.append((rows[order], columns[order]))
-    return found
-
-
 def contrast_table(
     separations: NDArray[np.float64],
     errors: list[NDArray[np.float64]],
@@ -84,27 +50,27 @@ def contrast_table(
     resolution: float,
     sigmas: float = 5.0,
 ) -> QTable:
-    """The contrast curve.
+    """Make the table of a contrast curve.
 
     Parameters
     ----------
     separations : ndarray
         arcsec.
     errors : list of ndarray
-        Standard deviations of a contrast at the pixels of each ring.
+        Standard deviations of contrasts at the pixels of each ring.
     photon : list of ndarray
-        The same if the star were known.
+        The same for a known star.
     resolution : float
         lambda/D, arcsec.
     sigmas : float
-        Of a detection.
+        S/N of a detection.
 
     Returns
     -------
     QTable
         Separation; median, lowest and highest contrast of the ring; the median for a known star
-        (the matched filter's photon limit); the median with the small-sample correction, which
-        applies where the noise was scaled to the scatter that was found.
+        (the photon limit of a matched filter); the median with the small-sample correction, which
+        applies where errors were scaled to the measured scatter.
     """
     rows = []
     factor = small_sample_factor(separations, resolution, sigmas)

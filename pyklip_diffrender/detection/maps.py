@@ -1,4 +1,4 @@
-"""Amplitude and information of a planet at every pixel, with the wavefront integrated out."""
+"""Amplitude and information of a planet at every pixel, with the star marginalised."""
 
 from __future__ import annotations
 
@@ -6,78 +6,79 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.detection.field import Image
+from pyklip_diffrender.detection.groups import Group
 
 __all__ = ["Maps"]
 
-Image = NDArray[np.float64]
-Group = tuple[LinearModel, Templates]
-
 _BATCH = 320
-_KEEP = 1e9
-"""Bytes of templates that are kept for the second look; beyond they are made again."""
+"""Number of templates that are rendered at a time."""
+
+_STORE = 1e9
+"""Largest number of bytes of templates that are stored; otherwise they are rendered again."""
 
 
 class Maps:
-    """p . Sigma^-1 r, p . Sigma^-1 p and p . p of a planet p at every pixel of the first frame.
+    """Inner products with a planet p at every pixel of the first frame.
 
     Parameters
     ----------
     groups : sequence of (LinearModel, Templates)
-        Independent of each other: their information adds.
     progress : bool
+        Show progress bars.
+
+    Attributes
+    ----------
+    numerator, information, photon : ndarray, (ny, nx)
+        p . Sigma^-1 r, p . Sigma^-1 p and p . p, see `linear.model.TemplateProducts`.
     """
 
     def __init__(self, groups: Sequence[Group], progress: bool = False) -> None:
         self.groups, self.progress = tuple(groups), progress
-        ny, nx = self.groups[0][1].grid.shape[:2]
-        self.shape = (ny, nx)
+        self.grid = self.groups[0][1].grid
+        ny, nx = self.shape = self.grid.shape[:2]
         frames = sum(len(templates.frames) for _, templates in self.groups)
-        self._keeps = 4.0 * frames * (ny * nx) ** 2 <= _KEEP
-        self._kept: dict[tuple[int, int], dict[int, Tensor]] = {}
+        self._stores = 4.0 * frames * (ny * nx) ** 2 <= _STORE
+        self._stored: dict[tuple[int, int], dict[int, Tensor]] = {}
         total = np.zeros((3, ny * nx))
-        for linear, where, images in self._batches("S/N map"):
-            total[:, where] += torch.stack(linear.weigh(images)).numpy()
+        for g, pixels, images in self._batches("S/N map"):
+            total[:, pixels] += torch.stack(self.groups[g][0].weigh(images)).numpy()
         self.numerator, self.information, self.photon = total.reshape(3, ny, nx)
 
-    def _batches(self, name: str) -> Iterator[tuple[LinearModel, slice, dict[int, Tensor]]]:
+    def _batches(self, name: str) -> Iterator[tuple[int, slice, dict[int, Tensor]]]:
+        """Index of the group, flat indices of pixels, and their templates by frame."""
         ny, nx = self.shape
-        bar = tqdm(total=ny * nx * len(self.groups), desc=name, disable=not self.progress)
-        for g, (linear, templates) in enumerate(self.groups):
-            for start in range(0, ny * nx, _BATCH):
-                index = np.arange(start, min(start + _BATCH, ny * nx))
-                images = self._kept.get((g, start))
-                if images is None:
-                    images = templates.at_pixels(*np.divmod(index, nx))
-                    if self._keeps:
-                        self._kept[g, start] = images
-                yield linear, slice(start, start + len(index)), images
-                bar.update(len(index))
-        bar.close()
+        with tqdm(
+            total=ny * nx * len(self.groups), desc=name, disable=not self.progress
+        ) as progress_bar:
+            for g, (_, templates) in enumerate(self.groups):
+                for start in range(0, ny * nx, _BATCH):
+                    index = np.arange(start, min(start + _BATCH, ny * nx))
+                    images = self._stored.get((g, start))
+                    if images is None:
+                        images = templates.at_pixels(*np.divmod(index, nx))
+                        if self._stores:
+                            self._stored[g, start] = images
+                    yield g, slice(start, start + len(index)), images
+                    progress_bar.update(len(index))
 
     def without(self, candidates: Candidates) -> Image:
-        """The numerator once point sources are taken out of the data, (ny, nx)."""
-        left = self.numerator.copy().reshape(-1)
+        """The numerator after candidates are removed from the data, (ny, nx)."""
         if not len(candidates):
-            return left.reshape(self.shape)
-        cleaned = {
-            id(linear): linear.clean(candidates.light(templates))
-            for linear, templates in self.groups
-        }
-        for linear, where, images in self._batches("candidates"):
-            for frame, planets in images.items():
-                whitened = (linear.frames[frame].weight * cleaned[id(linear)][frame][0]).float()
-                left[where] -= torch.tensordot(planets, whitened, dims=2).double().numpy()
-        return left.reshape(self.shape)
+            return self.numerator
+        numerator = self.numerator.flatten()
+        cleaned = [linear.clean(candidates.light(templates)) for linear, templates in self.groups]
+        for g, pixels, images in self._batches("candidates"):
+            for k, planets in images.items():
+                whitened = (self.groups[g][0].frames[k].weight * cleaned[g][k][0]).float()
+                numerator[pixels] -= torch.tensordot(planets, whitened, dims=2).double().numpy()
+        return numerator.reshape(self.shape)
 
     def snr(self, numerator: Image | None = None) -> Image:
         """Amplitude over its standard deviation; NaN where there is no information."""
-        top = self.numerator if numerator is None else numerator
-        safe = np.where(self.information > 0, self.information, np.nan)
-        return top / np.sqrt(safe)
+        information = np.where(self.information > 0, self.information, np.nan)
+        return (self.numerator if numerator is None else numerator) / np.sqrt(information)

@@ -1,7 +1,7 @@
-"""Figures of merit on a subtracted image, as the paper and as statisticians define them.
+"""Figures of merit of a star-subtracted image.
 
-Pixels are taken whole: those whose centres lie inside an aperture, with the edge of a circle
-included. Positions are x, y in pixels, with (0, 0) at the centre of the first pixel.
+Apertures consist of the whole pixels whose centres are inside or on the edge. Positions are x, y in
+pixels, with (0, 0) at the centre of the first pixel.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def _ring(center: Position, inner: float, outer: float) -> CircularAperture | Ci
 
 
 def _inside(aperture: Any, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Pixels of an image that an aperture takes."""
+    """Mask of the pixels of an image that are in an aperture."""
     inside = aperture.to_mask(method="center").to_image(shape)
     return np.zeros(shape, dtype=bool) if inside is None else inside > 0
 
@@ -68,10 +68,10 @@ def annulus_snr(
     -------
     float
         (mean in the aperture - mean of the annulus) / (standard deviation of the annulus's
-        pixels / sqrt(pixels in the aperture)); the annulus leaves the aperture out. The paper
-        compares methods by it. It is no significance: light of a bright planet outside the
-        aperture counts as scatter, so that it saturates near 30, and it knows nothing of lost
-        planet light (see `throughput`).
+        pixels / sqrt(pixels in the aperture)), where the annulus excludes the aperture. The paper
+        compares methods by it. It is not a significance: the light of a bright planet outside the
+        aperture counts as scatter, so that the value saturates near 30, and lost planet light
+        (see `throughput`) has no effect on it.
     """
     circle = _circle(position, radius)
     separation = math.dist(position, center)
@@ -89,7 +89,7 @@ def throughput(
     position: Position,
     radius: float = 3.0,
 ) -> float:
-    """Share of a known planet that a subtraction kept: its matched-filter amplitude.
+    """Fraction of a known planet's light that a subtraction retained, by a matched filter.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a detection gives back: maps, candidates, contrast curve, and how they are written."""
+"""The result of a detection: maps, candidates and contrast curve."""
 
 from __future__ import annotations
 
@@ -16,80 +16,56 @@ from astropy.io import fits
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
+from pyklip_diffrender.detection.calibration import calibration_errors
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.relinearise import has_only_reference_stars, without_light
-from pyklip_diffrender.detection.scale import scale_errors
-from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.detection.field import Image, require_inside
+from pyklip_diffrender.detection.groups import Group, has_only_reference_stars, weigh
+from pyklip_diffrender.detection.relinearise import without_light
+from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.files import replacing, write_fits
-from pyklip_diffrender.io.units import require_finite, to_arcsec
+from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
-__all__ = ["Detection", "amplitudes"]
-
-Image = NDArray[np.float64]
+__all__ = ["Detection", "contrasts_at"]
 
 _ROUNDS = 5
-"""How often the star is refined anew for a bright extended source, at most."""
+"""Largest number of refinements of the star for a bright extended source."""
 
 _SETTLED = 0.2
-"""Changes of its amplitude by less than so many of its errors end that."""
+"""The refinements end when its amplitude changes by less than this many standard deviations."""
 
 
-def amplitudes(
-    groups: Sequence[tuple[LinearModel, Templates]], offsets: ArrayLike, scatter: float
-) -> QTable:
-    """Contrasts of point sources at some positions, one at a time; see `Detection.measure`."""
+def contrasts_at(groups: Sequence[Group], offsets: ArrayLike, scatter: float) -> QTable:
+    """Contrasts of point sources at given positions, one at a time; see `Detection.measure`."""
     places = torch.from_numpy(np.atleast_2d(to_arcsec(offsets, "offsets")))
     if places.ndim != 2 or places.shape[1] != 2:
         raise ShapeError(f"offsets: got shape {tuple(places.shape)}, expected (k, 2)")
-    _require_inside(places.numpy(), groups[0][1].grid)
-    numerator = torch.zeros(len(places), dtype=torch.float64)
-    information = torch.zeros_like(numerator)
-    for linear, templates in groups:
-        weighed = linear.weigh(templates.at(places))
-        numerator += weighed.numerator
-        information += weighed.information
-    error = scatter / information.sqrt().numpy()
-    contrast = (numerator / information).numpy()
+    require_inside(places.numpy(), groups[0][1].grid)
+    products = weigh(groups, lambda templates: templates.at(places))
+    error = scatter / products.information.sqrt().numpy()
+    contrast = (products.numerator / products.information).numpy()
     snr = contrast / error
-    scale = scatter * scale_errors(groups, places, torch.from_numpy(snr)).numpy()
+    calibration = scatter * calibration_errors(groups, places, torch.from_numpy(snr)).numpy()
     return QTable(
         {
             "x": places[:, 0].numpy() * u.arcsec,
             "y": places[:, 1].numpy() * u.arcsec,
             "contrast": contrast,
-            "contrast_error": np.hypot(error, contrast * scale),
+            "contrast_error": np.hypot(error, contrast * calibration),
             "snr": snr,
         }
     )
 
 
-def _require_inside(places: Image, grid: Image) -> None:
-    """Refuse positions (k, 2) farther from the star than any pixel of a grid (ny, nx, 2)."""
-    require_finite(places, "offsets")
-    # Pixels have an extent; half a diagonal beyond their centres is still on the detector.
-    pixel = np.hypot(*(grid[1, 1] - grid[0, 0])) if min(grid.shape[:2]) > 1 else 0.0
-    reach = np.hypot(grid[..., 0], grid[..., 1]).max() + pixel / 2
-    distance = np.hypot(places[:, 0], places[:, 1])
-    if (distance > reach).any():
-        x, y = places[np.argmax(distance)]
-        raise IncompatibleSetupError(
-            f"offsets: got ({x:.4g}, {y:.4g}) arcsec, {distance.max():.4g} arcsec from the star; "
-            f"the corners of the field are within {reach:.3g} arcsec. Give x and y from the star "
-            "in arcsec, or with their unit, such as [[-485, 353]] * u.mas"
-        )
-
-
 def _amplitude(linear: LinearModel, frame: int, shape: torch.Tensor) -> tuple[float, float]:
-    weighed = linear.weigh({frame: shape[None]})
-    information = float(weighed.information[0])
-    return float(weighed.numerator[0]) / information, information**-0.5
+    products = linear.weigh({frame: shape[None]})
+    information = float(products.information[0])
+    return float(products.numerator[0]) / information, information**-0.5
 
 
 def _less_star(frame: FrameFit) -> Image:
-    """Residual of a frame of a reference star that shares nothing with the others."""
+    """Residual of a frame of a reference star that was fitted without the target."""
     combined = frame.observation.combined()
     return np.where(combined.valid[0], combined.data[0] - frame.star, np.nan)
 
@@ -104,24 +80,25 @@ class Detection:
     Attributes
     ----------
     fits : tuple of Refinement
-        What was searched, after the last refinement.
+        Fits that were searched, after the last refinement.
     groups : tuple of (LinearModel, Templates)
+        Linear model and templates of each fit of the target.
     contrast : ndarray, (ny, nx)
-        Of a point source at every pixel, relative to the star's light before the coronagraph.
+        Flux of a point source at every pixel over that of the star, before the coronagraph.
     error : ndarray, (ny, nx)
-        Its standard deviation, `scatter` included.
+        Standard deviation of `contrast`, with the factor `scatter`.
     photon_error : ndarray, (ny, nx)
-        What it would be if the star were known.
+        Standard deviation of `contrast` for a known star.
     snr : ndarray, (ny, nx)
         contrast / error.
     residual_snr : ndarray, (ny, nx)
-        The same once the candidates are taken out of the data.
+        The same after the candidates are removed from the data.
     scatter : float
-        Factor by which all errors were multiplied, so that S/N away from sources has a standard
-        deviation of 1; exactly 1 where the fit explains its data.
+        Factor by which all errors were multiplied, so that the S/N away from sources has a
+        standard deviation of 1.
     candidates : Candidates
     threshold : float
-        S/N above which something is a candidate.
+        Smallest S/N of a candidate.
     contrast_curve : QTable
         See `contrast.contrast_table`.
     grid : ndarray, (ny, nx, 2)
@@ -129,7 +106,7 @@ class Detection:
     """
 
     fits: tuple[Refinement, ...]
-    groups: tuple[tuple[LinearModel, Templates], ...]
+    groups: tuple[Group, ...]
     contrast: Image
     error: Image
     photon_error: Image
@@ -169,11 +146,12 @@ class Detection:
         """The candidates, highest S/N first.
 
         Columns are separation; position angle east of north (counter-clockwise from +y of the
-        first frame if its orientation is not known); offsets in right ascension and declination;
-        contrast; magnitude difference; S/N; and x, y from the star on the first frame. Errors are
+        first frame if its orientation is not known); contrast; magnitude difference; S/N; offsets
+        in right ascension and declination; and x, y from the star on the first frame. Errors are
         standard deviations, with all parameters of the star marginalised. The error of the
-        contrast includes those of the star's flux and of the source's own image (see
-        `scale.scale_errors`); the S/N, which asks whether there is a source at all, does not.
+        contrast includes the errors of the star's flux and of the source's own image (see
+        `calibration.calibration_errors`). The S/N does not include them, because they do not
+        change the significance of a source.
         """
         candidates, scatter, count = self.candidates, self.scatter, len(self.candidates)
         x, y = candidates.offsets.T.numpy()
@@ -188,7 +166,7 @@ class Detection:
             np.sqrt(np.einsum("ka,kab,kb->k", unit, places, unit)) for unit in (along, across)
         )
         angle = np.deg2rad(self.north) + np.arctan2(-x, y)
-        contrast_error = np.hypot(errors[:, 0], contrast * self._scale_errors)
+        contrast_error = np.hypot(errors[:, 0], contrast * self._calibration_errors)
         columns = {
             "separation": (separation * u.arcsec, ".4f"),
             "separation_error": (radial * u.arcsec, ".4f"),
@@ -214,11 +192,11 @@ class Detection:
         return table
 
     @cached_property
-    def _scale_errors(self) -> Image:
-        """Of the candidates' contrasts, relative, (k,)."""
-        found = self.candidates
-        snr = found.contrasts / (self.scatter * found.errors[:, 0])
-        return self.scatter * scale_errors(self.groups, found.offsets, snr).numpy()
+    def _calibration_errors(self) -> Image:
+        """Relative calibration errors of the candidates' contrasts, (k,)."""
+        candidates = self.candidates
+        snr = candidates.contrasts / (self.scatter * candidates.errors[:, 0])
+        return self.scatter * calibration_errors(self.groups, candidates.offsets, snr).numpy()
 
     def measure(self, offsets: ArrayLike) -> QTable:
         """Contrast of a point source at given positions, one at a time.
@@ -231,8 +209,8 @@ class Detection:
         Returns
         -------
         QTable
-            x, y, contrast, contrast_error, snr; errors as in `table`. The other candidates stay
-            in the data.
+            x, y, contrast, contrast_error, snr; errors as in `table`. The candidates are not
+            removed from the data.
 
         Raises
         ------
@@ -240,19 +218,19 @@ class Detection:
             For a position outside the field.
         NonFiniteError, ShapeError, UnitError
         """
-        return amplitudes(self.groups, offsets, self.scatter)
+        return contrasts_at(self.groups, offsets, self.scatter)
 
     def measure_shape(self, image: ArrayLike, *, relinearise: float = 25.0) -> tuple[float, float]:
-        """Amplitude of an extended source of known shape in the first frame, such as a ring.
+        """Measure an extended source of known shape in the first frame, such as a ring.
 
         Parameters
         ----------
         image : (ny, nx)
-            What it looks like at amplitude 1, in the data's unit, behind the coronagraph.
+            Image of the source at amplitude 1 behind the coronagraph, in the data's unit.
         relinearise : float
-            When it is brighter than so many of its errors (before `scatter`), the star of a single
-            frame is refined anew without it, until its amplitude has settled: no wavefront
-            explains its light.
+            S/N (before `scatter`) above which the source is subtracted and the star refined
+            again, until the amplitude has settled, so that it does not bias the wavefront. Only
+            for a single frame.
 
         Returns
         -------
@@ -276,12 +254,12 @@ class Detection:
 
     @cached_property
     def subtracted(self) -> tuple[Image, ...]:
-        """Every fit's frame less the star, when the candidates are part of the model.
+        """Star-subtracted frames of all fits, with the candidates as part of the model.
 
-        A fit that knows nothing of a companion takes some of its light for the star's: what
-        `Refinement.residual` leaves has lost it. Here candidates lose nothing, only sources below
-        the threshold do. In the order of `fits`, (ny, nx) each, in the data's unit; frames that
-        were refined as one observation are averaged; NaN where the data are masked.
+        A fit without a companion in its model attributes some of its light to the star, so that
+        `Refinement.residual` has lost that light. Here the candidates lose no light, only sources
+        below the threshold do. Images (ny, nx) are in the order of `fits`, in the data's unit, and
+        NaN where the data are masked; frames of one observation are averaged.
         """
         images: list[Image] = []
         groups = iter(self.groups)
@@ -291,21 +269,22 @@ class Detection:
                 continue
             linear, templates = next(groups)
             light = self.candidates.light(templates)
-            # Taken out before the star is estimated, and put back afterwards.
-            imitated = linear.clean(light) if len(self.candidates) else {}
+            # Candidates are removed before the star is estimated, and added again afterwards.
+            cleaned = linear.clean(light) if light else {}
             for k, frame in enumerate(linear.frames):
                 left = linear.cleaned[k]
-                if imitated:
-                    left = left - imitated[k][0]
+                if cleaned:
+                    left = left - cleaned[k][0]
                 image = left / frame.weight + light.get(k, torch.zeros(1))[0]
                 images.append(torch.where(frame.weight > 0, image, torch.nan).numpy())
         return tuple(images)
 
     @cached_property
     def left_out(self) -> tuple[Image, Image]:
-        """Residual of every 5 x 5 patch of the first frame as a fit that never saw it leaves it.
+        """Residual of every 5 x 5 patch of the first frame for a fit without the patch.
 
-        And its standard deviation (without `scatter`), both (ny, nx) in the data's unit.
+        The second image is its standard deviation, without `scatter`. Both are (ny, nx) in the
+        data's unit.
         """
         residual, deviation = self.groups[0][0].left_out(5, 0)
         return residual.numpy(), deviation.numpy()
@@ -316,7 +295,7 @@ class Detection:
         return {
             "software": f"pyklip_diffrender {__version__}",
             "observations": [f.observation.name for fit in self.fits for f in fit.frames],
-            **{key: value for key, value in self.fits[0].summary().items()},
+            **self.fits[0].summary(),
             "scatter": self.scatter,
             "threshold": self.threshold,
             "orientation": (

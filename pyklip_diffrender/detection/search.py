@@ -8,19 +8,21 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from astropy.table import QTable
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pyklip_diffrender.detection.candidates import Candidates, refine_candidates, strongest_peak
-from pyklip_diffrender.detection.contrast import contrast_table, ring_pixels
-from pyklip_diffrender.detection.excess import excess
-from pyklip_diffrender.detection.maps import Group, Maps
-from pyklip_diffrender.detection.relinearise import (
-    has_only_reference_stars,
-    lacks_candidates,
-    with_companions,
+from pyklip_diffrender.detection.contrast import contrast_table
+from pyklip_diffrender.detection.error_inflation import error_inflation, snr_scatter
+from pyklip_diffrender.detection.field import (
+    curve_separations,
+    pixel_width,
+    ring_pixels,
+    separation_of,
 )
-from pyklip_diffrender.detection.result import Detection, amplitudes
-from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.detection.groups import groups_of, weigh
+from pyklip_diffrender.detection.maps import Maps
+from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
+from pyklip_diffrender.detection.result import Detection, contrasts_at
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, to_arcsec
 from pyklip_diffrender.refinement import Refinement
@@ -31,14 +33,10 @@ Fits = Refinement | Sequence[Refinement]
 
 _log = logging.getLogger(__name__)
 
-_MOST = 20
-"""Candidates at most."""
+_MAX_CANDIDATES = 20
 
 _SOURCE = 5.0
-"""S/N from which on `measure` takes it that there is a source."""
-
-_WINGS = 0.4
-"""arcsec; nearer than this to a candidate, S/N says nothing about the noise."""
+"""S/N above which `measure` removes a source before it computes the default `scatter`."""
 
 
 def detect(
@@ -56,21 +54,21 @@ def detect(
     Parameters
     ----------
     fits : Refinement or sequence of Refinement
-        Several refinements are independent looks at the same sky.
+        Several refinements are independent measurements of the same sky.
     threshold : float
         S/N above which a source is a candidate.
     inner : float or Quantity
-        Smallest separation at which candidates are looked for, arcsec.
+        Smallest separation of candidates, arcsec.
     scatter : float, optional
-        Factor by which all errors are multiplied. Default, where every fit explains its data,
-        the square root of the reduced chi-squared with the candidates removed; otherwise the
-        standard deviation of S/N away from candidates. Never below 1.
+        Factor by which all errors are multiplied. By default it is the square root of the reduced
+        chi-squared with the candidates removed if every fit explains its data, otherwise the
+        standard deviation of the S/N away from candidates; at least 1.
     separations : array or Quantity, optional
-        Of the contrast curve, arcsec. Default every 0.1 from 0.2 to the nearest edge.
+        Separations of the contrast curve, arcsec. Default every 0.1 from 0.2 to the nearest edge.
     relinearise : float
-        S/N of a candidate above which the star is refined once more with the candidates in the
-        model, so that the linear model holds where the star is. Where a fit does not explain its
-        data, any candidate may be the reason, and `threshold` takes its place.
+        S/N of a candidate above which the star is refined again with the candidates in the model,
+        because bright sources bias the wavefront about which the model is linearised. Where a fit
+        does not explain its data, any candidate may be the reason, and `threshold` is used instead.
     progress : bool
         Show progress bars.
 
@@ -81,8 +79,8 @@ def detect(
     Raises
     ------
     IncompatibleSetupError
-        For fits without a linear model (the Adam recipe has none), failed ones, frames of a
-        reference star alone, or a threshold or separation that is not positive.
+        For fits that failed or have no linear model (the Adam recipe), for fits of a reference
+        star only, or for a threshold or separation that is not positive.
 
     Examples
     --------
@@ -98,24 +96,26 @@ def detect(
     fits = _checked(fits)
     inner = float(to_arcsec(inner, "inner"))
     _require_positive(threshold=threshold, inner=inner, scatter=scatter)
-    groups = _groups(fits)
-    maps = Maps(groups, progress)
+    maps = Maps(groups_of(fits), progress)
     candidates, factor = _search(maps, fits, threshold, inner, scatter, Candidates.of_fit(fits[0]))
     if not all(fit.status.calibrated for fit in fits):
         relinearise = min(relinearise, threshold)
     bright = candidates.contrasts > relinearise * factor * candidates.errors[:, 0]
     if bool(bright.any()) and lacks_candidates(fits, candidates):
         fits = with_companions(fits, candidates, progress)
-        groups = _groups(fits)
-        maps = Maps(groups, progress)
+        maps = Maps(groups_of(fits), progress)
         candidates, factor = _search(maps, fits, threshold, inner, scatter, candidates)
-    grid = groups[0][1].grid
     information = np.where(maps.information > 0, maps.information, np.nan)
     photon = np.where(maps.photon > 0, maps.photon, np.nan) ** -0.5
     error = factor / np.sqrt(information)
+    separations = curve_separations(maps.grid, separations)
+    rings = [
+        np.array(ring)[:, np.isfinite(error[ring])]
+        for ring in ring_pixels(maps.grid, separations, most=error.size)
+    ]
     return Detection(
         fits=tuple(fits),
-        groups=tuple(groups),
+        groups=maps.groups,
         contrast=maps.numerator / information,
         error=error,
         photon_error=photon,
@@ -124,8 +124,13 @@ def detect(
         scatter=factor,
         candidates=candidates,
         threshold=threshold,
-        contrast_curve=_curve(fits[0], grid, error, photon, separations),
-        grid=grid,
+        contrast_curve=contrast_table(
+            separations,
+            [error[*ring] for ring in rings],
+            [photon[*ring] for ring in rings],
+            _resolution(fits[0]),
+        ),
+        grid=maps.grid,
     )
 
 
@@ -136,7 +141,7 @@ def measure(
     scatter: float | None = None,
     relinearise: float = 25.0,
 ) -> QTable:
-    """Contrast of a point source at given positions, each as if it were the only one.
+    """Measure the contrasts of point sources at given positions, one at a time.
 
     Parameters
     ----------
@@ -152,7 +157,7 @@ def measure(
     Returns
     -------
     QTable
-        x, y, contrast, contrast_error (with that of the star's flux), snr (without it).
+        x, y, contrast, contrast_error, snr; see `Detection.table` for the errors.
 
     Raises
     ------
@@ -165,24 +170,26 @@ def measure(
     table = _measured(fits, offsets, scatter)
     bright = table[table["snr"] > relinearise]
     if len(bright):
-        places = torch.from_numpy(np.stack([bright["x"].value, bright["y"].value], axis=1))
-        contrasts = torch.from_numpy(np.asarray(bright["contrast"]))
-        known = Candidates(places, contrasts, torch.zeros(3 * len(bright), 3 * len(bright)))
-        table = _measured(with_companions(fits, known), offsets, scatter)
+        table = _measured(with_companions(fits, _as_candidates(bright)), offsets, scatter)
     return table
 
 
 def _measured(fits: Sequence[Refinement], offsets: ArrayLike, scatter: float | None) -> QTable:
-    groups = _groups(fits)
-    table = amplitudes(groups, offsets, 1.0 if scatter is None else scatter)
+    groups = groups_of(fits)
+    table = contrasts_at(groups, offsets, 1.0 if scatter is None else scatter)
     if scatter is None:
-        sources = table[table["snr"] > _SOURCE]
-        places = np.stack([sources["x"].value, sources["y"].value], axis=1)
-        known = Candidates.of_fit(fits[0]).offsets
-        factor = _factor(fits, groups, torch.cat([known, torch.from_numpy(places)]))
+        sources = _as_candidates(table[table["snr"] > _SOURCE])
+        known = Candidates.of_fit(fits[0])
+        factor = error_inflation(fits, groups, torch.cat([known.offsets, sources.offsets]))
         table["contrast_error"] *= factor
         table["snr"] /= factor
     return table
+
+
+def _as_candidates(table: QTable) -> Candidates:
+    return Candidates.at(
+        np.stack([table["x"].value, table["y"].value], axis=1), np.asarray(table["contrast"])
+    )
 
 
 def contrast_curve(
@@ -192,7 +199,7 @@ def contrast_curve(
     angles: int = 12,
     scatter: float | None = None,
 ) -> QTable:
-    """The 5-sigma contrast curve alone, from a few positions at each separation.
+    """Compute the 5-sigma contrast curve from a few positions at each separation.
 
     Parameters
     ----------
@@ -200,10 +207,10 @@ def contrast_curve(
     separations : array or Quantity, optional
         arcsec; as for `detect`.
     angles : int
-        Positions per separation, at most.
+        Largest number of positions per separation.
     scatter : float, optional
-        Factor by which the errors are multiplied; see `measure`. A source that no fit knows as a
-        companion makes the default larger; `detect` finds it first.
+        Factor by which the errors are multiplied; see `measure`. Sources that are not companions
+        of the fits increase the default; `detect` removes them first.
 
     Returns
     -------
@@ -213,40 +220,31 @@ def contrast_curve(
     Raises
     ------
     IncompatibleSetupError
-        See `detect`; also if no pixel of the field is at any of the separations.
+        See `detect`; also if no pixel is at any of the separations.
     """
     fits = _checked(fits)
     _require_positive(scatter=scatter)
-    groups = _groups(fits)
+    groups = groups_of(fits)
     grid = groups[0][1].grid
-    wanted = _separations(grid, separations)
-    rings = ring_pixels(grid, wanted, angles)
+    separations = curve_separations(grid, separations)
+    rings = ring_pixels(grid, separations, angles)
     if not any(len(ring[0]) for ring in rings):
         raise IncompatibleSetupError(
-            f"separations: got {wanted.tolist()} arcsec, where the frames have no pixel; the "
-            f"corners of the field are {np.hypot(grid[..., 0], grid[..., 1]).max():.3g} arcsec "
-            "from the star"
+            f"separations: got {separations.tolist()} arcsec, where the frames have no pixel; "
+            f"the corners of the field are {separation_of(grid).max():.3g} arcsec from the star"
         )
-    rows = np.concatenate([ring[0] for ring in rings])
-    columns = np.concatenate([ring[1] for ring in rings])
-    information = torch.zeros(len(rows), dtype=torch.float64)
-    photon = torch.zeros_like(information)
-    for linear, templates in groups:
-        images = templates.at_pixels(rows, columns)
-        weighed = linear.weigh(images)
-        information += weighed.information
-        photon += weighed.photon
+    rows, columns = np.concatenate(rings, axis=1)
+    products = weigh(groups, lambda templates: templates.at_pixels(rows, columns))
+    if scatter is None:
+        scatter = error_inflation(fits, groups, Candidates.of_fit(fits[0]).offsets)
     ends = np.cumsum([len(ring[0]) for ring in rings])[:-1]
-    factor = scatter
-    if factor is None:
-        factor = _factor(fits, groups, Candidates.of_fit(fits[0]).offsets)
-    errors = np.split(factor * information.numpy() ** -0.5, ends)
-    known = np.split(photon.numpy() ** -0.5, ends)
-    return contrast_table(wanted, errors, known, _resolution(fits[0]))
+    errors = np.split(scatter * products.information.numpy() ** -0.5, ends)
+    photon = np.split(products.photon.numpy() ** -0.5, ends)
+    return contrast_table(separations, errors, photon, _resolution(fits[0]))
 
 
 def _checked(fits: Fits) -> list[Refinement]:
-    """The fits in a list, all of them usable."""
+    """Return the fits as a list; raise an exception if one of them failed."""
     several = [fits] if isinstance(fits, Refinement) else list(fits)
     if not several:
         raise IncompatibleSetupError("detect: got no fit, expected a Refinement")
@@ -257,18 +255,10 @@ def _checked(fits: Fits) -> list[Refinement]:
 
 
 def _require_positive(**values: float | None) -> None:
-    """Refuse numbers that are not positive; None stands for a default."""
+    """Raise an exception for numbers that are not positive; None stands for a default."""
     for name, value in values.items():
         if value is not None and not value > 0:
             raise IncompatibleSetupError(f"{name}: got {value}, expected a positive number")
-
-
-def _groups(fits: Sequence[Refinement]) -> list[Group]:
-    """Linear model and templates of every fit of the target."""
-    origin = fits[0].frames[0]
-    return [
-        (fit.star_only, Templates(fit, origin)) for fit in fits if not has_only_reference_stars(fit)
-    ]
 
 
 def _search(
@@ -279,89 +269,50 @@ def _search(
     scatter: float | None,
     start: Candidates,
 ) -> tuple[Candidates, float]:
-    """Candidates, strongest first, and the factor for the errors."""
-    grid = maps.groups[0][1].grid
-    pixel = float(np.abs(np.diff(grid[:, :, 0], axis=1)).mean())
+    """Candidates in the order in which they were found, and the factor for the errors."""
+    groups, grid, pixel = maps.groups, maps.grid, pixel_width(maps.grid)
     explained = all(fit.status.calibrated for fit in fits)
-    candidates = start
-    if len(start):
-        candidates = refine_candidates(maps.groups, start, reach=pixel / 2)
-    # A refinement may take something for a companion while its wavefront is still far off.
-    while (
-        len(candidates)
-        and float((snrs := candidates.contrasts / candidates.errors[:, 0]).min()) < threshold
-    ):
-        candidates = candidates.without(int(snrs.argmin()))
-        if len(candidates):
-            candidates = refine_candidates(maps.groups, candidates, reach=pixel / 2)
+    candidates = refine_candidates(groups, start, reach=pixel / 2)
+    # A fit may have taken a residual for a companion while its wavefront was still wrong.
+    while len(candidates) and _weakest(candidates)[1] < threshold:
+        candidates = _without_weakest(groups, candidates, pixel)
+    rejected = 0
     while True:
         snr = maps.snr(maps.without(candidates))
-        factor = scatter
-        if factor is None:
-            factor = (
-                excess(fits, maps.groups, candidates.offsets)
-                if explained
-                else max(1.0, _scatter(snr, grid, candidates, inner))
-            )
+        if scatter is not None:
+            factor = scatter
+        elif explained:
+            factor = error_inflation(fits, groups, candidates.offsets)
+        else:
+            factor = snr_scatter(snr, grid, candidates.offsets, inner)
         peak = strongest_peak(
             snr / factor, grid, candidates.offsets, threshold=threshold, inner=inner, apart=pixel
         )
-        if peak is None or len(candidates) >= _MOST:
-            return candidates, factor
-        amplitude = float(snr[peak] / np.sqrt(maps.information[peak]))
-        candidates = refine_candidates(
-            maps.groups, candidates.with_one_more(grid[peak], amplitude), reach=pixel / 2
-        )
+        if peak is None or len(candidates) >= _MAX_CANDIDATES:
+            # The factor may have grown since a candidate was accepted.
+            if not len(candidates) or _weakest(candidates)[1] >= threshold * factor:
+                return candidates, factor
+            if rejected >= _MAX_CANDIDATES:
+                return candidates, factor
+            candidates, rejected = _without_weakest(groups, candidates, pixel), rejected + 1
+            continue
+        contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
+        candidates = candidates.with_one_more(grid[peak], contrast)
+        candidates = refine_candidates(groups, candidates, reach=pixel / 2)
         _log.info("candidates at %s arcsec", candidates.offsets.tolist())
 
 
-def _factor(fits: Sequence[Refinement], groups: Sequence[Group], offsets: torch.Tensor) -> float:
-    """Factor by which errors are multiplied, with the light of sources at `offsets` removed."""
-    # Where fits do not explain their data at all, their noise already has a model error in it.
-    return excess(fits, groups, offsets) if all(fit.status.calibrated for fit in fits) else 1.0
+def _weakest(candidates: Candidates) -> tuple[int, float]:
+    """Which candidate has the smallest S/N, before errors are scaled, and that S/N."""
+    snrs = candidates.contrasts / candidates.errors[:, 0]
+    return int(snrs.argmin()), float(snrs.min())
 
 
-def _scatter(
-    snr: NDArray[np.float64], grid: NDArray[np.float64], candidates: Candidates, inner: float
-) -> float:
-    """Standard deviation of S/N where there is no source, outliers held back."""
-    away = (np.hypot(grid[..., 0], grid[..., 1]) >= inner) & np.isfinite(snr)
-    for x, y in candidates.offsets.tolist():
-        away &= np.hypot(grid[..., 0] - x, grid[..., 1] - y) > _WINGS
-    values = snr[away]
-    scale = 1.4826 * float(np.median(np.abs(values - np.median(values))))
-    # Peaks that are candidates yet to be candidates must not hide themselves.
-    return float(np.clip(values, -5 * scale, 5 * scale).std())
-
-
-def _separations(grid: NDArray[np.float64], separations: ArrayLike | None) -> NDArray[np.float64]:
-    if separations is not None:
-        wanted = np.atleast_1d(to_arcsec(separations, "separations"))
-        if not (wanted > 0).all():
-            raise IncompatibleSetupError(
-                f"separations: got {wanted.tolist()} arcsec, expected positive numbers"
-            )
-        return wanted
-    edge = min(np.abs(grid[:, 0, 0]).min(), np.abs(grid[:, -1, 0]).min(),
-               np.abs(grid[0, :, 1]).min(), np.abs(grid[-1, :, 1]).min())  # fmt: skip
-    return np.arange(0.2, edge + 1e-9, 0.1)
+def _without_weakest(groups: Sequence[Group], candidates: Candidates, pixel: float) -> Candidates:
+    """The other candidates, fitted again."""
+    return refine_candidates(groups, candidates.without(_weakest(candidates)[0]), reach=pixel / 2)
 
 
 def _resolution(fit: Refinement) -> float:
     """lambda/D, arcsec."""
     return fit.model.bandpass.mean_wavelength / fit.model.diameter / ARCSEC
-
-
-def _curve(
-    fit: Refinement,
-    grid: NDArray[np.float64],
-    error: NDArray[np.float64],
-    photon: NDArray[np.float64],
-    separations: ArrayLike | None,
-) -> QTable:
-    wanted = _separations(grid, separations)
-    rings = ring_pixels(grid, wanted, most=error.size)
-    usable = [np.isfinite(error[ring]) for ring in rings]
-    errors = [error[ring][good] for ring, good in zip(rings, usable, strict=True)]
-    known = [photon[ring][good] for ring, good in zip(rings, usable, strict=True)]
-    return contrast_table(wanted, errors, known, _resolution(fit))

@@ -1,14 +1,14 @@
-"""The linear model of a fit: what every unknown does to every pixel, and how well it is known.
+"""The linear model of a fit: the Jacobian of all unknowns and their posterior covariance.
 
-With the whitened Jacobian G of all unknowns, their prior precision P and the data r (their
-distance from what the prior's mean predicts), the data's covariance once all unknowns are
-integrated out is Sigma = 1 + G^T P^-1 G. By Woodbury everything that Sigma^-1 is needed for costs
-one Cholesky factor of P + G G^T: the flux of a template p and its error are
+Let G be the whitened Jacobian of all unknowns, P their prior precision, and r the whitened data
+minus the prediction at the mean of the prior. The covariance of the data, marginalised over all
+unknowns, is Sigma = 1 + G^T P^-1 G. By the Woodbury identity, products with Sigma^-1 need only the
+Cholesky factor of P + G G^T. The flux of a template p and its error are
 
     flux = p . Sigma^-1 r / p . Sigma^-1 p,    error = 1 / sqrt(p . Sigma^-1 p).
 
-(C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, section
-2.7 has this marginalisation.) Here unknowns are rows, pixels columns.
+This marginalisation is in section 2.7 of C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes
+for Machine Learning" (2006). Unknowns are rows of G, pixels are columns.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pyklip_diffrender.errors import ShapeError
 __all__ = ["LinearFrame", "LinearModel", "TemplateProducts", "Unknown"]
 
 _BATCH = 512
-"""Templates that are weighed at a time."""
+"""Number of templates that are processed at a time."""
 
 
 class Unknown(NamedTuple):
@@ -62,16 +62,16 @@ class LinearFrame:
     residual : Tensor, (ny, nx), float64
         Data minus prediction where the model is linearised.
     weight : Tensor, (ny, nx), float64
-        1 / standard deviation; 0 for pixels that do not count.
+        1 / standard deviation; 0 for masked pixels.
     jacobian : Tensor, (rows, ny, nx), float32
-        What the unknowns do to the pixels, in the data's unit.
+        Derivatives of the pixels with respect to the unknowns, in the data's unit.
     rows : Tensor, (rows,), int64
-        Which of the model's unknowns each row belongs to.
+        Index of the unknown that each row belongs to.
     drift : Tensor, (some,), int64
-        Unknowns by which the last rows of this frame (its wavefront modes, from the first one on)
-        may differ from the other frames'.
+        Indices of the unknowns by which the leading wavefront modes of this frame differ from
+        those of the other frames.
     first_mode : int
-        Place of the first wavefront mode among the rows.
+        Index of the first wavefront mode among the rows.
     """
 
     residual: Tensor
@@ -82,21 +82,28 @@ class LinearFrame:
     first_mode: int
 
     def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
-        """Sum what stands for every row, (rows, k), over the unknowns, (size, k)."""
+        """Sum values by row, (rows, k), to values by unknown, (size, k)."""
         total = torch.zeros(size, *on_rows.shape[1:], dtype=on_rows.dtype)
         total.index_add_(0, self.rows, on_rows)
         count = len(self.drift)
         return total.index_add_(0, self.drift, on_rows[self.first_mode : self.first_mode + count])
 
     def of_unknowns(self, values: Tensor) -> Tensor:
-        """Values of the rows from those of the unknowns; the adjoint of `onto_unknowns`."""
+        """Values by row from values by unknown; the adjoint of `onto_unknowns`."""
         rows = values[self.rows]
         rows[self.first_mode : self.first_mode + len(self.drift)] += values[self.drift]
         return rows
 
+    def image(self, values: Tensor) -> Tensor:
+        """Change of the image, (..., ny, nx), for changes of the unknowns, (size, ...)."""
+        on_rows = self.of_unknowns(values).float()
+        return torch.tensordot(on_rows, self.jacobian, dims=([0], [0])).double()
+
 
 class TemplateProducts(NamedTuple):
-    """Inner products of templates p, (k,) each.
+    """Inner products of templates p with the data r, (k,) each.
+
+    Sigma is the covariance of the data, marginalised over all unknowns.
 
     Attributes
     ----------
@@ -105,7 +112,7 @@ class TemplateProducts(NamedTuple):
     information : Tensor
         p . Sigma^-1 p.
     photon : Tensor
-        p . p, whitened: the information if everything but the template's amplitude were known.
+        p . p, whitened: the information if all parameters of the star were known.
     """
 
     numerator: Tensor
@@ -122,9 +129,9 @@ class LinearModel:
     unknowns : tuple of Unknown
     frames : tuple of LinearFrame
     vector : Tensor, (unknowns,)
-        Where it is linearised.
+        Values of the unknowns about which the model is linearised.
     mean, deviation : Tensor, (unknowns,)
-        The priors; a deviation of inf is none.
+        Mean and standard deviation of the priors; inf for no prior.
     curvature : Tensor, (unknowns, unknowns)
         G G^T over all frames, float64.
     """
@@ -167,10 +174,10 @@ class LinearModel:
 
     @cached_property
     def step(self) -> Tensor:
-        """From `vector` to the most probable unknowns of the linear model, (unknowns,).
+        """Most probable unknowns of the linear model minus `vector`, (unknowns,).
 
-        Small after a fit that has converged. Kept as a difference: the way from the priors' means
-        may be long, and its digits would be lost in single precision.
+        It is small after a fit that has converged. The unknowns themselves may be far from the
+        means of the priors, so that single precision would not do for them.
         """
         gradient = -(self.vector - self.mean) / self.deviation**2
         for frame in self.frames:
@@ -182,21 +189,18 @@ class LinearModel:
 
     @cached_property
     def cleaned(self) -> tuple[Tensor, ...]:
-        """Sigma^-1 r of every frame, (ny, nx): what the most probable unknowns leave, whitened."""
-        found = []
-        for frame in self.frames:
-            on_rows = frame.of_unknowns(self.step).float()
-            explained = torch.tensordot(on_rows, frame.jacobian, dims=1).double()
-            found.append(frame.weight * (frame.residual - explained))
-        return tuple(found)
+        """Sigma^-1 r of every frame, (ny, nx): the whitened residual of the most probable model."""
+        return tuple(
+            frame.weight * (frame.residual - frame.image(self.step)) for frame in self.frames
+        )
 
     def projected(self, templates: Mapping[int, Tensor]) -> Tensor:
-        """What the unknowns can do of some templates: L^-1 G p, with P + G G^T = L L^T.
+        """Projection L^-1 G p of templates onto the unknowns, with P + G G^T = L L^T.
 
         Parameters
         ----------
         templates : mapping of int to Tensor, (k, ny, nx)
-            Of the frames that show them, in units of the data (not whitened).
+            Templates by frame, in units of the data (not whitened).
 
         Returns
         -------
@@ -216,12 +220,12 @@ class LinearModel:
         )
 
     def weigh(self, templates: Mapping[int, Tensor]) -> TemplateProducts:
-        """Amplitudes of templates, one at a time, with all unknowns integrated out.
+        """Compute amplitudes of templates, one at a time, marginalised over all unknowns.
 
         Parameters
         ----------
         templates : mapping of int to Tensor, (k, ny, nx)
-            Of the frames that show them, in units of the data.
+            Templates by frame, in units of the data.
 
         Returns
         -------
@@ -233,37 +237,34 @@ class LinearModel:
         total = len(next(iter(templates.values())))
         for start in range(0, total, _BATCH):
             part = {k: images[start : start + _BATCH] for k, images in templates.items()}
-            imitated = (self.projected(part) ** 2).sum(dim=0)
-            numerator, photon = torch.zeros_like(imitated), torch.zeros_like(imitated)
+            lost = (self.projected(part) ** 2).sum(dim=0)
+            numerator, photon = torch.zeros_like(lost), torch.zeros_like(lost)
             for k, images in part.items():
                 whitened = (images * self.frames[k].weight.to(images.dtype)).double()
                 numerator += torch.tensordot(whitened, self.cleaned[k], dims=2)
                 photon += (whitened**2).sum(dim=(1, 2))
-            parts.append(TemplateProducts(numerator, photon - imitated, photon))
+            parts.append(TemplateProducts(numerator, photon - lost, photon))
         return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
     def clean(self, templates: Mapping[int, Tensor]) -> dict[int, Tensor]:
-        """Sigma^-1 p, whitened, of templates (k, ny, nx) by frame; for every frame of the model.
+        """Sigma^-1 p of templates (k, ny, nx) by frame, whitened, for every frame of the model.
 
-        What of the templates the unknowns cannot imitate.
+        This is the part of the templates that the unknowns cannot reproduce.
         """
         solved = torch.linalg.solve_triangular(
             self._factor.T, self.projected(templates), upper=True
         )
         solved = solved * self._scale[:, None]
-        found = {}
+        residuals = {}
         for k, frame in enumerate(self.frames):
-            explained = torch.tensordot(
-                frame.of_unknowns(solved).float(), frame.jacobian, dims=([0], [0])
-            )
-            left = -explained.double()
+            left = -frame.image(solved)
             if k in templates:
                 left += templates[k].double()
-            found[k] = frame.weight * left
-        return found
+            residuals[k] = frame.weight * left
+        return residuals
 
     def normal_equations(self, templates: Mapping[int, Tensor]) -> tuple[Tensor, Tensor]:
-        """p_i . Sigma^-1 p_j and p_i . Sigma^-1 r for a few templates fitted together."""
+        """Return p_i . Sigma^-1 p_j and p_i . Sigma^-1 r of templates that are fitted together."""
         projected = self.projected(templates)
         matrix = -projected.T @ projected
         vector = torch.zeros(len(matrix), dtype=torch.float64)
@@ -276,14 +277,14 @@ class LinearModel:
     def without(
         self, name: str, light: Mapping[int, Tensor | NDArray[np.float64] | float]
     ) -> LinearModel:
-        """The model with some unknowns gone and their light back in the data.
+        """Remove unknowns from the model and add their light to the data.
 
         Parameters
         ----------
         name : str
-            Of the unknowns.
+            Name of the unknowns.
         light : mapping of int to array, (ny, nx)
-            What those unknowns render in each frame.
+            Image of those unknowns by frame, in the data's unit.
         """
         keeps = torch.tensor([unknown.name != name for unknown in self.unknowns])
         place = torch.cumsum(keeps, 0) - 1
@@ -313,7 +314,7 @@ class LinearModel:
         )
 
     def left_out(self, size: int = 5, frame: int = 0) -> tuple[Tensor, Tensor]:
-        """Residual of every patch of pixels as predicted from all pixels but its own.
+        """Residual of every patch of pixels, predicted from all pixels outside the patch.
 
         Parameters
         ----------
@@ -324,8 +325,8 @@ class LinearModel:
         Returns
         -------
         residual, deviation : Tensor, (ny, nx)
-            Data minus prediction by a fit that never saw the patch, in the data's unit, and its
-            standard deviation (noise and prediction); NaN for pixels that do not count.
+            Data minus the prediction of a fit without the patch, in the data's unit, and its
+            standard deviation, noise and prediction included; NaN for masked pixels.
         """
         part = self.frames[frame]
         ny, nx = part.residual.shape
@@ -347,8 +348,8 @@ class LinearModel:
                 inverse = torch.eye(inside.shape[1], dtype=torch.float64) - inside.T @ inside
                 covariance = torch.linalg.inv(inverse)
                 weight = part.weight[window][counts]
-                found = covariance @ self.cleaned[frame][window][counts] / weight
-                residual[window] = residual[window].masked_scatter(counts, found)
+                left = covariance @ self.cleaned[frame][window][counts] / weight
+                residual[window] = residual[window].masked_scatter(counts, left)
                 deviation[window] = deviation[window].masked_scatter(
                     counts, covariance.diagonal().sqrt() / weight
                 )

@@ -1,9 +1,9 @@
-"""How the image answers to small changes: its Jacobian with respect to wavefront and alignment.
+"""Jacobian of the image with respect to wavefront modes.
 
-For a small OPD change the field is linear, E = E0 + J d, and so the image changes by
-2 Re(conj(E0) J) d. The field E0 comes from the model as it is; J, which needs one propagation a
-mode, from a coarser copy of the model: an error of a percent in a derivative costs an iteration,
-not a bias.
+For a small change d of the OPD the field is linear, E = E0 + J d, and the image changes by
+2 Re(conj(E0) J) d. The field E0 comes from the model itself. J needs one propagation per mode and
+comes from a coarser copy of the model: an error of a percent in a derivative costs an iteration,
+but causes no bias.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.linear.forward_mode import jacfwd
+from pyklip_diffrender.linear.parameter_derivatives import field_derivatives, image_derivatives
 from pyklip_diffrender.optics.grid import PupilGrid, samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.bases import Basis
@@ -31,29 +31,25 @@ __all__ = [
     "coarse_copy",
     "coarse_npix",
     "downsample",
-    "parameter_jacobian",
 ]
 
 _log = logging.getLogger(__name__)
 
 NANOMETRE = 1e-9
-"""Wavefront coefficients are in nm inside a fit, so that all its numbers are of order 1."""
-
-IMAGE_PARAMETERS = ("blur",)
-"""Parameters that act on the image; all others act on the field."""
+"""Wavefront coefficients are in nm inside a fit, so that its numbers are of order 1."""
 
 _CELLS = 1.9
-"""Of the occulter per lambda/D: then one cell a pixel serves all wavelengths of F444W, down to
-3.9 um. A second one would take four times as long."""
+"""Cells of the occulter per lambda/D. With this number one cell per pixel is enough at all
+wavelengths of F444W, down to 3.9 um; two cells per pixel would take four times as long."""
 
 _BATCH_BYTES = 2.5e7
 
 _PIECE = 16
-"""Modes whose images are made at a time."""
+"""Number of modes whose images are computed at a time."""
 
 
 def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
-    """Pupil samples that `coarse_copy` has; those of the model where it serves itself."""
+    """Return the number of pupil samples of `coarse_copy`."""
     detector = model.detector
     field = max(n * s for n, s in zip(detector.shape[::-1], detector.pixelscale, strict=True))
     while npix < samples_for_field(field, min(model.bandpass.wavelengths), model.diameter):
@@ -64,10 +60,10 @@ def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
 
 
 def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
-    """A cheaper copy of a model for derivatives: coarse cells, single precision.
+    """Return a cheaper copy of a model for derivatives, with coarse cells and single precision.
 
-    A model whose pupil grid is fixed, or one that is already as coarse, serves itself. A wide
-    field takes more samples, by powers of two, so that the image does not repeat inside it.
+    If the pupil grid of the model is fixed, or is already as coarse, the model itself is returned.
+    For a wide field the number of samples is doubled until the image does not repeat inside it.
     """
     npix = coarse_npix(model, npix)
     if npix == model.npix:
@@ -84,8 +80,8 @@ def downsample(opd: Tensor, npix: int) -> Tensor:
     factor = opd.shape[-1] // npix
     if factor == 1:
         return opd
-    # Rows first, each as a whole, then columns by a product: a third of the time of a pooling
-    # over squares.
+    # Summing rows and then multiplying for the columns takes a third of the time of average
+    # pooling.
     rows = opd.unflatten(-2, (npix, factor)).sum(dim=-2)
     mean = torch.full((factor, 1), 1 / factor**2, dtype=opd.dtype, device=opd.device)
     return (rows.unflatten(-1, (npix, factor)) @ mean).squeeze(-1)
@@ -94,26 +90,27 @@ def downsample(opd: Tensor, npix: int) -> Tensor:
 class WavefrontResponse:
     """Derivative of the complex field on the detector with respect to wavefront modes.
 
-    The field behind a coronagraph is a small difference of large ones: it changes by much when
-    the wavefront changes by little, but its derivative does not. So the derivative of the field
-    is kept, and that of the image is made from it for whatever field the star now has.
+    The field behind a coronagraph is a small difference of large fields. A small change of the
+    wavefront changes the field by a large factor, but hardly changes its derivative. Therefore
+    the derivative of the field is stored, and that of the image is computed from it and from the
+    current field of the star.
 
     Parameters
     ----------
     model : OpticalSystem
     basis : Basis
     opd : Tensor, (n, n)
-        About which to linearise, m.
+        Wavefront about which to linearise, m.
     values : dict of Tensor
         Values of the model's other parameters.
     names : tuple of str
-        Other parameters whose derivatives are kept as well.
+        Other parameters whose derivatives are stored as well.
     npix : int
         Pupil samples of the coarse copy that does the propagations.
     wavelengths : int
         Largest number of wavelengths at which derivatives are computed.
     memory_limit : float
-        Bytes that may be kept.
+        Largest number of bytes to store.
     progress : bool
         Show a progress bar.
 
@@ -150,7 +147,7 @@ class WavefrontResponse:
                 "or fewer modes, or raise the limit"
             )
         self.size = size
-        """Bytes that are kept."""
+        """Number of bytes stored."""
         self.fields = [
             torch.empty(len(basis), ny, nx, dtype=torch.complex64, device=model.device)
             for _ in bandpass.wavelengths
@@ -183,21 +180,21 @@ class WavefrontResponse:
         amplitude_modes: int = 0,
         modes: int | None = None,
     ) -> Tensor:
-        """Derivative of the image, for a star with the given fields.
+        """Derivative of the image for given fields of the star.
 
-        A mode of the amplitude, an OPD of -1j nm, changes the field by -1j times what the same
-        mode of the OPD does, so the same response serves.
+        An amplitude mode is an OPD of -1j nm. It changes the field by -1j times the change that
+        the same OPD mode causes, so its derivative follows from the same response.
 
         Parameters
         ----------
         fields : sequence of Tensor
-            What `OpticalSystem.fields` returns: the star's field at each wavelength.
+            The star's field at each wavelength, as `OpticalSystem.fields` returns it.
         values : dict of Tensor
             Values of the model's other parameters (the blur matters here).
         amplitude_modes : int
-            How many modes, the first, are amplitude modes as well.
+            Number of leading modes that are amplitude modes as well.
         modes : int, optional
-            How many modes, the first, are wanted; default all.
+            Number of leading modes; default all.
 
         Returns
         -------
@@ -211,7 +208,7 @@ class WavefrontResponse:
             (2 * weight) * field.to(torch.complex64).conj()
             for field, weight in zip(self._kept(fields), self.coarse.bandpass.weights, strict=True)
         ]
-        # In pieces that stay in the processor's cache: the whole product is never held.
+        # Pieces that fit in the processor's cache are faster than the whole product.
         for start in range(0, max(modes, amplitude_modes), _PIECE):
             piece = slice(start, start + _PIECE)
             real, imaginary = total[:modes][piece], total[modes:][piece]
@@ -231,12 +228,12 @@ class WavefrontResponse:
 
 
 _OPENINGS = 20.0
-"""Relative change of the field for a shift of the Lyot stop by one pupil diameter: its openings
-are about a twentieth of it wide."""
+"""Relative change of the field for a shift of the Lyot stop by one pupil diameter. The openings of
+the stop are about a twentieth of a diameter wide."""
 
 
 class Responses:
-    """The field's responses to a basis that were computed, to be used again nearby.
+    """Cache of wavefront responses, which are used again where the field is nearly the same.
 
     Parameters
     ----------
@@ -247,13 +244,14 @@ class Responses:
     wavelengths : int
         Largest number of wavelengths at which derivatives are computed.
     relinearise : float
-        Relative change of the field (radians, for a phase), rms over the pupil, beyond which the
-        response is computed anew. A response from 0.2 away (a star 15 mas off) halves the error
-        that a fit states for the star's position and moves it by four of those errors.
+        Relative change of the field (radians for a phase), rms over the pupil, above which the
+        response is computed again. With a response computed at a distance of 0.2 (15 mas in the
+        star's position), the stated error of the star's position is half the correct one, and
+        the position is off by four times that error.
     keep : int
-        Number of responses that are kept: one for each frame, as their stars differ in position.
+        Number of responses to store: one for each frame, because star positions differ.
     memory_limit : float
-        Bytes that one response may take.
+        Largest number of bytes of one response.
     progress : bool
         Show progress bars.
     """
@@ -294,8 +292,7 @@ class Responses:
         values : dict of Tensor
         names : tuple of str
         fields : sequence of Tensor
-            The star's field at each wavelength. Derivatives of the field are used again where it
-            differs little.
+            The star's field at each wavelength.
         """
         inside = opd[self.model.entrance.lit]
         kept = self._slopes
@@ -309,12 +306,12 @@ class Responses:
     def near(
         self, opd: Tensor, values: dict[str, Tensor], names: tuple[str, ...] = ()
     ) -> WavefrontResponse:
-        """The response where the field differs little from that of `opd` and `values`."""
+        """Return the stored response for nearly the same field, or compute it."""
         inside = opd[self.model.entrance.lit]
-        for there, then, response in reversed(self._kept):
-            if self._change(inside - there, values, then) <= self.relinearise:
+        for opd_then, values_then, response in reversed(self._kept):
+            if self._change(inside - opd_then, values, values_then) <= self.relinearise:
                 return response
-        # Room first, for the new one takes as much memory as the old.
+        # Memory is freed first, because the new response is as large as the old one.
         del self._kept[: max(0, len(self._kept) + 1 - self.keep)]
         response = WavefrontResponse(
             self.model,
@@ -334,11 +331,8 @@ class Responses:
         """Relative change of the field, rms over the pupil."""
 
         def difference(name: str) -> Tensor:
-            here, there = values.get(name), others.get(name)
-            missing = torch.zeros((), dtype=torch.float64)
-            return (missing if here is None else here.cpu()) - (
-                missing if there is None else there.cpu()
-            )
+            zero = torch.zeros((), dtype=torch.float64)
+            return values.get(name, zero).cpu() - others.get(name, zero).cpu()
 
         wavenumber = 2 * math.pi / min(self.model.bandpass.wavelengths)
         # The rms of a tilt over a disc is a quarter of its diameter times the angle.
@@ -355,114 +349,3 @@ class Responses:
         ):
             total = total + (sensitivity * difference(name)).square().sum().to(total.device)
         return float(total.sqrt())
-
-
-def field_derivatives(
-    model: OpticalSystem, opd: Tensor, values: dict[str, Tensor], names: tuple[str, ...]
-) -> dict[str, list[Tensor]]:
-    """Derivatives of the complex field on the detector with respect to named parameters.
-
-    Forward-mode derivatives of the model itself.
-
-    Parameters
-    ----------
-    model : OpticalSystem
-        May be a coarse copy.
-    opd : Tensor, (npix, npix)
-        m.
-    values : dict of Tensor
-        Where to differentiate; must hold every name.
-    names : tuple of str
-        Those that act on the image only (`IMAGE_PARAMETERS`) are left out.
-
-    Returns
-    -------
-    dict of str to list of Tensor
-        For every wavelength (components, ny, nx), per unit of the parameter table.
-    """
-    # Constants are built and kept at the first call; that must not happen inside a transform.
-    with torch.no_grad():
-        model(opd, **values)
-    moved = {name: values[name] for name in names if name not in IMAGE_PARAMETERS}
-    if not moved:
-        return {}
-
-    def fields(given: dict[str, Tensor]) -> list[Tensor]:
-        # Complex outputs of jacfwd would need complex inputs.
-        return [torch.view_as_real(field) for field in model.fields(opd, **{**values, **given})]
-
-    # Together: one pass costs as much for five components as for one.
-    slopes = jacfwd(fields)(moved)
-    return {
-        name: [torch.view_as_complex(s[name].movedim(-1, 0).contiguous()) for s in slopes]
-        for name in moved
-    }
-
-
-def image_derivatives(
-    model: OpticalSystem,
-    fields: Sequence[Tensor],
-    values: dict[str, Tensor],
-    names: tuple[str, ...],
-    slopes: dict[str, list[Tensor]],
-) -> Tensor:
-    """Derivatives of the image from those of the field, for a star with the given fields.
-
-    Parameters
-    ----------
-    model : OpticalSystem
-    fields : sequence of Tensor
-        The star's field at each wavelength; of a finer model, if there is one.
-    values : dict of Tensor
-    names : tuple of str
-    slopes : dict of str to list of Tensor
-        What `field_derivatives` gave.
-
-    Returns
-    -------
-    Tensor, (components of all names in order, ny, nx)
-        Light per pixel per unit of the parameter table.
-    """
-    rows = []
-    for name in names:
-        if name in IMAGE_PARAMETERS:
-
-            def image(value: Tensor, name: str = name) -> Tensor:
-                return model.image_of(fields, {**values, name: value})
-
-            rows.append(jacfwd(image)(values[name]).movedim(-1, 0))
-            continue
-        total = torch.zeros((), dtype=fields[0].real.dtype, device=model.device)
-        for field, slope, weight in zip(fields, slopes[name], model.bandpass.weights, strict=True):
-            total = total + 2 * weight * (field.conj() * slope).real
-        rows.append(model.detector.image(total, values))
-    return torch.cat([row.double() for row in rows])
-
-
-def parameter_jacobian(
-    model: OpticalSystem,
-    opd: Tensor,
-    values: dict[str, Tensor],
-    names: tuple[str, ...],
-    fields: Sequence[Tensor] | None = None,
-) -> Tensor:
-    """Derivative of the image with respect to the components of named parameters.
-
-    Parameters
-    ----------
-    model, opd, values, names
-        See `field_derivatives`.
-    fields : sequence of Tensor, optional
-        The finer model's fields there, at each wavelength. Then only the fields' derivatives are
-        those of `model`.
-
-    Returns
-    -------
-    Tensor, (components, ny, nx), float64
-        Light per pixel per unit of the parameter table.
-    """
-    slopes = field_derivatives(model, opd, values, names)
-    if fields is None:
-        with torch.no_grad():
-            fields = model.fields(opd, **values)
-    return image_derivatives(model, fields, values, names, slopes)

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
 from pyklip_diffrender.linear.response import (
     WavefrontResponse,
     coarse_copy,
     coarse_npix,
     downsample,
-    parameter_jacobian,
 )
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem

@@ -22,8 +22,8 @@ __all__ = ["adam"]
 def adam(problem: Problem, settings: Adam, *, seed: int, progress: bool) -> Refinement:
     """Refine the OPD pixels with Adam on the mean absolute error; return the best iterate.
 
-    Star offset and alignment are held at their starting values; flux and background are those
-    given, or the least-squares fit of the starting star.
+    Star offset and alignment keep their starting values, and so do flux and background if `start`
+    has them; otherwise these are fitted to the starting star by least squares.
     """
     began = time.perf_counter()
     values = problem.optical_start(())

@@ -1,9 +1,9 @@
-"""The schedule of a fit: alignment first, then the wavefront, while the model error shrinks.
+"""Schedule of a fit: alignment first, then the wavefront, with a decreasing model error.
 
-Far from the data, in units of photon noise, undamped steps diverge: the star is bright and its
-noise small. So the noise is taken as sqrt(sigma^2 + (kappa star)^2). The fraction kappa of the
-star that the model is allowed to miss starts as large as the first residual demands, and shrinks
-to nothing, or to what the model cannot explain.
+The star is bright, so that the first residuals are many times larger than the photon noise, and
+undamped steps would diverge. Therefore the noise is taken as sqrt(sigma^2 + (kappa star)^2). The
+model error kappa, a fraction of the star, begins at the value for which chi-squared per pixel is 1
+and decreases to 0, or to the value that the final residual requires.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 from tqdm import tqdm
 
 from pyklip_diffrender.linear.model import Unknown
-from pyklip_diffrender.refinement.companions import standing_out
+from pyklip_diffrender.refinement.companions import bright_companions
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.gauss_newton import Solver, count_modes_below
 from pyklip_diffrender.refinement.objective import State
@@ -33,37 +33,37 @@ __all__ = ["Annealing"]
 _log = logging.getLogger(__name__)
 
 _EXPLAINED = 1.5
-"""Chi-squared per pixel below which the noise is taken to explain the residual."""
+"""Chi-squared per pixel below which the noise explains the residual."""
 
 _NEGLIGIBLE = 1e-3
 """Model error, as a fraction of the star, below which annealing ends."""
 
 _COARSE = 0.01
-"""Model error, as a fraction of the star, above which modes to `_FEW_CYCLES` do as well as all."""
+"""Model error above which modes up to `_FEW_CYCLES` are sufficient."""
 
 _FEW_CYCLES = 14.0
 
 _NEAR = 0.003
-"""Model error below which a companion that a fit finds has bent the wavefront but little.
+"""Model error below which a new companion has hardly biased the wavefront.
 
-Planets of 5e-7 to 2e-6 were found at 0.001 to 0.0026; side lobes of one of 1e-4 at 0.3 arcsec, in
-its place, at 0.005 to 0.1.
+Planets of contrast 5e-7 to 2e-6 were found at a model error of 0.001 to 0.0026. Side lobes of a
+planet of contrast 1e-4 at 0.3 arcsec were mistaken for planets at 0.005 to 0.1.
 """
 
 _BRIGHT = 8.0
-"""How far a companion must stand out, in units of the scatter, when the wavefront's fit stalls.
+"""S/N of a companion, in units of the scatter, that is added when the fit of the wavefront stalls.
 
-Without companions, peaks reached 6 (drifts of 40 to 400 h); companions that stalled a fit, 12.
+Without companions, peaks reached 6 (drifts of 40 to 400 h); companions that stalled a fit had 12.
 """
 
 _MOST_BRIGHT = 8
 """Largest number of companions that a fit may add in this way."""
 
 _ALIGNED = 0.05
-"""Gain in chi-squared per pixel below which the alignment is good enough for the wavefront."""
+"""Gain in chi-squared per pixel below which the wavefront is fitted as well."""
 
 _ANNEALING = 0.6
-"""Factor by which kappa shrinks at least from step to step."""
+"""Largest ratio of kappa in successive steps."""
 
 
 class Annealing:
@@ -76,7 +76,7 @@ class Annealing:
     settings : GaussNewton
     basis : Basis
     warm : mapping of Unknown to float, optional
-        Where an earlier fit ended. The wavefront is then free from the first step on.
+        Final values of an earlier fit. The wavefront is then free from the first step.
     progress : bool
         Show progress bars.
     """
@@ -93,7 +93,7 @@ class Annealing:
         self.problems = list(problems)
         self.solver = Solver(problems, settings, basis, progress)
         self.objective = self.solver.objective
-        self._few = count_modes_below(basis, _FEW_CYCLES)
+        self._few_modes = count_modes_below(basis, _FEW_CYCLES)
         layout = self.solver.first_layout()
         self._begin = self.objective.at(
             layout, layout.initial() if warm is None else layout.warm(warm)
@@ -114,37 +114,37 @@ class Annealing:
             modes = self._modes_for(kappa)
         status = Status.ITERATION_LIMIT
         bar = tqdm(total=settings.max_iterations, desc="refine", disable=not self.progress)
-        left = settings.max_iterations
-        while left:
-            left -= 1
+        remaining = settings.max_iterations
+        while remaining:
+            remaining -= 1
             state, gain = solver.step(state, kappa, modes)
-            needed, chi2 = self.objective.model_error(state), self.objective.chi2_per_pixel(state)
-            if (needed, chi2) < best_error:
-                best, best_error = state, (needed, chi2)
-            self._record(kappa, modes, chi2, needed, gain)
+            error, chi2 = self.objective.model_error(state), self.objective.chi2_per_pixel(state)
+            if (error, chi2) < best_error:
+                best, best_error = state, (error, chi2)
+            self._record(kappa, modes, chi2, error, gain)
             bar.update()
             bar.set_postfix(chi2=f"{chi2:.3g}", kappa=f"{kappa:.2g}")
             settled = gain < settings.tolerance
             if not modes:
-                kappa = max(floor, min(kappa, needed))
-                bright = self._standing_out(state, kappa) if gain < _ALIGNED else []
+                kappa = max(floor, min(kappa, error))
+                bright = self._new_companions(state, kappa, False) if gain < _ALIGNED else []
                 if bright:
                     state = self._with_companions(state, bright)
                 elif gain < _ALIGNED and settings.wavefront:
-                    # What the alignment alone could not follow says nothing about later steps.
+                    # Damping of the alignment is no guide to that of the wavefront.
                     aligned, modes, solver.damping = state, self._modes_for(kappa), 0.0
                 elif settled:
                     status = _status_of(chi2)
                     break
                 continue
-            stalled = needed > max(kappa, _NEGLIGIBLE)
-            bright = self._stalling(state, needed) if stalled else []
+            stalled = error > max(kappa, _NEGLIGIBLE)
+            bright = self._new_companions(state, error, True) if stalled else []
             if bright:
-                # Near the solution all is linear, and the wavefront gives back what it took.
-                # Where it has bent too far for that, the fit starts again from the alignment.
-                near = needed < _NEAR
+                # Near the solution the model is linear, so that further steps remove the bias of
+                # the wavefront. Otherwise the fit starts again from the alignment.
+                near = error < _NEAR
                 best = state = self._with_companions(state if near else aligned, bright)
-                best_error, left = (math.inf, math.inf), settings.max_iterations
+                best_error, remaining = (math.inf, math.inf), settings.max_iterations
                 bar.reset()
                 if not near:
                     solver.scales, solver.damping, modes = first_scales, 0.0, 0
@@ -153,7 +153,7 @@ class Annealing:
             if settled and kappa <= floor and modes == len(self.basis):
                 status = _status_of(chi2)
                 break
-            kappa = min(_ANNEALING * kappa, needed / 2)
+            kappa = min(_ANNEALING * kappa, error / 2)
             if kappa < max(_NEGLIGIBLE, floor):
                 kappa = floor
             modes = self._modes_for(kappa)
@@ -162,13 +162,13 @@ class Annealing:
             status = Status.DIVERGED
         return self._conclude(best, status, seed, time.perf_counter() - began)
 
-    def _record(self, kappa: float, modes: int, chi2: float, needed: float, gain: float) -> None:
+    def _record(self, kappa: float, modes: int, chi2: float, error: float, gain: float) -> None:
         record = {
             "iteration": len(self.history),
             "wavefront": modes > 0,
             "kappa": kappa,
             "chi2_per_pixel": chi2,
-            "model_error": needed,
+            "model_error": error,
             "gain": gain,
             "damping": self.solver.damping,
         }
@@ -176,39 +176,29 @@ class Annealing:
         _log.info("%s, scales %s", record, self.solver.scales.tolist())
 
     def _modes_for(self, kappa: float) -> int:
-        """Count the modes worth fitting while the model may miss a fraction kappa of the star."""
+        """Number of leading modes to fit while the model error is kappa."""
         several = len(self.problems) > 1
         amplitude = len(self.solver.amplitude_deviation) > 0
         everything = self.settings.min_model_error > 0 or amplitude or several
-        return len(self.basis) if everything or kappa <= _COARSE else self._few
+        return len(self.basis) if everything or kappa <= _COARSE else self._few_modes
 
-    def _standing_out(self, state: State, kappa: float) -> list[Planet]:
-        """Companions that stand out of the residual of the alignment fit."""
-        known = len(state.joint.frames[0].companions)
-        return standing_out(
-            self.objective,
-            state,
-            kappa,
-            most=self.settings.max_companions - known,
-            threshold=self.settings.companion_threshold,
-        )
-
-    def _stalling(self, state: State, kappa: float) -> list[Planet]:
-        """The companion that keeps the wavefront's fit from converging, if there is one."""
-        known = len(state.joint.frames[0].companions)
-        if self.settings.min_model_error > 0:
-            return []  # The model error that is allowed for may be all that stands out.
-        if known >= self.settings.max_companions + _MOST_BRIGHT:
-            return []
-        # One at a time: the side lobes of a bright one stand out as well.
-        return standing_out(self.objective, state, kappa, most=1, threshold=_BRIGHT)
+    def _new_companions(self, state: State, kappa: float, stalled: bool) -> list[Planet]:
+        """Companions in the residual of the alignment, or of a wavefront fit that stalled."""
+        room = self.settings.max_companions - len(state.joint.frames[0].companions)
+        threshold = self.settings.companion_threshold
+        if stalled:
+            if self.settings.min_model_error > 0:
+                return []  # Peaks may be due to the assumed model error.
+            # One at a time, because the side lobes of a bright companion are peaks as well.
+            room, threshold = min(1, room + _MOST_BRIGHT), _BRIGHT
+        return bright_companions(self.objective, state, kappa, most=room, threshold=threshold)
 
     def _with_companions(self, state: State, added: Sequence[Planet]) -> State:
         _log.info("companions given parameters of their own: %s", added)
         return self.objective.at(*state.joint.with_companions(added, state.vector))
 
     def _conclude(self, state: State, status: Status, seed: int, seconds: float) -> Refinement:
-        """Errors at the end, and the result in the form that users see."""
+        """Compute errors and make the result."""
         chi2 = self.objective.chi2_per_pixel(state)
         kappa = 0.0 if chi2 < _EXPLAINED else self.objective.model_error(state)
         modes = len(self.basis) if self.settings.wavefront else 0
@@ -267,5 +257,5 @@ class Annealing:
 
 
 def _status_of(chi2: float) -> Status:
-    """How a fit that has settled ended."""
+    """Status of a fit that has converged."""
     return Status.CONVERGED if chi2 < _EXPLAINED else Status.MODEL_MISMATCH

@@ -1,4 +1,4 @@
-"""Fits that go on from one another: with more modes, or with other settings."""
+"""Fits that continue earlier ones, with more modes or with other settings."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["continued", "fit_with_growing_basis", "warm_start"]
+__all__ = ["continue_from", "fit_with_growing_basis"]
 
 _log = logging.getLogger(__name__)
 
 _STRUCTURE = 1.15
-"""Reduced chi-squared above which more modes are tried."""
+"""Reduced chi-squared above which a fit is repeated with more modes."""
 
 _FOREIGN = 5.0
-"""Reduced chi-squared above which modes are not what is missing: something else is in the frame."""
+"""Reduced chi-squared above which more modes would not help, because the frame shows more than the
+star."""
 
 
-def warm_start(fit: Refinement) -> dict[Unknown, float]:
-    """Return where a fit ended, by unknown."""
-    assert fit.linear is not None
-    return dict(zip(fit.linear.unknowns, fit.linear.vector.tolist(), strict=True))
+def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Unknown, float]]:
+    """Return the settings and the starting values with which to continue a fit.
 
-
-def continued(fit: Refinement, **changes: Any) -> GaussNewton:
-    """Return the settings with which to go on from a fit.
-
-    The prior has the scales that the fit ended with, the companions are those that it found, and
-    the basis is as fine as the fit's, or finer.
+    The prior has the final scales of the fit, and the companions are those of the fit.
 
     Parameters
     ----------
     fit : Refinement
     **changes
         Fields of `GaussNewton` with other values.
+
+    Returns
+    -------
+    settings : GaussNewton
+    warm : dict of Unknown to float
+        Final values of the unknowns.
 
     Raises
     ------
@@ -60,11 +60,12 @@ def continued(fit: Refinement, **changes: Any) -> GaussNewton:
         "drift": settings.drift and _with_scales(settings.drift, fit.scales, "{} drift"),
         "companions": fit.planets,
     }
-    return replace(settings, **{**reached, **changes})
+    warm = dict(zip(fit.linear.unknowns, fit.linear.vector.tolist(), strict=True))
+    return replace(settings, **{**reached, **changes}), warm
 
 
 def _with_scales(prior: WavefrontPrior, scales: Mapping[str, float], label: str) -> WavefrontPrior:
-    """The prior with the scales of a fit; groups that its basis lacks keep their own."""
+    """Replace the scales of a prior by those of a fit; other groups keep theirs."""
     return replace(
         prior, scales={n: scales.get(label.format(n), own) for n, own in prior.scales.items()}
     )
@@ -78,9 +79,9 @@ def fit_with_growing_basis(
     seed: int,
     progress: bool,
 ) -> Refinement:
-    """Refine with the settings' basis, or with the first default basis that explains the data.
+    """Refine with the basis of the settings, or the first default basis that explains the data.
 
-    The settings of the result start with the basis that it ended with.
+    The `cycles` of the result's settings begin with those of the last basis.
 
     Parameters
     ----------
@@ -88,7 +89,7 @@ def fit_with_growing_basis(
         One for each frame.
     settings : GaussNewton
     warm : mapping of Unknown to float, optional
-        Where to start.
+        Starting values.
     seed : int
         Recorded with the result.
     progress : bool
@@ -97,15 +98,16 @@ def fit_with_growing_basis(
     if settings.basis is not None or not settings.cycles:
         basis = settings.basis or default_basis()
         return Annealing(problems, settings, basis, warm, progress).run(seed)
-    # A model error that is allowed for may be what is left, and drifts have no room to grow.
+    # With an assumed model error the residual need not be missing modes. The number of modes that
+    # drift is fixed.
     grows = settings.wavefront and settings.min_model_error == 0 and settings.drift is None
     tried = settings.cycles if grows else settings.cycles[:1]
     fit: Refinement | None = None
     for k, cycles in enumerate(tried):
         chosen = replace(settings, cycles=settings.cycles[k:])
         if fit is not None:
-            _log.info("structure is left: modes up to %g cycles per pupil", cycles)
-            chosen, warm = continued(fit, cycles=settings.cycles[k:]), warm_start(fit)
+            _log.info("residuals have structure: adding modes up to %g cycles per pupil", cycles)
+            chosen, warm = continue_from(fit, cycles=settings.cycles[k:])
         earlier = fit
         fit = Annealing(problems, chosen, default_basis(cycles), warm, progress).run(seed)
         if earlier is not None:

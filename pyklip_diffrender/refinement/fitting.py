@@ -1,4 +1,4 @@
-"""`refine`: from frames and a wavefront map to the star in the frames."""
+"""`refine`: fit the star in observed frames, starting from a wavefront map."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import Plan
 from pyklip_diffrender.refinement.adam import adam
-from pyklip_diffrender.refinement.planned import fit_problems, make_plan, require_plan_for
+from pyklip_diffrender.refinement.planned import choose_plan, fit_problems
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
@@ -61,16 +61,16 @@ def refine(
         Default `GaussNewton.nircam()` for frames whose header says NIRCam, else `GaussNewton()`.
     start : dict or sequence of dict, optional
         Starting values by parameter name, for all observations or one by one. "detector_shift"
-        follows from the observation's star position unless it is given.
+        is by default that of the star in the observation.
     systematics : Systematics, optional
-        What is known of the model's error, see `learn_systematics`.
+        Known pattern of the model's error, see `learn_systematics`.
     plan : "auto", "off" or Plan
-        "auto" first finds out, with `pyklip_diffrender.plan`, what can be made cheaper without a
-        visible error; a plan that was made before is used as it is; "off" fits with the model as
-        given. Either way the result is on the model as given. A basis of the settings' own, or
-        none, and a free pupil amplitude (as in the preset for real frames) switch "auto" off.
+        "auto" first determines, with `pyklip_diffrender.plan`, how much cheaper the model can be
+        without a visible error. "off" fits with `model` itself. The result always refers to
+        `model`. "auto" has no effect if the settings have a basis, no wavefront, or a free pupil
+        amplitude (as in the preset for real frames).
     seed : int
-        Of the wavefronts that a plan draws; the fit itself is deterministic.
+        Seed of the wavefronts that a plan draws; the fit itself is deterministic.
     progress : bool
         Show progress bars.
 
@@ -140,25 +140,8 @@ def refine(
                 "systematics: the Adam recipe has no place for them; use GaussNewton"
             )
         return adam(problems[0], chosen, seed=seed, progress=progress)
-    planned = _plan(plan, problems, chosen, seed)
+    planned = choose_plan(plan, problems, chosen, seed)
     return fit_problems(problems, chosen, planned, seed=seed, progress=progress)
-
-
-def _plan(
-    plan: Plan | str, problems: Sequence[Problem], settings: GaussNewton, seed: int
-) -> Plan | None:
-    """The plan to follow; None for the model as given."""
-    if isinstance(plan, Plan):
-        require_plan_for(problems[0].model, plan)
-        return plan
-    if plan not in ("auto", "off"):
-        raise IncompatibleSetupError(f"plan: got {plan!r}, expected 'auto', 'off' or a Plan")
-    # A basis of their own, or none, says how fine a fit is meant to be; the preset for real frames,
-    # with the pupil's amplitude free, is as coarse as it can be already.
-    decided = settings.basis is not None or not settings.wavefront
-    if plan == "off" or decided or settings.prior.amplitude_scale > 0:
-        return None
-    return make_plan(problems, settings, seed)
 
 
 def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start]:
@@ -173,7 +156,7 @@ def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start
 
 
 def _with_position(model: OpticalSystem, observation: Observation, start: Start) -> dict[str, Any]:
-    """Starting values, with the star's position on the detector if the observation has one."""
+    """Add the position of the star, if the observation has one, to the starting values."""
     if observation.star_offset is not None and "star_offset" in model.parameters:
         start = {"star_offset": observation.star_offset, **start}
     ny, nx = observation.shape

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
 from pyklip_diffrender.linear.response import (
     NANOMETRE,
     Responses,
     WavefrontResponse,
     coarse_copy,
     downsample,
-    parameter_jacobian,
 )
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem

@@ -28,7 +28,7 @@ class FrameFit:
     ----------
     model : OpticalSystem
     observation : Observation
-        As it was given; several frames of one observation are averaged for the fit.
+        The observation; its frames are averaged for the fit.
     start : dict
         Starting values of parameters, by name.
     opd : ndarray, (npix, npix)
@@ -37,12 +37,12 @@ class FrameFit:
     star : ndarray, (ny, nx)
         The star and the background, in the unit of the observation.
     companion_image : ndarray, (ny, nx)
-        Light of the companions that had parameters of their own; not part of `star`.
+        Light of the companions that were part of the fit; not part of `star`.
     values, errors : dict of str to ndarray
         Every parameter but the wavefront and its standard deviation (NaN where it was not
         fitted), in the units of the parameter table.
     gain : ndarray, (ny, nx)
-        Known pattern of the model's error by which the star is multiplied; 1 without systematics.
+        Known pattern of the model's error, which multiplies the star; 1 without systematics.
     coefficients : ndarray or None
         Coefficients of the wavefront modes, nm.
     """
@@ -70,8 +70,8 @@ class FrameFit:
     def residual(self) -> Image:
         """Data minus star, (frames, ny, nx); NaN where the data are masked.
 
-        Some of the light of sources that were not part of the fit has been taken for the star's
-        and is lost here; `Detection.subtracted` keeps it.
+        The fit attributes some of the light of other sources to the star, so that it is missing
+        here; `Detection.subtracted` retains it.
         """
         data = self.observation.data - self.star
         return np.where(self.observation.valid, data, np.nan)
@@ -97,7 +97,7 @@ class FrameFit:
         Parameters
         ----------
         fov_pixels : int or (ny, nx), optional
-            Default as fitted.
+            Default the shape of the observation.
         center : (x, y), optional
             Pixel of the new array on which the observation's `center` falls. Default the middle
             of the array.
@@ -125,7 +125,7 @@ class FrameFit:
         return np.asarray(self.flux * image + level)
 
     def to_hdus(self, k: int) -> tuple[dict[str, Any], list[Any]]:
-        """Facts and FITS extensions of the frame, with EXTVER k + 1."""
+        """Return metadata and FITS extensions of the frame, with EXTVER k + 1."""
         observation, hdus = observation_hdus(self.observation, k)
         unit = observation["unit"]
         arrays = {
@@ -152,7 +152,7 @@ class FrameFit:
     def from_hdus(
         cls, hdus: fits.HDUList, facts: dict[str, Any], model: OpticalSystem, k: int
     ) -> FrameFit:
-        """Make the frame from what `to_hdus` returned."""
+        """Make a frame from the metadata and extensions of `to_hdus`."""
         opd: NDArray[Any] = image(hdus, "OPD", k)
         if ("ABSORPTION", k + 1) in hdus:
             opd = opd + 1j * image(hdus, "ABSORPTION", k)

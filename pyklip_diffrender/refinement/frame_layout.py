@@ -1,4 +1,4 @@
-"""Layout of the unknowns of one frame: where each parameter is, and its prior."""
+"""Layout of the unknowns of one frame: indices, starting values and priors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["COMPANION_PRIOR", "FrameLayout"]
 _LINEAR = tuple(p.name for p in FLUX_AND_BACKGROUND)
 
 COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
-"""Prior deviation of a companion's contrast and of its x and y (arcsec) about the start."""
+"""Prior standard deviations of a companion's contrast, x and y (arcsec) about its start."""
 
 
 @dataclass
@@ -39,13 +39,13 @@ class FrameLayout:
     amplitude_modes : int
         Amplitude modes of the pupil.
     companions : list of Planet
-        Where companions start.
+        Starting values of companions.
     roll : float
         Degrees by which the sky is turned, counter-clockwise, relative to the first frame.
     shows_companions : bool
         False for a reference star.
     deviations : mapping of str to float
-        Prior deviations that differ from the parameter table's.
+        Prior standard deviations that replace those of the parameter table.
     """
 
     names: tuple[str, ...]
@@ -73,18 +73,12 @@ class FrameLayout:
         return (*self.optical, *self.linear)
 
     def where(self, name: str) -> slice:
-        """Place of a named parameter, of "companions", "amplitude" or "modes"."""
+        """Place of a parameter, or of "companions", "amplitude" or "modes"."""
+        sizes = {each: parameter(each).size for each in self.ordered}
+        sizes["companions"] = 3 * len(self.companions)
+        sizes["amplitude"], sizes["modes"] = self.amplitude_modes, self.modes
         begin = 0
-        for each in self.ordered:
-            size = parameter(each).size
-            if each == name:
-                return slice(begin, begin + size)
-            begin += size
-        for each, size in (
-            ("companions", 3 * len(self.companions)),
-            ("amplitude", self.amplitude_modes),
-            ("modes", self.modes),
-        ):
+        for each, size in sizes.items():
             if each == name:
                 return slice(begin, begin + size)
             begin += size
@@ -112,7 +106,7 @@ class FrameLayout:
         return float(value[0])
 
     def sources(self, vector: Tensor) -> Tensor:
-        """Companions, (companions, 3), as the first frame has them."""
+        """Contrast, x and y of companions in the first frame, (companions, 3)."""
         return vector[self.where("companions")].reshape(-1, 3)
 
     @property
@@ -122,7 +116,7 @@ class FrameLayout:
         return torch.tensor([[cosine, -sine], [sine, cosine]], dtype=torch.float64)
 
     def prior_deviation(self) -> Tensor:
-        """Prior deviations of everything before the amplitude and the modes."""
+        """Prior standard deviations of all unknowns before the amplitude and the modes."""
         named = [
             torch.full(
                 (parameter(name).size,),
@@ -135,5 +129,5 @@ class FrameLayout:
         return torch.cat([*named, planets])
 
     def with_companions(self, added: Sequence[Planet]) -> FrameLayout:
-        """A layout with more companions."""
+        """Return a layout with more companions."""
         return replace(self, companions=[*self.companions, *added])

@@ -1,12 +1,13 @@
 """Damped Gauss-Newton steps on the unknowns of a fit.
 
-One step solves the linearised problem with Gaussian priors; where the penalised chi-squared does
-not fall, it is tried again with Levenberg-Marquardt damping. The schedule of a whole fit, which
-alternates such steps with a shrinking model error, is in `annealing`.
+One step solves the linearised problem with Gaussian priors. If it does not lower the penalised
+chi-squared, it is repeated with Levenberg-Marquardt damping. The schedule of a fit, with a model
+error that decreases from step to step, is in `annealing`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -28,10 +29,10 @@ from pyklip_diffrender.wavefront.priors import EvidenceUpdate, scale_ratios, sol
 __all__ = ["Solver", "count_modes_below"]
 
 _TRIES = 7
-"""How often a step is tried again with more damping."""
+"""Largest number of attempts at a step, with increasing damping."""
 
 _IMPROBABLE = 1.5
-"""Ratio of the scale that modes have to the scale held, above which the prior is wrong."""
+"""Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
 
 
 def count_modes_below(basis: Basis, cycles: float) -> int:
@@ -55,9 +56,9 @@ class Solver:
     Attributes
     ----------
     scales : Tensor, (groups,)
-        The prior's scales, nm: fitted as steps are taken, unless they are held.
+        The prior's scales, nm, updated in every step unless they are fixed.
     damping : float
-        Of the next step.
+        Levenberg-Marquardt damping of the next step.
 
     Raises
     ------
@@ -132,7 +133,7 @@ class Solver:
             not problem.observation.reference,
         )
         image = forward.at(layout, layout.initial()).image
-        # Photon-noise weights before the star is known would trust the faint pixels only.
+        # With photon-noise weights the faint pixels would dominate this first estimate.
         flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
         deviations = dict(self.settings.deviations)
         known = "flux" in deviations
@@ -164,17 +165,17 @@ class Solver:
         kappa : float
             Assumed error of the star model, as a fraction of the star.
         modes : int
-            Wavefront modes that are free, from the first one on; 0 for alignment only.
+            Number of leading wavefront modes that are free; 0 for alignment only.
 
         Returns
         -------
         state : State
-            The same one if no step lowers the penalised chi-squared.
+            The same state if no step lowers the penalised chi-squared.
         gain : float
-            By how much the penalised chi-squared per pixel fell, or would have fallen.
+            Decrease, or expected decrease, of the penalised chi-squared per pixel.
         """
         layout, objective = state.joint, self.objective
-        equations = self._equations = linearise(objective, state, kappa, modes)
+        equations = self._equations = linearise(objective, state, kappa, modes, objective.robust)
         sigmas = [objective.sigma(k, point, kappa) for k, point in enumerate(state.points)]
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else self.damping
@@ -182,7 +183,7 @@ class Solver:
         self.scales = update.scales
         expected = self._predicted_gain(layout, equations, update.step)
         if expected < self.settings.tolerance * objective.pixels:
-            # Not worth a step, after which everything would have to be linearised again.
+            # The gain is not worth another linearisation.
             return state, expected / objective.pixels
         before = self._cost(state, sigmas)
         for _ in range(_TRIES):
@@ -203,16 +204,21 @@ class Solver:
     def linear_model(
         self, state: State, kappa: float, modes: int
     ) -> tuple[LinearModel, EvidenceUpdate]:
-        """Linear model about a state, with the errors of all unknowns."""
+        """Return the linear model about a state and the errors of all unknowns.
+
+        Without a model error, pixels have their full weights: robust ones take a source that is not
+        in the model for an outlier, and a tenth of the light of one of S/N 7 with it.
+        """
         layout, equations = state.joint, self._equations
+        robust = self.objective.robust if kappa else math.inf
         count = layout.unknowns_with(modes)
         if (
             equations is None
             or equations.state is not state
-            or equations.kappa != kappa
+            or (equations.kappa, equations.robust) != (kappa, robust)
             or len(equations.current) != count
         ):
-            equations = linearise(self.objective, state, kappa, modes)
+            equations = linearise(self.objective, state, kappa, modes, robust)
         update = self._solve(layout, equations, errors=True)
         linear = LinearModel(
             unknowns=layout.unknowns()[:count],
@@ -225,7 +231,7 @@ class Solver:
         return linear, update
 
     def prior_holds(self, update: EvidenceUpdate) -> bool:
-        """Whether modes are about as large as a prior whose scales were held says."""
+        """Whether the fitted modes are probable under a prior with fixed scales."""
         settings = self.settings
         if settings.prior.fit_scales or not settings.wavefront or update.variance is None:
             return True
@@ -243,13 +249,13 @@ class Solver:
         fit_scales: bool = False,
         errors: bool = False,
     ) -> EvidenceUpdate:
-        """Most probable unknowns of the linearised model, as distances from their starts."""
+        """Most probable unknowns of the linearised model, minus their starting values."""
         curvature = equations.curvature
         modes = max(0, len(curvature) - layout.where("modes").start)
         fixed = layout.prior_deviation()
         if modes:
             fixed = torch.cat([fixed, self.amplitude_deviation])
-        # Columns differ by many powers of ten (flux against nm): solve in their own units.
+        # Unknowns differ by many powers of ten, so the system is solved in scaled units.
         own = torch.ones(len(curvature), dtype=torch.float64)
         own[: len(fixed)] = curvature.diagonal()[: len(fixed)].clamp(min=1e-300) ** -0.5
         update = solve_with_evidence(
@@ -267,14 +273,14 @@ class Solver:
         return update.in_units(own)
 
     def _cost(self, state: State, sigmas: Sequence[Tensor]) -> float:
-        """Penalised chi-squared, which every step must lower."""
+        """Penalised chi-squared."""
         away = (state.vector - state.joint.initial()) / self.prior_deviation(state.joint)
         return self.objective.loss(state, sigmas) + float((away**2).sum())
 
     def _predicted_gain(
         self, layout: JointLayout, equations: NormalEquations, step: Tensor
     ) -> float:
-        """By how much the penalised chi-squared would fall if the model were linear."""
+        """Decrease of the penalised chi-squared if the model were linear."""
         precision = self.prior_deviation(layout)[: len(step)] ** -2
         curvature, current = equations.curvature, equations.current
 
@@ -284,7 +290,7 @@ class Solver:
         return max(quadratic(current) - quadratic(step), 1e-12)
 
     def _relax(self, ratio: float) -> None:
-        """Adapt the damping to how much of the predicted gain a step brought."""
+        """Adapt the damping to the ratio of actual to predicted gain."""
         if ratio > 0.7:
             self.damping = self.damping / 4 if self.damping > 1e-3 else 0.0
         elif ratio < 0.3:

@@ -1,4 +1,4 @@
-"""Layout of the joint unknowns of several frames: which are shared, which are a frame's own."""
+"""Layout of the joint unknowns of several frames, some shared and some different in each frame."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ __all__ = ["JointLayout"]
 class JointLayout:
     """Layout of the joint vector.
 
-    First what each frame has of its own, frame by frame; then what all share, in the order of
-    `FrameLayout`, wavefront modes last; then how each frame's first modes differ from those.
+    First are the unknowns that differ between frames, frame by frame. Then come the shared ones in
+    the order of `FrameLayout`, with the wavefront modes last. At the end are the differences of
+    the leading modes of each frame from the shared modes.
 
     Attributes
     ----------
     frames : tuple of FrameLayout
-        Alike but for where they start.
+        They differ only in their starting values.
     own : tuple of str
-        Names of which every frame has its own value.
+        Names of the parameters that differ between frames.
     drift : int
-        How many modes, the first of the basis, may differ between frames.
+        Number of leading modes that may differ between frames.
     """
 
     frames: tuple[FrameLayout, ...]
@@ -51,7 +52,7 @@ class JointLayout:
         return where.stop - where.start
 
     def _begin(self, name: str) -> int:
-        """Place of a shared entry."""
+        """First index of a shared parameter."""
         begin = len(self.frames) * sum(self._size(own) for own in self._own)
         for each in self._shared:
             if each == name:
@@ -60,7 +61,7 @@ class JointLayout:
         raise KeyError(name)
 
     def where(self, name: str) -> slice:
-        """Place of what is shared under a name, or of "drift"."""
+        """Place of a shared parameter, or of "drift"."""
         if name == "drift":
             begin = self._begin("modes") + self._size("modes")
             return slice(begin, begin + len(self.frames) * self.drift)
@@ -73,14 +74,14 @@ class JointLayout:
         return self.where("drift").stop
 
     def unknowns_with(self, modes: int) -> int:
-        """How many unknowns there are when only the first modes are free, or none (0)."""
+        """Number of unknowns if only the first `modes` modes are free; 0 for the alignment only."""
         if modes == 0:
             return self.where("companions").stop
         every = self.where("modes")
         return self.size if modes == every.stop - every.start else every.start + modes
 
     def rows(self, frame: int) -> Tensor:
-        """For every entry of a frame's vector its place in the joint one, (entries,), int64."""
+        """Indices in the joint vector of the entries of a frame's vector, (entries,), int64."""
         unknowns = self.frames[frame]
         rows = torch.empty(unknowns.where("modes").stop, dtype=torch.int64)
         begin = frame * sum(self._size(own) for own in self._own)
@@ -88,24 +89,24 @@ class JointLayout:
             rows[unknowns.where(name)] = torch.arange(begin, begin + self._size(name))
             begin += self._size(name)
         for name in self._shared:
-            there = self.where(name)
-            rows[unknowns.where(name)] = torch.arange(there.start, there.stop)
+            place = self.where(name)
+            rows[unknowns.where(name)] = torch.arange(place.start, place.stop)
         return rows
 
     def drift_rows(self, frame: int) -> Tensor:
-        """Places of a frame's own part of its first modes, (drift,), int64."""
+        """Indices of the differences of a frame's modes from the shared ones, (drift,), int64."""
         begin = self.where("drift").start + frame * self.drift
         return torch.arange(begin, begin + self.drift)
 
     def of_frame(self, frame: int, vector: Tensor) -> Tensor:
-        """A frame's vector from the joint one."""
+        """Return the vector of a frame."""
         values = vector[self.rows(frame)]
         first = self.frames[frame].where("modes").start
         values[first : first + self.drift] += vector[self.drift_rows(frame)]
         return values
 
     def joined(self, vectors: Sequence[Tensor]) -> Tensor:
-        """The joint vector of frames that agree on what they share (the first one decides)."""
+        """Return the joint vector; shared parameters are those of the first frame."""
         joint = torch.zeros(self.size, dtype=torch.float64)
         for frame in reversed(range(len(self.frames))):
             joint[self.rows(frame)] = vectors[frame]
@@ -116,14 +117,14 @@ class JointLayout:
         return self.joined([unknowns.initial() for unknowns in self.frames])
 
     def warm(self, values: Mapping[Unknown, float]) -> Tensor:
-        """The starting vector with what an earlier fit found.
+        """Return the starting vector with the final values of an earlier fit.
 
         Parameters
         ----------
         values : mapping of Unknown to float
-            Unknowns that are not part of this layout are ignored, those that it lacks keep their
-            starting values: the basis may have more or fewer modes than the earlier one, as long
-            as both begin with the same. Companions always start where the layout says.
+            Unknowns that are not part of this layout are ignored, and missing ones keep their
+            starting values. The bases may differ in length if they begin with the same modes.
+            Companions keep the starting values of the layout.
         """
         vector = self.initial()
         for place, unknown in enumerate(self.unknowns()):
@@ -132,7 +133,7 @@ class JointLayout:
         return vector
 
     def prior_deviation(self) -> Tensor:
-        """Prior deviations of everything before the amplitude and the modes."""
+        """Prior standard deviations of all unknowns before the amplitude and the modes."""
         joint = torch.empty(self.where("amplitude").start, dtype=torch.float64)
         for frame, layout in reversed(list(enumerate(self.frames))):
             own = layout.prior_deviation()
@@ -140,7 +141,7 @@ class JointLayout:
         return joint
 
     def clamped(self, vector: Tensor) -> Tensor:
-        """The vector with every parameter inside its bounds."""
+        """Clip every parameter to its bounds."""
         vector = vector.clone()
         for frame, unknowns in enumerate(self.frames):
             rows = self.rows(frame)
@@ -152,7 +153,7 @@ class JointLayout:
     def with_companions(
         self, added: Sequence[Planet], vector: Tensor
     ) -> tuple[JointLayout, Tensor]:
-        """A layout with more companions, and the same point in it."""
+        """Return a layout with more companions, and the vector of the same state in it."""
         grown = replace(self, frames=tuple(u.with_companions(added) for u in self.frames))
         moved = grown.initial()
         before, after = self.where("companions").stop, grown.where("companions").stop

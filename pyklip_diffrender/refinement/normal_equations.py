@@ -17,23 +17,27 @@ __all__ = ["NormalEquations", "linearise"]
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """A state's normal equations, for the unknowns as distances from their starts.
+    """Normal equations of a state, for the unknowns minus their starting values.
 
     Attributes
     ----------
     state : State
     kappa : float
-    curvature : Tensor
-        G G^T.
-    gradient : Tensor
-        G r at the unknowns' starts.
-    current : Tensor
-        Where they are now.
+        Assumed error of the star model, as a fraction of the star.
+    robust : float
+        Residual, in standard deviations, of half weight; inf for least squares.
+    curvature : Tensor, (unknowns, unknowns)
+        G G^T, with the whitened Jacobian G.
+    gradient : Tensor, (unknowns,)
+        G r, with the residual r at the starting values.
+    current : Tensor, (unknowns,)
+        Unknowns of the state minus their starting values.
     frames : tuple of LinearFrame
     """
 
     state: State
     kappa: float
+    robust: float
     curvature: Tensor
     gradient: Tensor
     current: Tensor
@@ -41,7 +45,7 @@ class NormalEquations:
 
 
 _PIXELS = 1024
-"""Pixels whose whitened Jacobian is held in double precision at a time."""
+"""Number of pixels whose Jacobian is converted to double precision at a time."""
 
 
 def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -66,18 +70,22 @@ def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Ten
     return upper + upper.triu(1).T, gradient
 
 
-def linearise(objective: Objective, state: State, kappa: float, modes: int) -> NormalEquations:
-    """Normal equations about a state.
+def linearise(
+    objective: Objective, state: State, kappa: float, modes: int, robust: float
+) -> NormalEquations:
+    """Linearise all frames about a state.
 
     Parameters
     ----------
     objective : Objective
     state : State
     kappa : float
-        Share of the star that the model may miss.
+        Assumed error of the star model, as a fraction of the star.
     modes : int
-        How many of the wavefront's modes are free, the first ones: all, or fewer where frames do
-        not drift apart; 0 for none and no amplitude.
+        Number of leading wavefront modes that are free; all of them if the wavefront drifts
+        between frames, 0 for the alignment only.
+    robust : float
+        Residual, in standard deviations, of half weight; inf for least squares.
     """
     joint = state.joint
     size = joint.unknowns_with(modes)
@@ -86,7 +94,7 @@ def linearise(objective: Objective, state: State, kappa: float, modes: int) -> N
     gradient = torch.zeros(size, dtype=torch.float64)
     frames = []
     for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
-        residual, weight = objective.weighted(k, point, kappa)
+        residual, weight = objective.weighted(k, point, kappa, robust)
         rendered = forward.jacobian(point, modes)
         first = point.unknowns.where("modes").start
         rows = joint.rows(k)[: len(rendered)]
@@ -105,4 +113,4 @@ def linearise(objective: Objective, state: State, kappa: float, modes: int) -> N
             for onto, other in ((rows, slice(None)), (drift, own)):
                 curvature[to[:, None], onto] += product[which, other]
     gradient = gradient + curvature @ current
-    return NormalEquations(state, kappa, curvature, gradient, current, tuple(frames))
+    return NormalEquations(state, kappa, robust, curvature, gradient, current, tuple(frames))

@@ -15,16 +15,20 @@ from pyklip_diffrender.refinement.joint_layout import JointLayout
 __all__ = ["Objective", "State"]
 
 
+_MAX_KAPPA = 10.0
+"""Largest model error, as a fraction of the star."""
+
+
 @dataclass(frozen=True)
 class State:
-    """FrameLayout of all frames and what each frame renders.
+    """Values of all unknowns and the images that they render.
 
     Attributes
     ----------
     joint : JointLayout
     vector : Tensor, (joint unknowns,)
     points : tuple of Point
-        One a frame.
+        One for each frame.
     """
 
     joint: JointLayout
@@ -33,7 +37,7 @@ class State:
 
     @property
     def flux(self) -> float:
-        """Of the star in the first frame."""
+        """Flux of the star in the first frame."""
         return self.points[0].unknowns.level("flux", self.points[0].vector)
 
 
@@ -43,9 +47,9 @@ class Objective:
     Parameters
     ----------
     forwards : sequence of Forward
-        One a frame.
+        One for each frame.
     robust : float
-        Residuals of this many sigma count half (Cauchy's weights); inf for least squares.
+        Residuals of this many sigma have half the weight (Cauchy's loss); inf for least squares.
     """
 
     def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
@@ -62,11 +66,11 @@ class Objective:
         return State(joint, vector, points)
 
     def sigma(self, frame: int, point: Point, kappa: float) -> Tensor:
-        """Noise and, in quadrature, the fraction `kappa` of the star that the model may miss."""
+        """Noise and, in quadrature, a model error of the fraction `kappa` of the star."""
         return torch.sqrt(self.noise(frame, point) ** 2 + (kappa * point.total) ** 2)
 
     def noise(self, frame: int, point: Point) -> Tensor:
-        """Noise of the data and, in quadrature, the error of the known pattern."""
+        """Noise of the data and, in quadrature, the error of the systematics."""
         problem = self.forwards[frame].problem
         return torch.hypot(problem.sigma, problem.gain_error * point.light)
 
@@ -75,13 +79,15 @@ class Objective:
         problem = self.forwards[frame].problem
         return torch.where(problem.valid, (problem.data - point.total) / sigma, 0.0)
 
-    def weighted(self, frame: int, point: Point, kappa: float) -> tuple[Tensor, Tensor]:
-        """Residual and weight of every pixel, whitened and made robust; 0 where masked."""
+    def weighted(
+        self, frame: int, point: Point, kappa: float, robust: float
+    ) -> tuple[Tensor, Tensor]:
+        """Whitened residual and weight of every pixel, made robust; 0 where masked."""
         sigma = self.sigma(frame, point, kappa)
         residual = self.whitened(frame, point, sigma)
         weight = torch.where(self.forwards[frame].problem.valid, 1 / sigma, 0.0)
-        if math.isfinite(self.robust):
-            halving = torch.rsqrt(1 + (residual / self.robust) ** 2)
+        if math.isfinite(robust):
+            halving = torch.rsqrt(1 + (residual / robust) ** 2)
             residual, weight = residual * halving, weight * halving
         return residual, weight
 
@@ -94,7 +100,7 @@ class Objective:
         return total / self.pixels
 
     def model_error(self, state: State) -> float:
-        """The share kappa of the star that brings chi2 per pixel to 1; 0 if it is there."""
+        """The model error kappa at which chi-squared per pixel is 1, at least 0 and at most 10."""
         residuals, noises, stars = [], [], []
         for k, point in enumerate(state.points):
             problem = self.forwards[k].problem
@@ -105,15 +111,15 @@ class Objective:
         residual, noise, star = torch.cat(residuals), torch.cat(noises), torch.cat(stars)
         if float((residual / noise).mean()) <= 1:
             return 0.0
-        low, high = 0.0, 10.0
+        low, high = 0.0, _MAX_KAPPA
         for _ in range(50):
             middle = (low + high) / 2
-            excess = float((residual / (noise + middle**2 * star)).mean()) > 1
-            low, high = (middle, high) if excess else (low, middle)
+            too_small = float((residual / (noise + middle**2 * star)).mean()) > 1
+            low, high = (middle, high) if too_small else (low, middle)
         return high
 
     def loss(self, state: State, sigmas: Sequence[Tensor]) -> float:
-        """Chi2 of all frames for given deviations (Cauchy's loss where robust)."""
+        """Chi-squared of all frames for fixed standard deviations, or Cauchy's loss if robust."""
         total = 0.0
         for k, (point, sigma) in enumerate(zip(state.points, sigmas, strict=True)):
             squared = self.whitened(k, point, sigma) ** 2

@@ -1,4 +1,4 @@
-"""Refinement with a planned, cheaper model, whose result is put back onto the model as given."""
+"""Refinement with the cheaper model of a plan, and transfer of the result to the full model."""
 
 from __future__ import annotations
 
@@ -18,37 +18,55 @@ from pyklip_diffrender.linear.response import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import ModelError, Plan, plan
-from pyklip_diffrender.refinement.continuation import (
-    continued,
-    fit_with_growing_basis,
-    warm_start,
-)
+from pyklip_diffrender.refinement.continuation import continue_from, fit_with_growing_basis
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton
 
-__all__ = ["fit_problems", "make_plan", "refine_again", "require_plan_for"]
+__all__ = ["choose_plan", "fit_problems", "refine_again"]
 
 _log = logging.getLogger(__name__)
 
 
-def make_plan(problems: Sequence[Problem], settings: GaussNewton, seed: int) -> Plan:
-    """Plan the model fidelity of a fit; what the settings decide is left alone.
+def choose_plan(
+    requested: Plan | str, problems: Sequence[Problem], settings: GaussNewton, seed: int
+) -> Plan | None:
+    """Return the plan of a fit, or None to fit with the full model.
 
     Parameters
     ----------
+    requested : Plan, "auto" or "off"
     problems : sequence of Problem
-        To be fitted together. The plan is made for the first that is not of a reference star.
+        To be fitted together.
     settings : GaussNewton
     seed : int
-        Of the wavefronts that the plan draws.
+        Seed of the wavefronts that a plan draws.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For a plan that was made for another system.
     """
+    if isinstance(requested, Plan):
+        _require_plan_for(problems[0].model, requested)
+        return requested
+    if requested not in ("auto", "off"):
+        raise IncompatibleSetupError(f"plan: got {requested!r}, expected 'auto', 'off' or a Plan")
+    # A user who chooses the basis, or fits no wavefront, has decided how fine the model is to be.
+    # The preset for real frames, with a free pupil amplitude, cannot be made coarser.
+    decided = settings.basis is not None or not settings.wavefront
+    if requested == "off" or decided or settings.prior.amplitude_scale > 0:
+        return None
+    return _make_plan(problems, settings, seed)
+
+
+def _make_plan(problems: Sequence[Problem], settings: GaussNewton, seed: int) -> Plan:
+    """Plan the model fidelity for the first problem that is not of a reference star."""
     science = next((p for p in problems if not p.observation.reference), problems[0])
     cycles = settings.cycles or (24.0,)
     keep: dict[str, Any] = {}
-    fixed = settings.basis is not None or settings.drift is not None
-    if fixed or not settings.wavefront or not settings.cycles:
+    if settings.drift is not None or not settings.cycles:
         keep["cycles"] = float(cycles[0])
     if len(problems) > 1:
         # A correction belongs to one position of the star.
@@ -57,28 +75,22 @@ def make_plan(problems: Sequence[Problem], settings: GaussNewton, seed: int) -> 
         science.model,
         science.observation,
         science.initial,
-        # What one frame hardly sees, many do.
+        # Several frames have less noise than one, so that smaller model errors matter.
         error_budget=0.1 / math.sqrt(len(problems)),
         keep=keep,
         start=science.start,
-        # Another basis has groups of its own, which say nothing about the default modes.
-        prior=settings.prior if settings.basis is None else None,
+        prior=settings.prior,
         cycles=cycles,
         model_error=settings.min_model_error,
         seed=seed,
     )
 
 
-def require_plan_for(model: OpticalSystem, planned: Plan) -> None:
-    """Refuse a plan that was made for another system.
-
-    Raises
-    ------
-    IncompatibleSetupError
-    """
+def _require_plan_for(model: OpticalSystem, planned: Plan) -> None:
     other = planned.given
-    ours = (model.npix, model.detector.shape, model.bandpass, model.parameters)
-    theirs = (other.npix, other.detector.shape, other.bandpass, other.parameters)
+    ours, theirs = (
+        (each.npix, each.detector.shape, each.bandpass, each.parameters) for each in (model, other)
+    )
     if ours != theirs:
         raise IncompatibleSetupError(
             f"plan: it was made for {other!r}, the model is {model!r}. Make one for it with "
@@ -95,22 +107,24 @@ def fit_problems(
     seed: int,
     progress: bool,
 ) -> Refinement:
-    """Refine with the plan's model, if there is a plan; the result is on the problems' model.
+    """Refine with the cheaper model of a plan, if there is one.
 
-    At the end the star is rendered with the problems' model. If that differs by more than the
-    plan's budget, the fit goes on from there with the model as given.
+    At the end the star is rendered with the full model. If the two stars differ by more than the
+    budget of the plan, the fit continues with the full model.
 
     Parameters
     ----------
     problems : sequence of Problem
-        One for each frame, with the model as given.
+        One for each frame, with the full model.
     settings : GaussNewton
     planned : Plan or None
-        None to fit with the model as given.
+        None to fit with the full model.
     warm : mapping of Unknown to float, optional
-        Where to start.
+        Starting values.
     seed : int
+        Recorded with the result.
     progress : bool
+        Show progress bars.
     """
     if planned is None:
         return fit_with_growing_basis(problems, settings, warm, seed=seed, progress=progress)
@@ -130,15 +144,13 @@ def fit_problems(
             seconds=time.perf_counter() - began,
         )
     _log.warning(
-        "the planned model's star differs from that of the given model by %.2g sigma (worst pixel "
-        "%.2g), more than the budget of %.2g: the fit goes on with the model as given",
+        "the stars of the planned and of the full model differ by %.2g sigma (worst pixel %.2g), "
+        "more than the budget of %.2g: the fit continues with the full model",
         error.rms,
         error.worst,
         planned.budget,
     )
-    exact = fit_with_growing_basis(
-        problems, continued(fit), warm_start(fit), seed=seed, progress=progress
-    )
+    exact = fit_with_growing_basis(problems, *continue_from(fit), seed=seed, progress=progress)
     return replace(
         exact,
         plan=replace(planned, final_error=error, abandoned=True),
@@ -149,7 +161,7 @@ def fit_problems(
 def _on_full_model(
     fit: Refinement, k: int, problem: Problem, free: tuple[str, ...]
 ) -> tuple[FrameFit, ModelError]:
-    """One frame of a planned fit on the given model, and by how much its star changes."""
+    """One frame of a planned fit with the full model, and the change of its star."""
     frame, model = fit.frames[k], problem.model
     opd = frame.opd
     if frame.model.npix != model.npix:
@@ -162,7 +174,7 @@ def _on_full_model(
     with torch.no_grad():
         image = model(torch.from_numpy(np.ascontiguousarray(opd)).to(model.device), **values)
     image = problem.gain * image.double()
-    # Flux and background at which the given model's star comes nearest to the one fitted.
+    # Flux and background for which the full model is closest to the fitted star.
     before = torch.from_numpy(frame.star).to(model.device)
     linear = tuple(name for name in ("flux", "background") if name in free)
     start = {name: float(frame.values[name][0]) for name in ("flux", "background")}
@@ -177,7 +189,7 @@ def _on_full_model(
 
 
 def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> Refinement:
-    """Go on from a refinement with other settings.
+    """Continue a refinement with other settings.
 
     Parameters
     ----------
@@ -192,12 +204,10 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
     IncompatibleSetupError
         If the fit is by another method than Gauss-Newton.
     """
-    settings = continued(fit, **changes)
+    settings, warm = continue_from(fit, **changes)
     problems = [
         Problem(frame.model, frame.observation, fit.initial, frame.start, fit.systematics)
         for frame in fit.frames
     ]
     planned = None if fit.plan is None or fit.plan.abandoned else fit.plan
-    return fit_problems(
-        problems, settings, planned, warm_start(fit), seed=fit.seed, progress=progress
-    )
+    return fit_problems(problems, settings, planned, warm, seed=fit.seed, progress=progress)

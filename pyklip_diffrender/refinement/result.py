@@ -68,9 +68,9 @@ class Refinement:
     Attributes
     ----------
     frames : tuple of FrameFit
-        One for each observation, in the order given.
+        One for each observation, in the same order.
     initial : OPDMap
-        The wavefront map that the fit started from.
+        Starting wavefront.
     settings : GaussNewton or Adam
     basis : Basis or None
         Wavefront modes that were fitted.
@@ -78,23 +78,24 @@ class Refinement:
     chi2_per_pixel : float
         With the errors of the observations (and those of `systematics`).
     model_error : float
-        Error of the star model that is assumed, as a fraction of the star's light in a pixel, in
-        quadrature with the noise; 0 when chi-squared per pixel is near 1.
+        Assumed error of the star model, as a fraction of the star's light in a pixel, added in
+        quadrature to the noise; 0 if chi-squared per pixel is near 1.
     companions, companion_errors : ndarray, (companions, 3)
-        Companions with parameters of their own: contrast, and x and y from the star in arcsec as
-        the first frame shows them.
+        Companions that were part of the fit: contrast, and x and y from the star in the first
+        frame, arcsec.
     scales : dict of str to float
-        Scales of the prior at the end, nm.
+        Final scales of the prior, nm.
     effective_parameters : float
-        Number of wavefront parameters that the data determine; NaN where not known.
+        Number of wavefront parameters that the data determine; NaN if unknown.
     log_evidence : float
-        Of the linearised model, up to a constant of the data: differences compare priors.
+        Logarithm of the evidence of the linearised model, up to a constant of the data. Differences
+        compare priors.
     linear : LinearModel or None
-        Effect of all unknowns on all pixels, which `detect` needs (None for the Adam recipe).
+        Jacobian and covariance of all unknowns, for `detect`; None for the Adam recipe.
     systematics : Systematics or None
-        What was assumed of the model's error.
+        Assumed pattern of the model's error.
     plan : Plan or None
-        The model fidelity that was chosen; None if the model was used as given.
+        The chosen model fidelity; None if the fit used the full model.
     history : list of dict
         One entry for each iteration.
     seconds : float
@@ -129,7 +130,7 @@ class Refinement:
 
     @property
     def model(self) -> OpticalSystem:
-        """The optical system, as it was given."""
+        """The optical system."""
         return self.frames[0].model
 
     @property
@@ -149,7 +150,7 @@ class Refinement:
 
     @property
     def reduced_chi2(self) -> float:
-        """Chi-squared per degree of freedom; NaN where the number of modes is not known."""
+        """Chi-squared per degree of freedom; NaN if the method has no linear model."""
         if self.linear is None:
             return math.nan
         pixels = sum(int((frame.weight > 0).sum()) for frame in self.linear.frames)
@@ -157,7 +158,7 @@ class Refinement:
 
     @cached_property
     def star_only(self) -> LinearModel:
-        """The linear model with the companions' light put back into the data.
+        """The linear model without companions, with their light added to the data.
 
         Raises
         ------
@@ -196,7 +197,7 @@ class Refinement:
         return table
 
     def write(self, path: str | os.PathLike[str], *, linear: bool = True) -> Path:
-        """Write the refinement to a FITS file from which `read` makes it again.
+        """Write the refinement to a FITS file that `read` reads.
 
         Extensions are PARAMETERS (a table), and for each frame DATA, ERROR, VALID, STAR,
         COMPANIONS, GAIN, OPD and COEFFICIENTS, numbered by EXTVER. The file is written
@@ -215,7 +216,7 @@ class Refinement:
         Raises
         ------
         IncompatibleSetupError
-            For settings with a basis that is not the package's own.
+            For settings with a user-defined basis.
         """
         primary = fits.PrimaryHDU()
         for key, value in self.summary().items():
@@ -248,7 +249,7 @@ class Refinement:
     def read(
         cls, path: str | os.PathLike[str], *, model: OpticalSystem | None = None
     ) -> Refinement:
-        """Read what `write` wrote.
+        """Read a refinement that `write` wrote.
 
         Parameters
         ----------
@@ -261,7 +262,7 @@ class Refinement:
         CorruptFileError
             If the file is missing, truncated, or was not written by `write`.
         IncompatibleSetupError
-            If the model is needed and was not given.
+            If the model is needed but missing.
         """
         name = Path(path).name
         with open_fits(path) as hdus:
@@ -322,7 +323,7 @@ class Refinement:
         return plotting.plot_refinement(self, ax, frame=frame)
 
     def summary(self) -> Mapping[str, Any]:
-        """Return the facts that belong in a header or a log, without arrays."""
+        """Return metadata for a header or a log, without arrays."""
         return {
             "method": self.method,
             "status": self.status.name,

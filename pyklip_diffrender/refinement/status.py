@@ -34,5 +34,5 @@ class Status(Enum):
 
     @property
     def calibrated(self) -> bool:
-        """Whether the stated errors can be relied on as they are."""
+        """Whether the stated errors are reliable without a further factor."""
         return self not in (Status.MODEL_MISMATCH, Status.PRIOR_MISMATCH, Status.DIVERGED)

@@ -44,12 +44,12 @@ _DTYPES = {"torch.float64": torch.float64, "torch.float32": torch.float32}
 
 
 def encoded(value: Any) -> Any:
-    """Turn settings into what JSON can hold.
+    """Convert settings to types that JSON knows.
 
     Raises
     ------
     IncompatibleSetupError
-        For an object that this file format does not know, such as a basis of one's own.
+        For an object of unknown type, such as a user-defined basis.
     """
     if value is None or isinstance(value, bool | int | str):
         return value
@@ -114,18 +114,18 @@ def text_hdu(name: str, content: Mapping[str, Any]) -> fits.ImageHDU:
 
 
 def text_of(hdus: fits.HDUList, name: str) -> dict[str, Any]:
-    """Content of an extension that `text_hdu` made."""
+    """Return the content of an extension that `text_hdu` made."""
     content = json.loads(np.asarray(hdus[name].data, dtype=np.uint8).tobytes().decode())
     return {key: decoded(value) for key, value in content.items()}
 
 
 def model_facts(model: OpticalSystem) -> dict[str, Any] | None:
-    """Arguments that make a model again; None for one that was converted or put together."""
+    """Arguments of `nircam_coronagraph` that make the model; None for other models."""
     return dict(model.recipe) if model.maker is nircam_coronagraph else None
 
 
 def model_of(facts: dict[str, Any] | None, name: str) -> OpticalSystem:
-    """Make the model from what `model_facts` gave.
+    """Make a model from the arguments of `model_facts`.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def image(hdus: fits.HDUList, name: str, frame: int) -> NDArray[np.float64]:
 
 
 def observation_hdus(observation: Observation, frame: int) -> tuple[dict[str, Any], list[Any]]:
-    """Facts and extensions of a frame's observation, its frames averaged."""
+    """Return metadata and extensions of an observation, with its frames averaged."""
     combined = observation.combined()
     facts = {
         "unit": combined.unit.to_string(),
@@ -170,7 +170,7 @@ def observation_hdus(observation: Observation, frame: int) -> tuple[dict[str, An
 
 
 def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Observation:
-    """The observation from what `observation_hdus` gave."""
+    """Make an observation from the metadata and extensions of `observation_hdus`."""
     angles, date = facts["position_angles"], facts["date"]
     return Observation.from_arrays(
         image(hdus, "DATA", frame),
@@ -194,7 +194,7 @@ _FRAME_ARRAYS = ("residual", "weight", "jacobian", "rows", "drift")
 
 
 def linear_hdus(linear: LinearModel) -> list[Any]:
-    """Extensions that hold a linear model."""
+    """Return the extensions of a linear model."""
     columns = [
         fits.Column("NAME", "20A", array=np.array([each.name for each in linear.unknowns])),
         fits.Column("COMPONENT", "J", array=[each.component for each in linear.unknowns]),
@@ -218,12 +218,12 @@ def linear_hdus(linear: LinearModel) -> list[Any]:
 
 
 def linear_of(hdus: fits.HDUList, frames: int, name: str) -> LinearModel:
-    """The linear model from what `linear_hdus` gave.
+    """Make a linear model from the extensions of `linear_hdus`.
 
     Raises
     ------
     CorruptFileError
-        If its parts do not go together.
+        If its parts are inconsistent.
     """
     table = hdus["UNKNOWNS"].data
     unknowns = tuple(

@@ -1,4 +1,4 @@
-"""What is in the sky and how bright: a star, its planets, and the photons that they send.
+"""A star, its planets, and the photons that arrive from them.
 
 The calibration is that of appendix A of B. Y. Feng et al., "Exoplanet Imaging via Differentiable
 Rendering" (2025): beta Pictoris, two hours, NIRCam F444W.
@@ -7,7 +7,7 @@ Rendering" (2025): beta Pictoris, two hours, NIRCam F444W.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from pyklip_diffrender.io.units import ARCSEC
 
@@ -28,13 +28,13 @@ ALPHA_PICTORIS_W2 = 0.979
 """WISE W2 magnitude of the paper's reference star."""
 
 PAPER_SEGMENT_GAP = 0.0
-"""Width of the mirror's segment gaps, m, at which the paper's photon levels come out: webbpsf's
-sampled pupil, which the paper used, hardly resolves them (they are 7 mm). Light that leaks through
-the coronagraph from gaps of their true width makes the star 1.5 times as bright."""
+"""Width of the mirror's segment gaps, m, that reproduces the paper's photon levels. The paper used
+the sampled pupil of webbpsf, which hardly resolves the true width of 7 mm. With it, light that
+leaks through the coronagraph makes the star 1.5 times as bright."""
 
 UNOCCULTED_PEAK = 3.71638e-3
-"""Share of the light collected by the pupil that falls on the brightest pixel of the paper's star
-with the Lyot stop but without the occulter, at 4.5 um."""
+"""Fraction of the light collected by the pupil that falls on the brightest pixel of the paper's
+star, with the Lyot stop but without the occulter, at 4.5 um."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class Star:
     pixel_area : float
         Solid angle of a pixel, sr.
     peak_fraction : float
-        Share of a point source's calibrated flux that falls on its brightest pixel. The paper
-        does not state it; 0.0148002 is what its other numbers imply for its 1.0334e10 photons
+        Fraction of a point source's calibrated flux that falls on its brightest pixel. The paper
+        does not state it. 0.0148002 follows from its other numbers, with its 1.0334e10 photons
         at contrast 1.
     """
 
@@ -92,7 +92,7 @@ class Planet:
     Attributes
     ----------
     contrast : float
-        Its light before the coronagraph relative to the star's.
+        Flux of the planet over that of the star, before the coronagraph.
     separation : float
         arcsec.
     position_angle : float
@@ -108,6 +108,10 @@ class Planet:
         """Make a planet at x, y from the star (arcsec, image orientation)."""
         return cls(contrast, math.hypot(x, y), math.degrees(math.atan2(-x, y)))
 
+    def rotated(self, angle: float) -> Planet:
+        """Rotate the planet about the star by `angle` degrees, counter-clockwise."""
+        return replace(self, position_angle=self.position_angle + angle)
+
     @property
     def offset(self) -> tuple[float, float]:
         """x, y relative to the star, arcsec, image orientation."""
@@ -117,7 +121,7 @@ class Planet:
 
 @dataclass(frozen=True)
 class Scene:
-    """A star, its planets, and the detector's noise.
+    """A star, its planets, the background and the read noise.
 
     Attributes
     ----------

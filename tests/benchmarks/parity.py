@@ -154,7 +154,7 @@ def wavefront_sensing(folder: Path, npix: int) -> str:
     instrument = parity.nircam(folder, npix)
     instrument.load_wss_opd(str(path), verbose=False)
     loaded = load_wss_opd(path, npix=npix)
-    found = float(np.abs(loaded.opd - instrument.pupilopd[0].data).max())
+    found = float(np.abs(loaded.data - instrument.pupilopd[0].data).max())
     instrument.pupilopd.close()
     return line("stpsf, load_wss_opd", "OPD, m", "1e-12", found)
 

@@ -1,17 +1,17 @@
-"""A round occulter by convolution on cells that fit the detector.
+"""A round occulter by convolution on a lattice aligned with the detector's samples.
 
-Behind an occulter with complement 1 - t the pupil holds E - F^-1[(1 - t) F[E]]. With L for all
-planes that follow in the pupil, the field on the detector at x is
+Behind an occulter of transmission t the field in the pupil is E - F^-1[(1 - t) F[E]]. Let L be the
+product of all planes that follow in the pupil. The field on the detector at x is
 
     A(x) = F[L E](x) - (cell / lambda) sum_c (1 - t)(c) F[E](c) F[L](x - c),
 
-summed over the cells c of the mask's disc. Where the cells lie on the lattice of the detector's
-samples, or on a refinement of it, the differences x - c do so too, and the sum is a small FFT
-convolution: no transform back to the pupil. Pixels may be rectangular and sheared.
+summed over the cells c of the disc of the mask. If the cells lie on the lattice of the detector's
+samples, or on a refinement of it, so do the differences x - c. The sum is then a small FFT
+convolution, without a transform back to the pupil. Pixels may be rectangular and sheared.
 
-The sum is exact if the spectrum of 1 - t ends below the frequencies that alias onto that of
-F[E] F[L]. A mask with an edge has no such limit, so its spectrum is cut off on a finer lattice
-before it is sampled. The plane-by-plane route samples the mask directly.
+The sum is exact if the spectrum of 1 - t is zero at the frequencies that alias onto that of
+F[E] F[L]. The spectrum of a mask with an edge is not limited, so it is cut off on a finer lattice
+before the mask is sampled. The propagation plane by plane samples the mask directly.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from pyklip_diffrender.optics.planes import CompactOcculter, Wavefront
 __all__ = ["DEFAULT_SAMPLING", "OcculterLattice", "finest_spacing"]
 
 DEFAULT_SAMPLING = 2.0
-"""Default minimum of cells per lambda/D: errors of 4e-9 of the star's peak at 4.5 um."""
+"""Cells per lambda/D by default. The error is 4e-9 of the star's peak at 4.5 um."""
 
 _FINER = 4
 """Points per cell, along each axis, at which the mask is sampled before it is band-limited."""
 
 _ROLL_OFF = 0.06
-"""Width of the edge of the band, cycles per cell. From 2 cells per lambda/D on, the band used by
-the pupils (0.87 D / lambda) and the band that aliases onto it are well below and above the edge."""
+"""Width of the edge of the band, cycles per cell. With at least 2 cells per lambda/D, the band of
+the pupils (0.87 D / lambda) is well below the edge and the band that aliases onto it well above."""
 
 _MARGIN = 4
-"""Cells of the band-limited mask beyond its edge."""
+"""Number of cells of the band-limited mask beyond its edge."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ class _Axis:
     samples : int
         Number of detector samples.
     phases : int
-        Samples per cell, if those are finer; each has its own kernel.
+        Samples per cell, where samples are finer; each has its own kernel.
     cells : int
-        Cells per sample, if those are finer.
+        Cells per sample, where cells are finer.
     half : int
         Cells are numbered from -half to half.
     spacing : float
@@ -73,9 +73,9 @@ class _Axis:
 
     @classmethod
     def fit(cls, samples: int, step: float, oversample: int, finest: float, reach: float) -> _Axis:
-        """The coarsest cells that fit the samples and are no wider than `finest` (radians).
+        """Choose the coarsest aligned cells that are at most `finest` radians wide.
 
-        A pixel has a whole number of cells, so that sources at pixel centres fit as well.
+        A pixel has a whole number of cells, so that its centre is on the lattice as well.
         """
         phases = max(
             (k for k in range(1, oversample + 1) if oversample % k == 0 and k * step <= finest),
@@ -102,13 +102,13 @@ class _Axis:
         return int(next_fast_len(math.ceil(cells / self.cells)))
 
     def differences(self, first: Tensor) -> Tensor:
-        """Samples of a phase minus cells, in order, given the phase's first sample (radians)."""
+        """Samples of a phase minus cells, in order; `first` is the first sample, radians."""
         index = torch.arange(-2 * self.half, (self.count - 1) * self.cells + 1)
         offsets = (index + self.half).to(torch.float64) * self.spacing
         return first + offsets.to(first.device)
 
     def band_limiting(self) -> Tensor:
-        """Matrix from the mask on a finer lattice to its band-limited form on the cells."""
+        """Matrix from the mask on a finer lattice to the band-limited mask on the cells."""
         inside = self.half - _MARGIN
         fine = torch.arange(-inside * _FINER, inside * _FINER + 1, dtype=torch.float64) / _FINER
         cells = torch.arange(-self.half, self.half + 1, dtype=torch.float64)
@@ -134,7 +134,7 @@ def _axes(
 def finest_spacing(
     occulter: CompactOcculter, detector: Detector, wavelength: float, sampling: float
 ) -> float:
-    """The smaller spacing of the cells that fit the detector, radians.
+    """Return the smaller spacing of the aligned cells, radians.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def finest_spacing(
     wavelength : float
         m.
     sampling : float
-        Cells per lambda/D, at least.
+        Smallest number of cells per lambda/D.
     """
     return min(axis.spacing for axis in _axes(occulter, detector, wavelength, sampling))
 
@@ -158,13 +158,13 @@ class OcculterLattice:
     wavelength : float
         m.
     sampling : float
-        Cells per lambda/D, at least.
+        Smallest number of cells per lambda/D.
 
     Attributes
     ----------
     x, y : _Axis
     blocked : Tensor, (cells in y, cells in x)
-        1 - t on the cells, with the scale of the field on a sample.
+        1 - t on the cells, times the factor that turns the sum into the field on a sample.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
-"""Propagation through a coronagraph with one round occulter by convolution (`occulter`).
+"""Propagation through a coronagraph with one round occulter, by convolution (see `occulter`).
 
-A single star behind fixed planes is computed block by block in `streaming`, everything else by
-ordinary torch operations, which have derivatives of every kind.
+A single star with fixed planes is computed block by block (see `streaming`). Everything else uses
+ordinary torch operations, which have derivatives of all kinds.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ __all__ = ["LatticeRoute", "is_pointwise"]
 _POINTWISE = (Gain, InternalAberration, LyotStop, PupilOptic)
 
 _LARGE = 512
-"""Samples across a pupil whose arrays do not fit into the cache. Only then is it faster to compute
-the field a second time for its derivative."""
+"""Samples across a pupil above which arrays do not fit into the cache. Only then is it faster to
+compute the field a second time for its derivative."""
 
 
 def is_pointwise(plane: Plane) -> bool:
@@ -69,7 +69,7 @@ class LatticeRoute:
         behind = planes[self._place + 1 :]
         self._moving = {name for plane in behind for name in plane.parameters} | {"detector_shift"}
         self._lattices: dict[float, OcculterLattice] = {}
-        # The latest at each wavelength, with the parameters of the planes behind the occulter.
+        # The most recent result at each wavelength, with the parameters that it depends on.
         self._stops: dict[float, tuple[Position, Wavefront]] = {}
         self._kernels: dict[float, tuple[Position, Tensor]] = {}
         self._stars: dict[float, tuple[Position, _StreamedStar]] = {}
@@ -90,11 +90,11 @@ class LatticeRoute:
 
     @property
     def sampling(self) -> float:
-        """Cells per lambda/D, at least."""
+        """Smallest number of cells per lambda/D."""
         return self.occulter.sampling or DEFAULT_SAMPLING
 
     def pays(self, wavelengths: Sequence[float]) -> bool:
-        """Whether the detector allows cells that are not much finer than requested."""
+        """Whether the cells aligned with the detector are not much finer than necessary."""
         return all(
             finest_spacing(self.occulter, self.detector, wavelength, self.sampling)
             >= wavelength / self.occulter.diameter / self.sampling / 2.5
@@ -112,7 +112,7 @@ class LatticeRoute:
     def _stop(self, onto: Sequence[PupilGrid], wavelength: float, values: Values) -> Wavefront:
         """The product of all planes behind the occulter.
 
-        A shift of the detector is included as a tilt, so that the rest need not depend on it.
+        A shift of the detector is included as a tilt, so that nothing else depends on it.
         """
         return kept(
             self._stops,
@@ -150,7 +150,7 @@ class LatticeRoute:
         )
 
     def field(self, wavefront: Wavefront, values: Values, onto: Sequence[PupilGrid]) -> Tensor:
-        """Field on the detector's samples from that behind the entrance pupil.
+        """Propagate from the entrance pupil to the detector's samples.
 
         Parameters
         ----------
@@ -176,13 +176,13 @@ class LatticeRoute:
         values: Values,
         onto: Sequence[PupilGrid],
     ) -> Tensor | None:
-        """As `field` for one star, in a third of the time.
+        """Compute the field of a single star, in a third of the time of `field`.
 
         Returns
         -------
         Tensor or None
             Differentiable in reverse mode with respect to the OPD and the star's offset. None if
-            other derivatives or several stars are needed.
+            other derivatives or several stars are required.
         """
         offset = values.get("star_offset")
         fixed = [value for name, value in values.items() if name != "star_offset"]
@@ -242,13 +242,13 @@ class LatticeRoute:
 
 @dataclass(frozen=True)
 class _StreamedStar:
-    """Computes the field of the star from an OPD, when nothing else varies.
+    """The field of a star as a function of OPD and star offset only.
 
     Attributes
     ----------
     stream : PupilStream
     branches : list of Branch
-        To the cells in front of the mask, and to the detector.
+        Transforms to the cells of the mask and to the detector.
     lattice : OcculterLattice
     kernel : Tensor
         Transform of the kernel of the convolution.
@@ -288,7 +288,7 @@ def _radians(offset: Tensor | None) -> Tensor | None:
 class _ReverseMode(torch.autograd.Function):
     """The field of a `_StreamedStar` with its derivatives in reverse mode.
 
-    The field in the pupil is computed again in the backward pass, block by block, not stored.
+    The field in the pupil is not stored, but computed again in the backward pass, block by block.
     """
 
     @staticmethod

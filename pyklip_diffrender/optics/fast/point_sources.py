@@ -1,9 +1,10 @@
-"""Point sources at every detector pixel, by convolution on cells that fit the detector.
+"""Point sources at every detector pixel, by convolution on a lattice aligned with the pixels.
 
-A source at p is a tilt of the pupil: what the propagation needs of the field, F[E] in the cells c
-of the occulter and F[L E] at the samples x of the detector, becomes F[E](c - p) and F[L E](x - p).
-Where cells, samples and sources are points of one lattice, all differences lie on it too. Both are
-computed once, on larger pieces of the lattice, and a source costs two small FFTs.
+A source at p tilts the wavefront in the pupil. The propagation (see `occulter`) needs F[E] at the
+cells c of the occulter and F[L E] at the samples x of the detector. For a source at p these are
+F[E](c - p) and F[L E](x - p). If cells, samples and sources are points of one lattice, so are all
+these differences. Both transforms are therefore computed only once, on larger parts of the lattice,
+and every source costs two small FFTs.
 """
 
 from __future__ import annotations
@@ -33,15 +34,15 @@ Index = ArrayLike | Tensor
 _log = logging.getLogger(__name__)
 
 _BATCH_BYTES = 1.2e7
-"""Of one array of a batch: more does not fit into the cache, and takes twice as long."""
+"""Bytes of one array of a batch. Larger arrays do not fit into the cache and take twice as long."""
 
 _NEAR = 0.15
-"""Sources within this part of the occulter's radius are computed in double precision: there the
-image is what a thousandfold suppression leaves, and single precision is good to 4e-6 of that."""
+"""Fraction of the occulter's radius within which sources are computed in double precision. There
+the light is suppressed a thousandfold, and the error of single precision is 4e-6 of the image."""
 
 _ALIKE = 0.01
-"""Relative difference, rms, from the model's own images up to which those of a mask without its
-outer parts are taken: a percent of a planet's template costs 5e-5 of its S/N."""
+"""Largest relative rms difference from the images of the model at which the outer parts of a mask
+are ignored. An error of a percent of a planet's template costs 5e-5 of its S/N."""
 
 
 class PointSources:
@@ -55,17 +56,17 @@ class PointSources:
     values : mapping of str to value, optional
         The model's other parameters. A ``star_offset`` is ignored: the positions are the pixels'.
     sampling : float
-        Cells of the occulter per lambda/D, at least.
+        Smallest number of cells of the occulter per lambda/D.
     offset : tuple of float
-        x, y in arcsec by which all sources stand off the pixels' centres.
+        x, y in arcsec from the centre of a pixel to the source.
 
     Attributes
     ----------
     route : "lattice" or "model"
-        How the images are made: as in the head of this module, or by calling the model, which is
-        the way for systems whose planes are not one mask between pupil planes. A mask of several
-        parts is reduced to the first, if that changes the images of a few sources by a percent
-        at most.
+        How images are computed: by convolution as described at the top of this module, or by
+        calling the model. The model is called if the planes are not one mask between pupil planes.
+        A mask of several parts is reduced to the first one if that changes the images of a few
+        test sources by a percent at most.
     """
 
     def __init__(
@@ -78,12 +79,12 @@ class PointSources:
         offset: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self.model, self._offset = model, torch.tensor(offset, dtype=torch.float64)
-        given = {name: value for name, value in (values or {}).items() if name != "star_offset"}
+        fixed = {name: value for name, value in (values or {}).items() if name != "star_offset"}
         with torch.no_grad():
             self._opd = model.opd(opd).detach()
             if self._opd.ndim != 2:
                 raise ShapeError(f"opd: got shape {tuple(self._opd.shape)}, expected one map")
-            self._values = {name: value.detach() for name, value in model.values(given).items()}
+            self._values = {name: value.detach() for name, value in model.values(fixed).items()}
             self._radius = 0.0
             self._waves = self._prepared(sampling)
             self.route = "lattice" if self._waves else "model"
@@ -92,7 +93,7 @@ class PointSources:
         _log.debug("point sources by the route %r", self.route)
 
     def _prepared(self, sampling: float) -> list[_Wave]:
-        """All wavelengths; none if the planes are not at most one mask between factors."""
+        """Prepare all wavelengths; an empty list if `_one_mask` returns None."""
         waves = []
         for wavelength in self.model.bandpass.wavelengths:
             planes = _one_mask(self.model, wavelength)
@@ -104,10 +105,7 @@ class PointSources:
         return waves
 
     def _agrees(self) -> bool:
-        """Whether the images are those of the model, from the middle of the detector to a corner.
-
-        Also true where the images are the model's anyway.
-        """
+        """Whether images agree with those of the model, between the middle and a corner."""
         if self.route == "model":
             return True
         ny, nx = self.model.detector.shape
@@ -159,8 +157,8 @@ class PointSources:
         Returns
         -------
         Tensor, (k, ny, nx), float32
-            What ``model(opd, star_offset=position, **values)`` gives: light per detector pixel
-            as a fraction of what the pupil collects.
+            As ``model(opd, star_offset=position, **values)``: light per detector pixel as a
+            fraction of the light that the pupil collects.
 
         Raises
         ------
@@ -169,21 +167,21 @@ class PointSources:
         """
         rows, columns = self._indices(rows, columns)
         shape = (len(rows), *self.model.detector.shape)
-        found = torch.empty(shape, dtype=torch.float32, device=self.model.device)
+        images = torch.empty(shape, dtype=torch.float32, device=self.model.device)
         with torch.no_grad():
             near = self._near(self.positions(rows, columns))
             for double in (False, True):
                 chosen = torch.nonzero(near == double).flatten()
                 for part in chosen.split(self._batch(double)) if len(chosen) else ():
-                    found[part] = self._batch_of_images(rows[part], columns[part], double)
-        return found
+                    images[part] = self._batch_of_images(rows[part], columns[part], double)
+        return images
 
     def _indices(self, rows: Index, columns: Index) -> tuple[Tensor, Tensor]:
         pair = []
-        for name, given, count in zip(
+        for name, values, count in zip(
             ("rows", "columns"), (rows, columns), self.model.detector.shape, strict=True
         ):
-            index = torch.as_tensor(given, device=self.model.device).reshape(-1).to(torch.int64)
+            index = torch.as_tensor(values, device=self.model.device).reshape(-1).to(torch.int64)
             if len(index) and (int(index.min()) < 0 or int(index.max()) >= count):
                 raise ShapeError(f"{name}: expected indices from 0 to {count - 1}")
             pair.append(index)
@@ -192,7 +190,7 @@ class PointSources:
         return pair[0], pair[1]
 
     def _near(self, positions: Tensor) -> Tensor:
-        """Which positions need double precision, (k,)."""
+        """Whether positions need double precision, (k,)."""
         radius = self._radius if self.model.dtype == torch.float64 else 0.0
         return positions.norm(dim=-1) < _NEAR * radius
 
@@ -216,9 +214,9 @@ class PointSources:
 
 
 def _one_mask(model: OpticalSystem, wavelength: float) -> list[Plane] | None:
-    """The planes with sampled masks reduced to their first part.
+    """Reduce sampled masks to their first part.
 
-    None unless they are at most one mask between factors in the pupil.
+    Returns None unless the planes are at most one mask between factors in the pupil.
     """
     planes: list[Plane] = []
     for plane in model.planes:
@@ -234,20 +232,20 @@ def _one_mask(model: OpticalSystem, wavelength: float) -> list[Plane] | None:
 
 
 class _Wave:
-    """What one wavelength needs: three transforms on pieces of the lattice.
+    """Transforms on parts of the lattice at one wavelength.
 
     Parameters
     ----------
     front : Wavefront
-        In front of the occulter, the source on the axis.
+        Field in front of the occulter for a source on the axis.
     stop : Wavefront
-        What the planes behind the occulter make of a field of ones.
+        Product of all planes behind the occulter.
     occulter : CompactOcculter or None
     detector : Detector
     axes : tuple of Tensor
         Sample positions x, y, radians.
     sampling : float
-        Cells per lambda/D, at least.
+        Smallest number of cells per lambda/D.
     """
 
     def __init__(
@@ -273,7 +271,7 @@ class _Wave:
         arrays = [detector.per_sample * direct]
         self._lattice: OcculterLattice | None = None
         self.size = math.prod(detector.shape) * k**2
-        """Numbers in the largest array that a source needs."""
+        """Size of the largest array that a source needs."""
         if occulter is not None:
             lattice = OcculterLattice(occulter, detector, stop.wavelength, sampling)
             both = (lattice.x, lattice.y)
@@ -313,7 +311,7 @@ class _Wave:
 
 
 def _in_both_precisions(arrays: Sequence[Tensor]) -> dict[torch.dtype, list[Tensor]]:
-    """The arrays in single and in double precision, by the type of real numbers."""
+    """Arrays in single and double precision, by the type of real numbers."""
     return {
         real: [a.to(real.to_complex() if a.is_complex() else real) for a in arrays]
         for real in (torch.float32, torch.float64)
@@ -321,6 +319,6 @@ def _in_both_precisions(arrays: Sequence[Tensor]) -> dict[torch.dtype, list[Tens
 
 
 def _cut(array: Tensor, top: Tensor, left: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Windows of an array, one for each pair of first row and column, (k, *shape)."""
+    """Cut windows out of an array, one for each pair of first row and column, (k, *shape)."""
     every = array.unfold(0, shape[0], 1).unfold(1, shape[1], 1)
     return every[top, left]

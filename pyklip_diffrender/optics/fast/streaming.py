@@ -1,10 +1,10 @@
-"""From the pupil to images in blocks of rows, with the derivative in reverse mode.
+"""Transforms from the pupil to images in blocks of rows, with derivatives in reverse mode.
 
-A megapixel field and the arrays needed for it do not fit into a processor's cache, and allocating
-them takes longer than filling them. Here the field exists for some rows at a time, which go through
-the product along x before the next. It is stored as real and imaginary parts of the half to the
-right of the axis and of the other half, mirrored: sums and differences of the two halves need
-products of half the size, with cosines and sines.
+A field of a megapixel and its temporary arrays do not fit into a processor's cache, and allocating
+them takes longer than filling them. Here the field is computed for a block of rows at a time, which
+is transformed along x before the next block. Its real and imaginary parts are stored for the half
+of the pupil to the right of the axis, and for the other half mirrored. The cosine transform of the
+sum and the sine transform of the difference of these halves need matrices of half the size.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from pyklip_diffrender.optics.grid import PupilGrid
 __all__ = ["Branch", "PupilStream"]
 
 _ROWS = 128
-"""Rows of a block, for each thread: about 2 MB an array for 1024 samples across the pupil."""
+"""Rows of a block per thread. For 1024 samples across the pupil an array has about 2 MB."""
 
 
 def _sides(array: Tensor) -> Tensor:
-    """Columns from the axis to the right, and to the left: (..., 2, rows, half).
+    """Columns to the right and to the left of the axis, outwards: (..., 2, rows, half).
 
-    In an odd number of columns the middle one is on both sides.
+    If the number of columns is odd, both sides contain the middle one.
     """
     half = (array.shape[-1] + 1) // 2
     right, left = array[..., array.shape[-1] - half :], array[..., :half].flip(-1)
@@ -36,14 +36,14 @@ def _sides(array: Tensor) -> Tensor:
 
 
 def _reach(lit: Tensor) -> list[int]:
-    """For every row of (sides, rows, half), the columns up to the last one that is lit."""
+    """Number of columns up to the last lit one, for every row of (sides, rows, half)."""
     column = torch.arange(1, lit.shape[-1] + 1, device=lit.device)
     reach: list[int] = (lit.any(dim=0) * column).amax(dim=-1).tolist()
     return reach
 
 
 def _part(room: Tensor, *shape: int) -> Tensor:
-    """The beginning of a flat array as an array of some shape."""
+    """View the beginning of a flat array with another shape."""
     return room[: math.prod(shape)].view(shape)
 
 
@@ -90,7 +90,7 @@ class Branch:
         product = kernel(image, pupil, self.wavelength, +1)
         cosine, sine = product.real.clone(), product.imag.clone()
         if window.shape[1] % 2:
-            cosine[:, 0] /= 2  # The middle column is on both sides.
+            cosine[:, 0] /= 2  # Both sides contain the middle column.
         self.products = [part.contiguous().to(self.dtype) for part in (cosine, sine)]
         complex_type = self.dtype.to_complex()
         rows = window.y.to(device)
@@ -107,7 +107,7 @@ class Branch:
         return torch.zeros(shape, dtype=dtype, device=self.x.device)
 
     def finish(self, along_x: Tensor) -> Tensor:
-        """The image (y, x) from products of shape (even and odd, k, real and imaginary, rows)."""
+        """Image (y, x) from products of shape (even and odd, k, real and imaginary, rows)."""
         even = torch.complex(along_x[0, :, 0], along_x[0, :, 1]).mT
         odd = torch.complex(-along_x[1, :, 1], along_x[1, :, 0]).mT
         field = even + odd
@@ -120,7 +120,7 @@ class Branch:
 
 
 class PupilStream:
-    """The field behind an entrance pupil, and images of it, by blocks of rows.
+    """Images of the field behind an entrance pupil, by blocks of rows.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class PupilStream:
     def products(
         self, opd: Tensor, offset: Tensor | None, branches: Sequence[Branch]
     ) -> list[Tensor]:
-        """The field times the factor of each branch, after the product along x.
+        """Transform the field times the factor of each branch along x.
 
         Parameters
         ----------
@@ -178,7 +178,7 @@ class PupilStream:
         opd, offset, branches
             See `products`; the OPD is real.
         along_x : sequence of Tensor
-            Its derivative with respect to what `products` gives.
+            Derivatives of the number with respect to the products.
 
         Returns
         -------
@@ -188,7 +188,7 @@ class PupilStream:
             Per radian.
         """
         wavelength = branches[0].wavelength
-        # From OPD to phase; applied here, where arrays are small.
+        # The factor from OPD to phase is applied to these arrays because they are small.
         along_x = [slope * (2 * math.pi / wavelength) for slope in along_x]
         by_opd = torch.zeros(opd.shape, dtype=self.dtype, device=opd.device)
         window = PupilGrid.full(self.grid.npix, self.grid.diameter).crop(by_opd, self.grid)
@@ -202,11 +202,11 @@ class PupilStream:
             # d(field) = i field d(phase)
             right, left = back[1].mul_(field[0]).addcmul_(back[0], field[1], value=-1)
             window[rows, middle : middle + width] = right
-            # Added, because the middle of an odd number of columns is on both sides.
+            # Added, because both sides contain the middle of an odd number of columns.
             window[rows, before - width : before] += left.flip(-1)
         by_offset = None
         if offset is not None:
-            # As an OPD, an offset in x is a tilt along -x of the pupil, one in y along y.
+            # An offset in x is a tilt of the OPD along -x of the pupil, an offset in y along y.
             x, y = (axis.to(opd.device) for axis in (self.grid.x, self.grid.y))
             by_offset = torch.stack(
                 [-(window.sum(dim=0).to(x.dtype) @ x), window.sum(dim=1).to(y.dtype) @ y]
@@ -216,7 +216,7 @@ class PupilStream:
     def _blocks(
         self, opd: Tensor, offset: Tensor | None, wavelength: float
     ) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Rows, the field on them (real and imaginary, sides, rows, width), work space."""
+        """Iterate over rows, the field (real and imaginary, sides, rows, width) and work space."""
         opd = PupilGrid.full(self.grid.npix, self.grid.diameter).crop(opd, self.grid)
         tilt = None
         if offset is not None:
@@ -241,7 +241,7 @@ class PupilStream:
         width: int,
         room: Tensor,
     ) -> Tensor:
-        """Field on some rows: (real and imaginary, sides, rows, width)."""
+        """Field of a block of rows, (real and imaginary, sides, rows, width)."""
         count = rows.stop - rows.start
         phase = _part(room[0], 2, count, width)
         field = _part(room[1:3].view(-1), 2, 2, count, width)
@@ -266,7 +266,7 @@ class PupilStream:
     def _along_x(
         self, field: Tensor, rows: slice, branch: Branch, product: Tensor, room: Tensor
     ) -> None:
-        """Put the product along x of a branch, on some rows, into `product`."""
+        """Store the transform along x of a block of rows in `product`."""
         part = self._overlap(rows, branch, field.shape[-1])
         if part is None:
             return
@@ -282,14 +282,14 @@ class PupilStream:
         for k, combine in enumerate((torch.add, torch.sub)):
             folded = _part(room[2 + k], 2, stop - top, width)
             combine(light[:, 0], light[:, 1], out=folded)
-            # In this order: a product with few columns takes twice as long as one with few rows.
+            # A product with few columns would take twice as long as this one with few rows.
             folded_product = branch.products[k][:, :width] @ folded.view(-1, width).T
             product[k, :, :, top:stop] = folded_product.view(-1, 2, stop - top)
 
     def _overlap(
         self, rows: slice, branch: Branch, width: int
     ) -> tuple[slice, int, int, int] | None:
-        """Slice of the given rows that a branch has, their range on its grid, and their width."""
+        """Slice of the rows that a branch contains, their range on its grid, and their width."""
         first = self.grid.rows[0] - branch.grid.rows[0]  # Row 0 of this grid in the branch's.
         top, stop = max(rows.start + first, 0), min(rows.stop + first, branch.grid.shape[0])
         if top >= stop:
@@ -304,7 +304,7 @@ class PupilStream:
     def _back_along_x(
         self, back: Tensor, rows: slice, branch: Branch, slope: Tensor, room: Tensor
     ) -> None:
-        """Add the derivative with respect to the field on some rows to `back`.
+        """Add the derivative with respect to the field of a block of rows to `back`.
 
         Parameters
         ----------
@@ -312,7 +312,7 @@ class PupilStream:
         rows : slice
         branch : Branch
         slope : Tensor, (even and odd, k, real and imaginary, rows)
-            With respect to the products along x.
+            Derivative with respect to the products along x.
         room : Tensor
         """
         part = self._overlap(rows, branch, back.shape[-1])

@@ -1,4 +1,4 @@
-"""How well the scale of a contrast is known: the star's light, and the source's own image."""
+"""Calibration errors of contrasts, from the star's flux and from the image of the source."""
 
 from __future__ import annotations
 
@@ -7,35 +7,33 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.linear.model import LinearFrame, LinearModel
+from pyklip_diffrender.linear.model import LinearFrame
 from pyklip_diffrender.linear.response import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 
-__all__ = ["scale_errors"]
+__all__ = ["calibration_errors"]
 
 _CLEAR = 25.0
-"""S/N from which on it matters that the wavefront makes a source's own image, too."""
+"""S/N above which the error of a source's own image matters."""
 
 
-def scale_errors(
-    groups: Sequence[tuple[LinearModel, Templates]], offsets: Tensor, significance: Tensor
-) -> Tensor:
-    """Relative errors of contrasts by what the sources' light is compared with.
+def calibration_errors(groups: Sequence[Group], offsets: Tensor, snr: Tensor) -> Tensor:
+    """Relative errors of contrasts because of the star's flux and of the source's image.
 
-    A contrast is the source's light over the star's, and the light is measured by an image that
-    the wavefront forms: what is not known of the flux or of the wavefront changes it in proportion.
-    Neither makes a source more or less significant. Both come from the same posterior, and may
-    cancel in part.
+    A contrast is the flux of the source over that of the star. The source is measured with an
+    image that depends on the wavefront, so errors of the wavefront and of the star's flux change
+    the contrast in proportion. They do not change the significance of a source. Both come from
+    the same posterior and may partly cancel.
 
     Parameters
     ----------
     groups : sequence of (LinearModel, Templates)
-        Independent of each other.
     offsets : Tensor, (k, 2)
         x, y of the sources from the star, arcsec.
-    significance : Tensor, (k,)
-        Their S/N. The image of a source below 25 counts as known: noise hides what is not.
+    snr : Tensor, (k,)
+        S/N of the sources. Below 25 the image is taken as known, because noise dominates.
 
     Returns
     -------
@@ -51,7 +49,7 @@ def scale_errors(
             for row, unknown in enumerate(frame.rows[: frame.first_mode].tolist()):
                 if linear.unknowns[unknown].name == "flux":
                     on_rows[row] = 1 / fitted.flux
-            for j in torch.nonzero(significance > _CLEAR).flatten().tolist():
+            for j in torch.nonzero(snr > _CLEAR).flatten().tolist():
                 on_rows[frame.first_mode :, j] = _by_modes(templates, k, frame, offsets[j])
             changes += frame.onto_unknowns(on_rows, len(linear.vector)) / frames
         variance += linear.variances(changes)
@@ -59,10 +57,7 @@ def scale_errors(
 
 
 def _by_modes(templates: Templates, k: int, frame: LinearFrame, offset: Tensor) -> Tensor:
-    """By what share every mode changes a source's light as its template sees it, per nm.
-
-    The part of the image's change that looks like the image; the rest only adds information.
-    """
+    """Relative change, per nm of every mode, of the flux that a matched filter measures."""
     modes = torch.zeros(len(frame.rows) - frame.first_mode, dtype=torch.float64)
     if not len(modes):
         return modes  # The wavefront was not fitted.

@@ -1,0 +1,96 @@
+"""Factor by which errors are multiplied where the residuals are larger than their noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.field import Image, far_from, separation_of
+from pyklip_diffrender.detection.groups import Group
+from pyklip_diffrender.refinement import Refinement
+
+__all__ = ["error_inflation", "snr_scatter"]
+
+_DEGENERATE = 1e-6
+"""Relative eigenvalue below which sources are degenerate with each other."""
+
+_WINGS = 0.4
+"""arcsec; closer to a candidate, its own light dominates the S/N."""
+
+
+def error_inflation(fits: Sequence[Refinement], groups: Sequence[Group], offsets: Tensor) -> float:
+    """Square root of the reduced chi-squared with the light of sources removed, at least 1.
+
+    Unmodelled structure in the residuals biases planet fluxes, so it inflates their errors. The
+    light of planets is no such structure. A planet of S/N 20 that was not removed would increase
+    all errors by 3 %, so the sources are fitted together and removed first.
+
+    Parameters
+    ----------
+    fits : sequence of Refinement
+    groups : sequence of (LinearModel, Templates)
+        Of these fits.
+    offsets : Tensor, (k, 2)
+        x, y of the sources from the star, arcsec; some may coincide.
+
+    Returns
+    -------
+    float
+        1 if a fit does not explain its data, because its noise then includes a model error.
+    """
+    if not all(fit.status.calibrated for fit in fits):
+        return 1.0
+    reduced = float(np.mean([fit.reduced_chi2 for fit in fits]))
+    companions = Candidates.of_fit(fits[0]).offsets
+    # A ratio, because robust fits give outliers less weight in their linear models.
+    share = _reduced_chi2(groups, offsets) / _reduced_chi2(groups, companions)
+    return math.sqrt(max(1.0, reduced * share))
+
+
+def snr_scatter(snr: Image, grid: Image, offsets: Tensor, inner: float) -> float:
+    """Clipped standard deviation of the S/N away from sources, at least 1.
+
+    Parameters
+    ----------
+    snr : ndarray, (ny, nx)
+    grid : ndarray, (ny, nx, 2)
+        x, y of the pixels from the star, arcsec.
+    offsets : Tensor, (k, 2)
+        x, y of the sources.
+    inner : float
+        Pixels closer to the star than this are ignored, arcsec.
+    """
+    away = (separation_of(grid) >= inner) & np.isfinite(snr) & far_from(grid, offsets, _WINGS)
+    values = snr[away]
+    deviation = 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    # Sources that are not yet candidates must not raise the threshold above themselves.
+    return max(1.0, float(np.clip(values, -5 * deviation, 5 * deviation).std()))
+
+
+def _reduced_chi2(groups: Sequence[Group], offsets: Tensor) -> float:
+    """Reduced chi-squared of the data after the sources and all unknowns are fitted."""
+    pixels = sum(int((frame.weight > 0).sum()) for linear, _ in groups for frame in linear.frames)
+    if not len(offsets):
+        return sum(_chi2(linear.cleaned) for linear, _ in groups) / pixels
+    images = [templates.at(offsets) for _, templates in groups]
+    equations = [
+        linear.normal_equations(part) for (linear, _), part in zip(groups, images, strict=True)
+    ]
+    matrix, vector = (torch.stack(parts).sum(dim=0) for parts in zip(*equations, strict=True))
+    contrasts = torch.linalg.pinv(matrix, rtol=_DEGENERATE, hermitian=True) @ vector
+    independent = int(torch.linalg.matrix_rank(matrix, rtol=_DEGENERATE, hermitian=True))
+    chi2 = 0.0
+    for (linear, _), part in zip(groups, images, strict=True):
+        light = {k: torch.tensordot(contrasts, each, dims=1)[None] for k, each in part.items()}
+        cleaned = linear.clean(light)
+        chi2 += _chi2([whole - cleaned[k][0] for k, whole in enumerate(linear.cleaned)])
+    return chi2 / max(pixels - independent, 1)
+
+
+def _chi2(whitened: Sequence[Tensor]) -> float:
+    return sum(float((part**2).sum()) for part in whitened)
