@@ -19,7 +19,7 @@ from pyklip_diffrender.detection.field import (
     ring_pixels,
     separation_of,
 )
-from pyklip_diffrender.detection.groups import groups_of, weigh
+from pyklip_diffrender.detection.groups import Group, groups_of, weigh
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
 from pyklip_diffrender.detection.result import Detection, contrasts_at
