@@ -248,6 +248,20 @@ def test_alignment_alone_leaves_the_wavefront_as_it_was(tiny: Case, plain: Refin
     assert got.chi2_per_pixel > 3 * plain.chi2_per_pixel
 
 
+@pytest.mark.parametrize("explained", [True, False])
+def test_pixels_have_their_full_weight_where_the_data_are_explained(
+    tiny: Case, explained: bool
+) -> None:
+    """Robust weights would take a faint source for an outlier, and some of its light with it."""
+    fit = quick(tiny, robust=2.0, wavefront=explained)
+    assert (fit.status is Status.CONVERGED) == explained
+    share = fit.linear.frames[0].weight.numpy() * fit.frames[0].observation.error[0]
+    if explained:
+        np.testing.assert_allclose(share, 1.0, rtol=1e-12)
+    else:
+        assert np.quantile(share, 0.2) < 0.8
+
+
 def test_what_is_not_free_stays_where_it_was(tiny: Case) -> None:
     got = quick(tiny, free=("flux",), start={"star_offset": (0.002, -0.001), "background": 500.0})
     assert got.frames[0].values["star_offset"].tolist() == [0.002, -0.001]
