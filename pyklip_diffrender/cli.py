@@ -42,8 +42,8 @@ def _parser() -> argparse.ArgumentParser:
     frames.add_argument(
         "--systematics",
         default="auto",
-        help="pattern of the model's error: 'auto' (from the reference stars and the package's "
-        "library), 'off', or a systematics.fits of an earlier reduction",
+        help="pattern of the model's error: 'auto' (the package's library, else the reference "
+        "stars), 'references' (both), 'off', or a systematics.fits of an earlier reduction",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -210,7 +210,7 @@ def _search(sequence: Sequence, options: argparse.Namespace) -> None:
     from pyklip_diffrender.refinement import Systematics
 
     known = options.systematics
-    if known not in ("auto", "off"):
+    if known not in ("auto", "references", "off"):
         known = Systematics.read(known)
     reduction = reduce(
         sequence,

@@ -85,16 +85,16 @@ def reduce(
     target: str | None = None,
     filter: str | None = None,
     size: int = 80,
-    systematics: Systematics | Literal["auto", "off"] = "auto",
+    systematics: Systematics | Literal["auto", "references", "off"] = "auto",
     settings: GaussNewton | None = None,
     threshold: float = 5.0,
     progress: bool = False,
 ) -> Reduction:
     """Search a sequence of real frames for planets.
 
-    Every reference star is fitted first. What their fits have in common, and what the package's
-    library has from other stars on the same pixels of the detector, is the pattern of the model's
-    error, with which all frames of the target are then fitted together and searched.
+    The pattern of the model's error on the detector's pixels comes from the package's library or,
+    where that has none, from fits of the sequence's reference stars. With it, all frames of the
+    target are fitted together and searched.
 
     Parameters
     ----------
@@ -105,10 +105,11 @@ def reduce(
         See `Sequence.from_files`.
     size : int
         Side in pixels of the square about the star that is fitted.
-    systematics : Systematics, "auto" or "off"
-        Pattern of the model's error. "auto" takes it from the sequence's own reference stars and
-        the package's library (see `known_systematics`); with "off", or where neither has
-        anything, the target is fitted without one.
+    systematics : Systematics, "auto", "references" or "off"
+        Pattern of the model's error. "auto" takes that of the library (see `known_systematics`),
+        and fits the reference stars only where there is none for these pixels; "references" fits
+        them in any case and uses both. With "off", or where neither has anything, the target is
+        fitted without a pattern.
     settings : GaussNewton, optional
         Of the fits; default those of `refine`.
     threshold : float
@@ -134,27 +135,41 @@ def reduce(
     references: list[Refinement] = []
     failed: list[tuple[str, str]] = []
     pattern = systematics if isinstance(systematics, Systematics) else None
-    if systematics == "auto":
-        for star, frames in _by_star(sequence.references).items():
-            _log.info("reference star %s: %d frames", star, len(frames))
-            try:
-                references.append(refine(model, frames, wavefront, **common))
-            except DiffrenderError as error:
-                _log.warning("reference star %s is left out: %s", star, error)
-                failed.append((star, str(error)))
-        pattern = known_systematics(sequence.science[0], references)
+    if systematics in ("auto", "references"):
+        first = sequence.science[0]
+        if systematics == "auto":
+            pattern = known_systematics(first)
+            if pattern is not None:
+                sequence, pattern = _registered(sequence, pattern, model, wavefront, common)
+        if pattern is None and sequence.references:
+            references, failed = _fit_references(sequence, model, wavefront, common)
+            pattern = known_systematics(first, references)
         _log.info("pattern of the model's error: %s", pattern)
-        if pattern is not None and not references:
-            sequence, pattern = _registered(sequence, pattern, model, wavefront, common)
     elif systematics != "off" and pattern is None:
         raise IncompatibleSetupError(
-            f"systematics: got {systematics!r}, expected 'auto', 'off' or a Systematics"
+            f"systematics: got {systematics!r}, expected 'auto', 'references', 'off' or a "
+            "Systematics"
         )
     if pattern is not None and settings is None and sequence.science[0].is_nircam:
         common["settings"] = GaussNewton.nircam(min_model_error=_KNOWN_MODEL_ERROR)
     fit = refine(model, sequence.science, wavefront, systematics=pattern, **common)
     detection = detect(fit, threshold=threshold, progress=progress)
     return Reduction(sequence, fit, detection, tuple(references), pattern, tuple(failed))
+
+
+def _fit_references(
+    sequence: Sequence, model: OpticalSystem, wavefront: OPDMap, common: dict[str, Any]
+) -> tuple[list[Refinement], list[tuple[str, str]]]:
+    """One fit for every reference star; names of those that fail, and why."""
+    fits, failed = [], []
+    for star, frames in _by_star(sequence.references).items():
+        _log.info("reference star %s: %d frames", star, len(frames))
+        try:
+            fits.append(refine(model, frames, wavefront, **common))
+        except DiffrenderError as error:
+            _log.warning("reference star %s is left out: %s", star, error)
+            failed.append((star, str(error)))
+    return fits, failed
 
 
 def _registered(

@@ -246,5 +246,42 @@ def test_half_a_file_is_no_refinement(tmp_path: Path, percent: int) -> None:
 
 def test_reduce_says_what_systematics_it_takes() -> None:
     sequence = Sequence("TARGET", (frame("TARGET", 20),))
-    with pytest.raises(IncompatibleSetupError, match=r"'maybe', expected 'auto', 'off' or a Sys"):
+    with pytest.raises(IncompatibleSetupError, match=r"'maybe', expected 'auto', 'references'"):
         reduce(sequence, opd(), size=SIZE, systematics="maybe")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("systematics", "library", "fits"),
+    [
+        ("auto", True, ["TARGET"]),
+        ("auto", False, ["REF", "TARGET"]),
+        ("references", True, ["REF", "TARGET"]),
+        ("off", True, ["TARGET"]),
+    ],
+)
+def test_references_are_fitted_only_where_they_are_needed(
+    monkeypatch: pytest.MonkeyPatch, systematics: str, library: bool, fits: list[str]
+) -> None:
+    fitted, patterns = [], []
+    known = learn_systematics(reference_fit())
+
+    def fit(model: object, frames: object, opd: object, **options: object) -> Refinement:
+        several = [frames] if isinstance(frames, Observation) else frames
+        (first, *_) = several  # type: ignore[misc]
+        fitted.append(first.target)
+        patterns.append(options.get("systematics"))
+        return reference_fit()
+
+    def from_library(observation: Observation, references: object = ()) -> Systematics | None:
+        return known if library or references else None
+
+    monkeypatch.setattr("pyklip_diffrender.reduction.refine", fit)
+    monkeypatch.setattr("pyklip_diffrender.reduction.known_systematics", from_library)
+    monkeypatch.setattr("pyklip_diffrender.reduction.detect", lambda fit, **options: None)
+    there = replace(frame("TARGET", 20), first_pixel=(0, 0))
+    sequence = Sequence("TARGET", (there,), (frame("REF", 10), frame("REF", 11)))
+    result = reduce(sequence, opd(), size=SIZE, systematics=systematics)  # type: ignore[arg-type]
+    assert fitted == fits
+    assert patterns[-1] is (None if systematics == "off" else known)
+    assert result.systematics is patterns[-1]
+    assert len(result.references) == len(fits) - 1

@@ -50,7 +50,7 @@ def main() -> None:
     chosen = [each for each in sequence.references if each.target in options.references]
     sequence = replace(sequence, references=tuple(chosen))
     began = time.perf_counter()
-    result = dr.reduce(sequence, options.opd)
+    result = dr.reduce(sequence, options.opd, systematics="references" if chosen else "auto")
     seconds = time.perf_counter() - began
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(f"{result}\n{seconds:.0f} s, {memory:.1f} GB")
