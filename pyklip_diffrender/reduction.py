@@ -64,7 +64,11 @@ class Reduction:
         return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"
 
     def __str__(self) -> str:
-        return f"{self.sequence!r}\n{self.fit.status.message}\n{self.detection}"
+        known = "none" if self.systematics is None else f"from {self.systematics.name}"
+        return (
+            f"{self.sequence!r}\n{self.fit.status.message}\n"
+            f"pattern of the model's error: {known}\n{self.detection}"
+        )
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write maps, tables, the fit, the systematics and a report; returns the paths."""
