@@ -148,7 +148,7 @@ def refine_candidates(groups: Sequence[Group], candidates: Candidates, reach: fl
             converged = True
             break
     if not converged:
-        _log.warning("positions did not settle, number of candidates: %d", count)
+        _log.info("positions did not settle, number of candidates: %d", count)
     return Candidates(offsets, contrasts, covariance, converged)
 
 

@@ -111,6 +111,11 @@ def detect(
         fits = with_companions(fits, candidates, progress)
         maps = Maps(groups_of(fits), progress)
         candidates, factor = _search(maps, fits, threshold, inner, scatter, candidates)
+    if not candidates.converged:
+        _log.warning(
+            "the positions of %d candidates did not settle; two of them may be one source, or the "
+            "star's own error", len(candidates)
+        )  # fmt: skip
     information = np.where(maps.information > 0, maps.information, np.nan)
     photon = np.where(maps.photon > 0, maps.photon, np.nan) ** -0.5
     error = factor / np.sqrt(information)
