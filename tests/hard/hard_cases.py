@@ -25,9 +25,10 @@ DTYPES = (torch.float64, torch.float32)
 WAVELENGTH = 4.5e-6
 NPIX = 128
 
-FLOAT32_IMAGE = 2e-5
+FLOAT32_IMAGE = 3e-5
 """Limit of a float32 image: 6e-8 a product, and what the coronagraph leaves is the small
-difference of fields 20 times as large; 1e-6 plane by plane, 8e-6 on the lattice were measured."""
+difference of fields 20 times as large; 1e-6 plane by plane, 8e-6 on the lattice were measured, and
+2.1e-5 with torch 2.6, whose sums are ordered differently."""
 
 
 @dataclass(frozen=True)
