@@ -30,6 +30,7 @@ LENIENT = (
     "-Wdefault::DeprecationWarning",
     "-Wdefault::PendingDeprecationWarning",
     "-Wdefault::FutureWarning",
+    "-Wdefault::astropy.utils.exceptions.AstropyDeprecationWarning",
 )
 
 
