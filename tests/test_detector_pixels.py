@@ -244,7 +244,15 @@ def test_lost_pixels_are_found_by_the_pattern(moved: tuple[float, float] | None)
         own = flat[3 - whole[1] : 35 - whole[1], 3 - whole[0] : 35 - whole[0]]
         onto = onto * (1 + own)
         data = np.fft.ifft2(fourier_shift(np.fft.fft2(onto), (y - whole[1], x - whole[0]))).real
-    observation = replace(frames, data=data[None], header=fits.Header({"DETECTOR": "NRCALONG"}))
+    # A dead pixel in the light of the star, which must not spread when the frame is shifted.
+    valid = np.ones((1, 32, 32), dtype=bool)
+    valid[0, 12, 20] = False
+    observation = replace(
+        frames,
+        data=np.where(valid, data, 0.0),
+        valid=valid,
+        header=fits.Header({"DETECTOR": "NRCALONG"}),
+    )
     settings = dr.GaussNewton(cycles=6, min_model_error=0.05)
     fit = dr.refine(system(), observation, opd, settings=settings, plan="off")
     known = dr.Systematics(
@@ -257,3 +265,6 @@ def test_lost_pixels_are_found_by_the_pattern(moved: tuple[float, float] | None)
     assert frame is not None
     assert frame.first_pixel == (103 - 0, 203 - 1)
     np.testing.assert_allclose(frame.center - observation.center, [[-0.3, -0.2]], atol=0.11)
+    assert np.array_equal(frame.valid, valid)
+    for row, column in ((12, 19), (12, 21), (11, 20), (13, 20)):
+        assert frame.data[0, row, column] == pytest.approx(onto[row, column], rel=0.08)

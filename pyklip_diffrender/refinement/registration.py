@@ -85,10 +85,17 @@ def register(fit: Refinement, known: Systematics) -> Observation | None:
     whole = np.round(moved).astype(int)
     shift = np.broadcast_to(whole - moved, (len(observation), 2))
     column, row = np.subtract(known.first_pixel, whole).tolist()
+    # Masked pixels hold nothing of the star; left so, they would ring into their neighbours.
+    valid = observation.valid
+    data = shift_frames(np.where(valid, observation.data, frame.star), shift)
+    typical = np.median(observation.error[valid])
+    error = shift_frames(np.where(valid, observation.error, typical), shift)
+    valid = valid & (error > 0)
     return replace(
         observation,
-        data=np.where(observation.valid, shift_frames(observation.data, shift), 0.0),
-        error=np.where(observation.valid, shift_frames(observation.error, shift), 1.0),
+        data=np.where(valid, data, 0.0),
+        error=np.where(valid, error, 1.0),
+        valid=valid,
         center=observation.center + shift,
         first_pixel=(column, row),
     )

@@ -1,4 +1,4 @@
-"""Planets injected into real frames: this package and pyKLIP on the same frames.
+"""Planets injected into real frames: this package and KLIP (pyKLIP's) on the same frames.
 
 Run from the root of the project, with the frames of programme 1184 in ../shared/data/gto1184::
 
