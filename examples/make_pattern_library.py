@@ -18,6 +18,7 @@ from pyklip_diffrender.refinement.learning import (
     MeasuredPattern,
     combine_patterns,
     measure_patterns,
+    thermal_light,
 )
 from pyklip_diffrender.refinement.library import write_patterns
 
@@ -26,10 +27,10 @@ log = logging.getLogger(__name__)
 SIZE = 80
 
 
-def patterns_of(
+def fit_of(
     star: str, name: str, files: list[Path], opd: Path, others: list[MeasuredPattern]
-) -> list[MeasuredPattern]:
-    """Fit all rolls of a star together and measure the pattern in each."""
+) -> dr.Refinement:
+    """Fit all rolls of a star together."""
     sequence = dr.Sequence.from_files(files, target=star, filter=name)
     model = dr.model_for(sequence.science[0], SIZE)
     frames = sequence.cutout(SIZE).science
@@ -38,7 +39,7 @@ def patterns_of(
     settings = dr.GaussNewton.nircam(max_companions=0, min_model_error=error)
     fit = dr.refine(model, frames, opd, settings=settings, systematics=known)
     log.info("%s %s: %s, chi2 %.2f", star, name, fit.status.name, fit.chi2_per_pixel)
-    return measure_patterns(fit)
+    return fit
 
 
 def main() -> None:
@@ -55,11 +56,16 @@ def main() -> None:
     files = sorted(options.folder.glob("*.fits*"))
     library = []
     for name in options.filters:
-        first = {star: patterns_of(star, name, files, options.opd, []) for star in options.stars}
+        first = {star: fit_of(star, name, files, options.opd, []) for star in options.stars}
+        thermal = thermal_light(list(first.values()))
+        log.info("%s: thermal background %.3g", name, thermal)
+        second = []
         for star in options.stars:
-            others = [p for other, own in first.items() if other != star for p in own]
-            library += patterns_of(star, name, files, options.opd, others)
-            write_patterns(library, options.output)
+            others = [fit for other, fit in first.items() if other != star]
+            known = measure_patterns(others, thermal)
+            second.append(fit_of(star, name, files, options.opd, known))
+        library += measure_patterns(second, thermal)
+        write_patterns(library, options.output)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ def frame(k: int, rows: list[int], drift: list[int], first_mode: int) -> LinearF
         rows=torch.tensor(rows),
         drift=torch.tensor(drift, dtype=torch.int64),
         first_mode=first_mode,
+        common=torch.zeros(NY, NX, dtype=torch.float64),
     )
 
 
@@ -54,10 +55,24 @@ def dense(model: LinearModel) -> tuple[Tensor, Tensor, Tensor]:
     )
 
 
+def noise(model: LinearModel) -> Tensor:
+    """Covariance of the noise of all whitened pixels, with the pattern that frames share."""
+    c = torch.stack([(part.weight * part.common).flatten() for part in model.frames])
+    # c = s g / sqrt(1 + g^2 s^2), the other way round: g^2 s s^T = c c^T / (1 - c^2).
+    shared = c[:, None] * c / (1 - (c**2).sum(dim=0))
+    frames, pixels = c.shape
+    matrix = torch.eye(frames * pixels, dtype=torch.float64)
+    for a in range(frames):
+        for b in range(frames):
+            block = matrix[a * pixels : (a + 1) * pixels, b * pixels : (b + 1) * pixels]
+            block.diagonal().add_(shared[a, b])
+    return matrix
+
+
 def covariance(model: LinearModel) -> tuple[Tensor, Tensor]:
     """Sigma of all whitened pixels, and the data."""
     jacobian, data, prior = dense(model)
-    return torch.eye(len(data), dtype=torch.float64) + jacobian.T @ prior @ jacobian, data
+    return noise(model) + jacobian.T @ prior @ jacobian, data
 
 
 @pytest.fixture
@@ -98,6 +113,34 @@ def pair() -> LinearModel:
     return replace(model, curvature=jacobian @ jacobian.T)
 
 
+@pytest.fixture
+def patterned(pair: LinearModel) -> LinearModel:
+    """Two frames of one detector, whose pattern multiplies both."""
+    star = torch.stack([3 * random(NY, NX, seed=60 + k).abs() for k in range(2)])
+    width = 0.1 + random(NY, NX, seed=62).abs()
+    seen = sum((part.weight * s) ** 2 for part, s in zip(pair.frames, star, strict=True))
+    common = star * width / torch.sqrt(1 + width**2 * seen)
+    model = replace(
+        pair,
+        frames=tuple(replace(p, common=c) for p, c in zip(pair.frames, common, strict=True)),
+    )
+    jacobian, _, _ = dense(model)
+    return replace(model, curvature=jacobian @ torch.linalg.solve(noise(model), jacobian.T))
+
+
+def test_the_covariance_of_a_shared_pattern_is_the_one_that_is_written_down(
+    patterned: LinearModel,
+) -> None:
+    """C from its definition, g^2 s_a s_b between frames, in one pixel."""
+    star = torch.stack([3 * random(NY, NX, seed=60 + k).abs() for k in range(2)])
+    width = 0.1 + random(NY, NX, seed=62).abs()
+    matrix, place = noise(patterned), 3 * NX + 4
+    a, b = (part.weight[3, 4] for part in patterned.frames)
+    expected = width[3, 4] ** 2 * a * star[0, 3, 4] * b * star[1, 3, 4]
+    torch.testing.assert_close(matrix[place, NY * NX + place], expected)
+    assert float(expected) > 0.1
+
+
 def stacked(model: LinearModel, templates: dict[int, Tensor]) -> Tensor:
     """Whitened templates over all frames, (k, pixels)."""
     count = len(next(iter(templates.values())))
@@ -110,7 +153,7 @@ def stacked(model: LinearModel, templates: dict[int, Tensor]) -> Tensor:
     ).double()
 
 
-@pytest.mark.parametrize("name", ["single", "pair"])
+@pytest.mark.parametrize("name", ["single", "pair", "patterned"])
 def test_amplitudes_are_those_of_the_full_covariance(
     name: str, request: pytest.FixtureRequest
 ) -> None:
@@ -123,7 +166,8 @@ def test_amplitudes_are_those_of_the_full_covariance(
     torch.testing.assert_close(found.numerator, white @ inverse @ data, rtol=1e-5, atol=1e-6)
     wanted = (white @ inverse @ white.T).diagonal()
     torch.testing.assert_close(found.information, wanted, rtol=1e-5, atol=0)
-    torch.testing.assert_close(found.photon, (white**2).sum(dim=1), rtol=1e-12, atol=0)
+    alone = (white @ torch.linalg.solve(noise(model), white.T)).diagonal()
+    torch.testing.assert_close(found.photon, alone, rtol=1e-9, atol=0)
     # The unknowns' freedom costs something, and how much is not the same for all templates.
     lost = found.information / found.photon
     assert float(lost.max()) < 0.99
@@ -133,7 +177,9 @@ def test_amplitudes_are_those_of_the_full_covariance(
     torch.testing.assert_close(vector, found.numerator, rtol=1e-5, atol=1e-6)
 
 
-def test_a_template_may_be_in_one_frame_only(pair: LinearModel) -> None:
+@pytest.mark.parametrize("name", ["pair", "patterned"])
+def test_a_template_may_be_in_one_frame_only(name: str, request: pytest.FixtureRequest) -> None:
+    pair: LinearModel = request.getfixturevalue(name)
     templates = {1: random(2, NY, NX, seed=51)}
     sigma, data = covariance(pair)
     white = stacked(pair, templates)
@@ -145,10 +191,15 @@ def test_a_template_may_be_in_one_frame_only(pair: LinearModel) -> None:
     torch.testing.assert_close(cleaned, expected, rtol=1e-5, atol=1e-5)
 
 
-def test_the_step_leads_to_the_most_probable_unknowns(pair: LinearModel) -> None:
+@pytest.mark.parametrize("name", ["pair", "patterned"])
+def test_the_step_leads_to_the_most_probable_unknowns(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    pair: LinearModel = request.getfixturevalue(name)
     jacobian, data, prior = dense(pair)
-    precision = torch.linalg.inv(prior) + jacobian @ jacobian.T
-    wanted = torch.linalg.solve(precision, jacobian @ data)
+    weighed = torch.linalg.solve(noise(pair), jacobian.T).T
+    precision = torch.linalg.inv(prior) + weighed @ jacobian.T
+    wanted = torch.linalg.solve(precision, weighed @ data)
     got = pair.vector + pair.step - pair.mean
     torch.testing.assert_close(got, wanted, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(pair.covariance, torch.linalg.inv(precision), rtol=1e-8, atol=1e-10)
@@ -170,14 +221,19 @@ def test_where_the_model_is_linearised_does_not_matter(single: LinearModel) -> N
     )
 
 
-def test_a_left_out_patch_is_predicted_by_all_other_pixels(single: LinearModel) -> None:
+@pytest.mark.parametrize("name", ["single", "patterned"])
+def test_a_left_out_patch_is_predicted_by_all_other_pixels(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    single: LinearModel = request.getfixturevalue(name)
     sigma, data = covariance(single)
     residual, deviation = single.left_out(size=3)
     weight = single.frames[0].weight
     assert bool(torch.isnan(residual[1, 2]))
     patch = torch.zeros(NY, NX, dtype=torch.bool)
     patch[0:3, 3:6] = True
-    inside, outside = patch.flatten(), ~patch.flatten()
+    inside = torch.cat([patch.flatten(), torch.zeros(len(data) - NY * NX, dtype=torch.bool)])
+    outside = ~inside
     across = sigma[inside][:, outside]
     solved = torch.linalg.solve(sigma[outside][:, outside], across.T)
     expected = (data[inside] - solved.T @ data[outside]) / weight[patch]

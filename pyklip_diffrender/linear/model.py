@@ -9,11 +9,21 @@ Cholesky factor of P + G G^T. The flux of a template p and its error are
 
 This marginalisation is in section 2.7 of C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes
 for Machine Learning" (2006). Unknowns are rows of G, pixels are columns.
+
+Frames of the same pixels of a detector share the error of its flat field. A pattern m_p with a
+Gaussian prior of width g_p multiplies the star s_fp of every frame f in pixel p. The noise of one
+pixel is therefore correlated between frames, with the covariance C = diag(1 / w_f^2) + g^2 s s^T.
+Its inverse is diagonal but for one term (the Sherman-Morrison formula):
+
+    C^-1 = W - W c c^T W,    c_f = s_f g / sqrt(1 + g^2 sum_f w_f^2 s_f^2),    W = diag(w_f^2).
+
+Every inner product above therefore loses the product of two images that are summed over frames
+with the weights W c. The frames' `common` is c.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -25,7 +35,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
 
-__all__ = ["LinearFrame", "LinearModel", "TemplateProducts", "Unknown"]
+__all__ = ["LinearFrame", "LinearModel", "TemplateProducts", "Unknown", "summed_rows"]
 
 _BATCH = 512
 """Number of templates that are processed at a time."""
@@ -72,6 +82,8 @@ class LinearFrame:
         those of the other frames.
     first_mode : int
         Index of the first wavefront mode among the rows.
+    common : Tensor, (ny, nx), float64
+        c of the pattern that the frames share, in the data's unit; 0 without one.
     """
 
     residual: Tensor
@@ -80,6 +92,7 @@ class LinearFrame:
     rows: Tensor
     drift: Tensor
     first_mode: int
+    common: Tensor
 
     def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
         """Sum values by row, (rows, k), to values by unknown, (size, k)."""
@@ -93,6 +106,10 @@ class LinearFrame:
         rows = values[self.rows]
         rows[self.first_mode : self.first_mode + len(self.drift)] += values[self.drift]
         return rows
+
+    def summed(self, images: Tensor) -> Tensor:
+        """This frame's part of the sum W c x over frames, for images x, (..., ny, nx)."""
+        return images * (self.weight**2 * self.common).to(images.dtype)
 
     def image(self, values: Tensor) -> Tensor:
         """Change of the image, (..., ny, nx), for changes of the unknowns, (size, ...)."""
@@ -112,7 +129,7 @@ class TemplateProducts(NamedTuple):
     information : Tensor
         p . Sigma^-1 p.
     photon : Tensor
-        p . p, whitened: the information if all parameters of the star were known.
+        p . C^-1 p, the information if all parameters of the star were known.
     """
 
     numerator: Tensor
@@ -133,7 +150,7 @@ class LinearModel:
     mean, deviation : Tensor, (unknowns,)
         Mean and standard deviation of the priors; inf for no prior.
     curvature : Tensor, (unknowns, unknowns)
-        G G^T over all frames, float64.
+        G G^T over all frames (J C^-1 J^T where they share a pattern), float64.
     """
 
     unknowns: tuple[Unknown, ...]
@@ -148,6 +165,26 @@ class LinearModel:
         return (
             f"<LinearModel: {len(self.unknowns)} unknowns, {len(self.frames)} x {ny} x {nx} pixels>"
         )
+
+    @cached_property
+    def shares_pattern(self) -> bool:
+        """Whether the frames share a pattern of the detector."""
+        return any(bool((frame.common != 0).any()) for frame in self.frames)
+
+    @cached_property
+    def _summed_rows(self) -> Tensor:
+        """W c summed over frames with the derivative by every unknown, (unknowns, pixels)."""
+        return summed_rows(self.frames, len(self.vector))
+
+    def _whitened(self, images: Mapping[int, Tensor]) -> dict[int, Tensor]:
+        """C^-1 x over w of images x by frame, (..., ny, nx), for all frames."""
+        whitened = {k: self.frames[k].weight * image for k, image in images.items()}
+        if self.shares_pattern:
+            total = sum(self.frames[k].summed(image) for k, image in images.items())
+            for k, frame in enumerate(self.frames):
+                shared = frame.weight * frame.common * total
+                whitened[k] = whitened[k] - shared if k in whitened else -shared
+        return whitened
 
     @cached_property
     def _scale(self) -> Tensor:
@@ -184,15 +221,19 @@ class LinearModel:
             weighted = (frame.weight**2 * frame.residual).flatten()
             on_rows = frame.jacobian.flatten(1) @ weighted.float()
             gradient = gradient + frame.onto_unknowns(on_rows.double(), len(self.vector))
+        if self.shares_pattern:
+            total = torch.stack([frame.summed(frame.residual) for frame in self.frames]).sum(dim=0)
+            gradient = gradient - self._summed_rows.double() @ total.flatten()
         scaled = torch.cholesky_solve((gradient * self._scale)[:, None], self._factor)[:, 0]
         return scaled * self._scale
 
     @cached_property
     def cleaned(self) -> tuple[Tensor, ...]:
         """Sigma^-1 r of every frame, (ny, nx): the whitened residual of the most probable model."""
-        return tuple(
-            frame.weight * (frame.residual - frame.image(self.step)) for frame in self.frames
+        whitened = self._whitened(
+            {k: frame.residual - frame.image(self.step) for k, frame in enumerate(self.frames)}
         )
+        return tuple(whitened[k] for k in range(len(self.frames)))
 
     def projected(self, templates: Mapping[int, Tensor]) -> Tensor:
         """Projection L^-1 G p of templates onto the unknowns, with P + G G^T = L L^T.
@@ -215,8 +256,18 @@ class LinearModel:
             weighted = (images * (frame.weight**2).to(images.dtype)).flatten(1)
             on_rows = frame.jacobian.flatten(1) @ weighted.T.to(frame.jacobian.dtype)
             total += frame.onto_unknowns(on_rows.double(), len(self.vector))
+        if self.shares_pattern:
+            summed = self._summed(templates)
+            total -= (self._summed_rows @ summed.T.to(self._summed_rows.dtype)).double()
         return torch.linalg.solve_triangular(
             self._factor, total * self._scale[:, None], upper=False
+        )
+
+    def _summed(self, templates: Mapping[int, Tensor]) -> Tensor:
+        """W c summed over frames with templates, (k, pixels)."""
+        return sum(
+            (self.frames[k].summed(images.double()).flatten(1) for k, images in templates.items()),
+            start=torch.zeros(()),
         )
 
     def weigh(self, templates: Mapping[int, Tensor]) -> TemplateProducts:
@@ -243,6 +294,8 @@ class LinearModel:
                 whitened = (images * self.frames[k].weight.to(images.dtype)).double()
                 numerator += torch.tensordot(whitened, self.cleaned[k], dims=2)
                 photon += (whitened**2).sum(dim=(1, 2))
+            if self.shares_pattern:
+                photon -= (self._summed(part) ** 2).sum(dim=1)
             parts.append(TemplateProducts(numerator, photon - lost, photon))
         return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
@@ -255,13 +308,12 @@ class LinearModel:
             self._factor.T, self.projected(templates), upper=True
         )
         solved = solved * self._scale[:, None]
-        residuals = {}
+        images = {}
         for k, frame in enumerate(self.frames):
-            left = -frame.image(solved)
+            images[k] = -frame.image(solved)
             if k in templates:
-                left += templates[k].double()
-            residuals[k] = frame.weight * left
-        return residuals
+                images[k] += templates[k].double()
+        return self._whitened(images)
 
     def normal_equations(self, templates: Mapping[int, Tensor]) -> tuple[Tensor, Tensor]:
         """Return p_i . Sigma^-1 p_j and p_i . Sigma^-1 r of templates that are fitted together."""
@@ -272,6 +324,9 @@ class LinearModel:
             whitened = (images.double() * self.frames[k].weight).flatten(1)
             matrix += whitened @ whitened.T
             vector += whitened @ self.cleaned[k].flatten()
+        if self.shares_pattern:
+            summed = self._summed(templates)
+            matrix -= summed @ summed.T
         return matrix, vector
 
     def without(
@@ -333,6 +388,11 @@ class LinearModel:
         white = part.jacobian.double() * part.weight
         basis = torch.zeros(len(self.vector), ny * nx, dtype=torch.float64)
         basis.copy_(part.onto_unknowns(white.flatten(1), len(self.vector)))
+        precision = torch.ones(ny, nx, dtype=torch.float64)
+        if self.shares_pattern:
+            shared = part.weight * part.common
+            basis -= self._summed_rows * shared.flatten()
+            precision -= shared**2
         basis = torch.linalg.solve_triangular(
             self._factor, basis * self._scale[:, None], upper=False
         ).reshape(-1, ny, nx)
@@ -345,7 +405,7 @@ class LinearModel:
                 if not bool(counts.any()):
                     continue
                 inside = basis[:, window[0], window[1]][:, counts]
-                inverse = torch.eye(inside.shape[1], dtype=torch.float64) - inside.T @ inside
+                inverse = torch.diag(precision[window][counts]) - inside.T @ inside
                 covariance = torch.linalg.inv(inverse)
                 weight = part.weight[window][counts]
                 left = covariance @ self.cleaned[frame][window][counts] / weight
@@ -354,3 +414,11 @@ class LinearModel:
                     counts, covariance.diagonal().sqrt() / weight
                 )
         return residual, deviation
+
+
+def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Tensor:
+    """W c summed over frames with the derivative by every unknown, (unknowns, pixels), float32."""
+    total = torch.zeros(unknowns, frames[0].weight.numel(), dtype=torch.float32)
+    for frame in frames:
+        total += frame.onto_unknowns(frame.summed(frame.jacobian).flatten(1), unknowns)
+    return total

@@ -38,7 +38,8 @@ class Point:
     image : Tensor, (ny, nx)
         The star at flux 1.
     light : Tensor, (ny, nx)
-        The star in the data's unit, with the known pattern of the model's error.
+        The star in the data's unit, with the known pattern of the model's error (also that of the
+        thermal background).
     star : Tensor, (ny, nx)
         The same with the background.
     total : Tensor, (ny, nx)
@@ -101,7 +102,7 @@ class Forward:
         with torch.no_grad():
             fields = self.model.fields(opd, **values)
             image = self.model.image_of(fields, values).double()
-        light = flux * self.problem.gain * image
+        light = flux * self.problem.gain * image + self.problem.pedestal
         star = light + unknowns.level("background", vector)
         total = star
         if unknowns.shows_companions and len(unknowns.companions):

@@ -20,7 +20,7 @@ from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.refinement.joint_layout import JointLayout
 from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
-from pyklip_diffrender.refinement.objective import Objective, State
+from pyklip_diffrender.refinement.objective import Objective, State, Weights
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.wavefront.bases import Basis
@@ -176,7 +176,7 @@ class Solver:
         """
         layout, objective = state.joint, self.objective
         equations = self._equations = linearise(objective, state, kappa, modes, objective.robust)
-        sigmas = [objective.sigma(k, point, kappa) for k, point in enumerate(state.points)]
+        weights = objective.weights(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else self.damping
         update = self._solve(layout, equations, fit_scales=fits_scales, damping=damping)
@@ -185,7 +185,7 @@ class Solver:
         if expected < self.settings.tolerance * objective.pixels:
             # The gain is not worth another linearisation.
             return state, expected / objective.pixels
-        before = self._cost(state, sigmas)
+        before = self._cost(state, weights)
         for _ in range(_TRIES):
             if self.damping != damping:
                 damping = self.damping
@@ -194,7 +194,7 @@ class Solver:
             vector = state.vector.clone()
             vector[: len(update.step)] += update.step - equations.current
             trial = objective.at(layout, layout.clamped(vector))
-            after = self._cost(trial, sigmas)
+            after = self._cost(trial, weights)
             if after < before:
                 self._relax((before - after) / expected)
                 return trial, (before - after) / objective.pixels
@@ -272,10 +272,14 @@ class Solver:
         )
         return update.in_units(own)
 
-    def _cost(self, state: State, sigmas: Sequence[Tensor]) -> float:
-        """Penalised chi-squared."""
+    def _cost(self, state: State, weights: Sequence[Weights]) -> float:
+        """Penalised chi-squared.
+
+        With weights that were made robust about the state before a step, a step that lowers it also
+        lowers Cauchy's loss.
+        """
         away = (state.vector - state.joint.initial()) / self.prior_deviation(state.joint)
-        return self.objective.loss(state, sigmas) + float((away**2).sum())
+        return self.objective.chi2(state, weights) + float((away**2).sum())
 
     def _predicted_gain(
         self, layout: JointLayout, equations: NormalEquations, step: Tensor

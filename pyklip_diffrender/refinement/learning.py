@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement.frame_fit import FrameFit
@@ -18,12 +20,23 @@ __all__ = [
     "combine_patterns",
     "learn_systematics",
     "measure_patterns",
+    "thermal_light",
 ]
 
 Image = NDArray[np.float64]
 
 _RING = 4.0
 """Width in pixels of the rings in which scatters are estimated."""
+
+_FIRST_RING = 2
+"""First ring from which the thermal background is estimated: closer to the star, residuals are
+also those of the wavefront."""
+
+_FEW = 50
+"""Number of pixels below which a ring is not used for that."""
+
+_RING_TO_RING = 0.2
+"""Relative error of a ring's mean product, because the pattern is not the same in all of them."""
 
 _OUTLIER = 4.0
 """Standard deviations from the median of the frames beyond which a pixel of a frame is left out:
@@ -38,7 +51,7 @@ class MeasuredPattern:
     ----------
     star : str
     value : ndarray, (ny, nx)
-        Residual over star; 0 where not known.
+        Residual over star and thermal background; 0 where not known.
     variance : ndarray, (ny, nx)
         Of the data's noise; inf where not known.
     center : tuple of float
@@ -48,6 +61,8 @@ class MeasuredPattern:
     filter, image_mask : str or None
     frame, date : str
         Where and when it was measured.
+    thermal : float
+        Thermal background that was assumed, in the unit of the frames.
     """
 
     star: str
@@ -59,6 +74,7 @@ class MeasuredPattern:
     image_mask: str | None = None
     frame: str = ""
     date: str = ""
+    thermal: float = 0.0
 
 
 def learn_systematics(
@@ -66,7 +82,9 @@ def learn_systematics(
 ) -> Systematics:
     """Learn the pattern that the star model misses from fits of other stars.
 
-    In every frame the residual is divided by the star. The ratios are averaged with inverse
+    In every frame the residual is divided by the star and the thermal background. The brightness of
+    the latter is the one with which the pattern is as strong far from the star as it is near it,
+    see `thermal_light`. The ratios are averaged with inverse
     variances, which are those of the data's noise and of the scatter between frames beyond that
     noise; a zero-mean Gaussian prior, as wide as the ratios scatter over the pixels of a ring,
     shrinks pixels that were not measured well. The error of the pattern for another frame is that
@@ -99,10 +117,79 @@ def learn_systematics(
     return combine_patterns(patterns, name)
 
 
-def measure_patterns(fits: Refinement | Sequence[Refinement]) -> list[MeasuredPattern]:
-    """Measure the pattern in every frame of the fits that did not fail."""
+def measure_patterns(
+    fits: Refinement | Sequence[Refinement], thermal: float | None = None
+) -> list[MeasuredPattern]:
+    """Measure the pattern in every frame of the fits that did not fail.
+
+    Parameters
+    ----------
+    fits : Refinement or sequence of Refinement
+    thermal : float, optional
+        Thermal background, in the unit of the frames. By default it is estimated.
+    """
     several = [fits] if isinstance(fits, Refinement) else list(fits)
-    return [_measured(frame) for fit in several if fit.status.usable for frame in fit.frames]
+    usable = [fit for fit in several if fit.status.usable]
+    if thermal is None:
+        thermal = thermal_light(usable)
+    return [_measured(frame, fit, thermal) for fit in usable for frame in fit.frames]
+
+
+def thermal_light(fits: Sequence[Refinement]) -> float:
+    """Estimate the thermal background that the pattern of the model's error multiplies.
+
+    The thermal background is subtracted from frames as if the flat field were perfect. What remains
+    of it is a fixed pattern that does not become fainter with the distance from the star. The
+    product of the residuals of two frames of the same pixels, averaged over a ring, is
+    m^2 (s_1 + B) (s_2 + B) for a pattern of rms m and stars s: a least-squares fit to all rings
+    gives m and B.
+
+    Returns
+    -------
+    float
+        In the unit of the frames; 0 where no two frames of a fit show the same pixels.
+    """
+    rings = [ring for fit in fits for ring in _products(fit)]
+    if not rings:
+        return 0.0
+    product, first, second, error = np.array(rings).T
+
+    def misfit(thermal: float) -> float:
+        shape = (first + thermal) * (second + thermal)
+        strength = (shape * product / error**2).sum() / ((shape / error) ** 2).sum()
+        return float((((product - strength * shape) / error) ** 2).sum())
+
+    brightest = float(np.sqrt((first * second).max()))
+    return float(minimize_scalar(misfit, bounds=(0.0, brightest), method="bounded").x)
+
+
+def _products(fit: Refinement) -> list[tuple[float, float, float, float]]:
+    """Mean product of the residuals of two frames, mean stars, and error, for every ring."""
+    rings = []
+    for a, b in combinations(fit.frames, 2):
+        pixel = a.observation.first_pixel
+        if pixel is None or pixel != b.observation.first_pixel:
+            continue
+        (light, left, noise, valid), (light_b, left_b, noise_b, valid_b) = (
+            _light_and_residual(frame, fit) for frame in (a, b)
+        )
+        x, y = a.observation.center[0]
+        ring = _rings(light.shape, (float(x), float(y)))
+        for k in range(_FIRST_RING, ring.max() + 1):
+            inside = (ring == k) & valid & valid_b
+            products = (left * left_b)[inside]
+            if len(products) < _FEW:
+                continue
+            # Clipped, because companions and outliers are no part of the pattern.
+            variances = [_median_variance(each[inside]) for each in (left, left_b)]
+            limit = _OUTLIER * np.sqrt(np.prod(variances))
+            mean = float(np.clip(products, -limit, limit).mean())
+            scatter = float(np.sqrt((noise**2).mean() * (noise_b**2).mean() / len(products)))
+            rings.append(
+                (mean, float(light[inside].mean()), float(light_b[inside].mean()),
+                 float(np.hypot(scatter, _RING_TO_RING * mean)))
+            )  # fmt: skip
+    return rings
 
 
 def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = None) -> Systematics:
@@ -114,6 +201,12 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
         For none, or patterns of different filters.
     """
     filters = {pattern.filter for pattern in patterns}
+    thermal = {pattern.thermal for pattern in patterns}
+    if len(thermal) != 1:
+        raise IncompatibleSetupError(
+            f"systematics: got patterns for thermal backgrounds of {sorted(thermal)}, expected "
+            "one. Measure them with the same value of thermal"
+        )
     if len(filters) != 1:
         raise IncompatibleSetupError(
             f"systematics: got patterns of {sorted(map(str, filters))}, expected one filter"
@@ -135,6 +228,7 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
         center=center,
         first_pixel=first_pixel,
         unknown=float(np.median(width)),
+        thermal=thermal.pop(),
         filter=patterns[0].filter,
         image_mask=patterns[0].image_mask,
         name=name or ", ".join(names),
@@ -146,29 +240,46 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
     )
 
 
+def _median_variance(values: Image) -> float:
+    """Variance about 0 from the median square, which companions and outliers hardly change."""
+    # 0.4549 is the median square of a unit normal variable.
+    return float(np.median(values**2)) / 0.4549
+
+
 def _text(value: object) -> str | None:
     return value if isinstance(value, str) else None
 
 
-def _measured(frame: FrameFit) -> MeasuredPattern:
-    observation = frame.observation
-    combined = observation.combined()
+def _light_and_residual(
+    frame: FrameFit, fit: Refinement
+) -> tuple[Image, Image, Image, NDArray[np.bool_]]:
+    """Star without the known pattern, what the frame has beyond it, noise, and valid pixels."""
+    combined = frame.observation.combined()
     background = float(frame.values["background"][0])
-    light = (frame.star - background) / frame.gain
-    left = combined.data[0] - background - frame.companion_image
-    usable = combined.valid[0] & (light > 0)
-    safe = np.where(usable, light, 1.0)
-    x, y = combined.center[0]
+    known = 0.0 if fit.systematics is None else fit.systematics.thermal
+    light = (frame.star - background + known) / frame.gain - known
+    left = combined.data[0] - background - frame.companion_image - light
+    return light, left, combined.error[0], combined.valid[0]
+
+
+def _measured(frame: FrameFit, fit: Refinement, thermal: float) -> MeasuredPattern:
+    observation = frame.observation
+    light, left, error, valid = _light_and_residual(frame, fit)
+    multiplied = light + thermal
+    usable = valid & (multiplied > 0)
+    safe = np.where(usable, multiplied, 1.0)
+    x, y = observation.center.mean(axis=0)
     return MeasuredPattern(
         star=observation.target,
-        value=np.where(usable, left / safe - 1, 0.0),
-        variance=np.where(usable, (combined.error[0] / safe) ** 2, np.inf),
+        value=np.where(usable, left / safe, 0.0),
+        variance=np.where(usable, (error / safe) ** 2, np.inf),
         center=(float(x), float(y)),
         first_pixel=observation.first_pixel,
         filter=observation.filter,
         image_mask=_text(observation.header.get("CORONMSK")),
         frame=observation.name,
         date="" if observation.date is None else observation.date.isot,
+        thermal=thermal,
     )
 
 
@@ -245,8 +356,7 @@ def _scatter_between_frames(
             inside = known & (ring == k)
             if not inside.any():
                 continue
-            # The median square holds back companions; 0.4549 is that of a unit normal variable.
-            spread = np.median(difference[inside] ** 2) / 0.4549
+            spread = _median_variance(difference[inside])
             share = 1 / np.median(noise[inside]) ** 2
             excess[k] += share * (spread - np.median(noise[inside]))
             weight[k] += share
@@ -263,14 +373,22 @@ def _outliers(values: Image, variances: Image) -> NDArray[np.bool_]:
 
 
 def _prior_width(values: Image, variances: Image, ring: NDArray[np.int64]) -> Image:
-    """Standard deviation of the pattern over the pixels of a ring, beyond noise."""
+    """Standard deviation of the pattern over the pixels of a ring.
+
+    From products of different frames, whose noise is independent: where noise dominates, squares of
+    one frame would show how well its errors are known, and not the pattern.
+    """
     count = ring.max() + 1
-    width = np.zeros(count)
-    for k in range(count):
-        inside = np.isfinite(variances) & (ring == k)
-        if inside.any():
-            weight = 1 / variances[inside] ** 2
-            width[k] = np.average(values[inside] ** 2 - variances[inside], weights=weight)
+    total, weight = np.zeros(count), np.zeros(count)
+    known = np.isfinite(variances)
+    for a in range(len(values)):
+        for b in range(a + 1, len(values)):
+            both = known[a] & known[b]
+            share = 1 / (variances[a][both] * variances[b][both])
+            product = values[a][both] * values[b][both]
+            total += np.bincount(ring[both], share * product, count)
+            weight += np.bincount(ring[both], share, count)
+    width = np.divide(total, weight, where=weight > 0, out=np.zeros(count))
     # No ring is taken to be free of the pattern just because it is too faint to show it.
     seen = width[width > 0]
     floor = np.median(seen) / 4 if len(seen) else 1e-4

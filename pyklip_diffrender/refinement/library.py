@@ -57,10 +57,12 @@ def known_systematics(
     >>> print(dr.known_systematics(frame))
     None
     """
-    patterns = measure_patterns(references)
+    library = _library_for(observation)
+    thermal = library[0].thermal if library else None
+    patterns = measure_patterns(references, thermal)
     stars = {_plain(pattern.star) for pattern in patterns} | {_plain(observation.target)}
     if all(pattern.first_pixel is not None for pattern in patterns):
-        patterns += [each for each in _library_for(observation) if _plain(each.star) not in stars]
+        patterns += [each for each in library if _plain(each.star) not in stars]
     return combine_patterns(patterns) if len(patterns) > 1 else None
 
 
@@ -113,6 +115,7 @@ def write_patterns(patterns: Sequence[MeasuredPattern], path: str | os.PathLike[
         header["STAR"] = (pattern.star, "star that it was measured on")
         header["FILTER"], header["CORONMSK"] = pattern.filter or "", pattern.image_mask or ""
         header["STARX"], header["STARY"] = pattern.center
+        header["THERMAL"] = (pattern.thermal, "subtracted light that the pattern multiplies")
         if pattern.first_pixel is not None:
             header["COLUMN"], header["ROW"] = pattern.first_pixel
         header["FRAME"], header["DATE-BEG"] = pattern.frame, pattern.date
@@ -141,6 +144,7 @@ def read_patterns(path: str | os.PathLike[str]) -> list[MeasuredPattern]:
                     value=np.where(known, native_float64(hdus["PATTERN", k].data), 0.0),
                     variance=np.where(known, error, np.inf) ** 2,
                     center=(header["STARX"], header["STARY"]),
+                    thermal=header.get("THERMAL", 0.0),
                     first_pixel=(header["COLUMN"], header["ROW"]) if "COLUMN" in header else None,
                     filter=header["FILTER"] or None,
                     image_mask=header["CORONMSK"] or None,

@@ -9,7 +9,7 @@ import torch
 from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
-from pyklip_diffrender.linear.model import LinearFrame
+from pyklip_diffrender.linear.model import LinearFrame, summed_rows
 from pyklip_diffrender.refinement.objective import Objective, State
 
 __all__ = ["NormalEquations", "linearise"]
@@ -27,7 +27,7 @@ class NormalEquations:
     robust : float
         Residual, in standard deviations, of half weight; inf for least squares.
     curvature : Tensor, (unknowns, unknowns)
-        G G^T, with the whitened Jacobian G.
+        G G^T, with the whitened Jacobian G; see `linear.model` for frames that share a pattern.
     gradient : Tensor, (unknowns,)
         G r, with the residual r at the starting values.
     current : Tensor, (unknowns,)
@@ -93,16 +93,18 @@ def linearise(
     curvature = torch.zeros(size, size, dtype=torch.float64)
     gradient = torch.zeros(size, dtype=torch.float64)
     frames = []
+    weights = objective.weights(state, kappa, robust)
     for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
-        residual, weight = objective.weighted(k, point, kappa, robust)
+        residual, weight, common = (
+            each.cpu() for each in (objective.residual(k, point), *weights[k])
+        )
         rendered = forward.jacobian(point, modes)
         first = point.unknowns.where("modes").start
         rows = joint.rows(k)[: len(rendered)]
         drift = joint.drift_rows(k) if modes else torch.zeros(0, dtype=torch.int64)
-        left = torch.where(weight > 0, residual / weight.clamp(min=1e-300), 0.0).cpu()
-        frames.append(LinearFrame(left, weight.cpu(), rendered, rows, drift, first))
+        frames.append(LinearFrame(residual, weight, rendered, rows, drift, first, common))
         product, pulled = _accumulate(
-            rendered.flatten(1), weight.flatten().cpu(), residual.flatten().cpu()
+            rendered.flatten(1), weight.flatten(), (weight * residual).flatten()
         )
         if len(state.points) == 1:
             curvature, gradient = product, pulled
@@ -112,5 +114,12 @@ def linearise(
             gradient.index_add_(0, to, pulled[which])
             for onto, other in ((rows, slice(None)), (drift, own)):
                 curvature[to[:, None], onto] += product[which, other]
+    if objective.shares_pattern:
+        summed = (
+            torch.stack([frame.summed(frame.residual) for frame in frames]).sum(dim=0).flatten()
+        )
+        product, pulled = _accumulate(summed_rows(frames, size), torch.ones_like(summed), summed)
+        curvature -= product
+        gradient -= pulled
     gradient = gradient + curvature @ current
     return NormalEquations(state, kappa, robust, curvature, gradient, current, tuple(frames))

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from pyklip_diffrender.refinement.forward import Forward, Point
 from pyklip_diffrender.refinement.joint_layout import JointLayout
+from pyklip_diffrender.refinement.problem import Problem
 
-__all__ = ["Objective", "State"]
+__all__ = ["Objective", "State", "Weights"]
 
 
 _MAX_KAPPA = 10.0
@@ -41,6 +43,21 @@ class State:
         return self.points[0].unknowns.level("flux", self.points[0].vector)
 
 
+class Weights(NamedTuple):
+    """Weights of a frame's pixels, (ny, nx) each.
+
+    Attributes
+    ----------
+    weight : Tensor
+        1 / standard deviation; 0 where masked.
+    common : Tensor
+        c of the pattern that the frames share, see `linear.model`.
+    """
+
+    weight: Tensor
+    common: Tensor
+
+
 class Objective:
     """Compares states with the data of all frames.
 
@@ -50,10 +67,17 @@ class Objective:
         One for each frame.
     robust : float
         Residuals of this many sigma have half the weight (Cauchy's loss); inf for least squares.
+
+    Attributes
+    ----------
+    shares_pattern : bool
+        Whether all frames show the same pixels of the detector, and the error of the systematics
+        is therefore one unknown in all of them; otherwise it is noise of every frame.
     """
 
     def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
         self.forwards = tuple(forwards)
+        self.shares_pattern = _share_pattern([forward.problem for forward in self.forwards])
         self.robust = robust
         self.pixels = sum(forward.problem.pixels for forward in self.forwards)
 
@@ -72,32 +96,65 @@ class Objective:
     def noise(self, frame: int, point: Point) -> Tensor:
         """Noise of the data and, in quadrature, the error of the systematics."""
         problem = self.forwards[frame].problem
-        return torch.hypot(problem.sigma, problem.gain_error * point.light)
+        return torch.hypot(problem.sigma, problem.gain_error * self._multiplied(frame, point))
+
+    def _multiplied(self, frame: int, point: Point) -> Tensor:
+        """Light that the pattern of the model's error multiplies."""
+        return point.light + self.forwards[frame].problem.thermal
 
     def whitened(self, frame: int, point: Point, sigma: Tensor) -> Tensor:
         """Residual over `sigma`; 0 where masked."""
         problem = self.forwards[frame].problem
         return torch.where(problem.valid, (problem.data - point.total) / sigma, 0.0)
 
-    def weighted(
-        self, frame: int, point: Point, kappa: float, robust: float
-    ) -> tuple[Tensor, Tensor]:
-        """Whitened residual and weight of every pixel, made robust; 0 where masked."""
-        sigma = self.sigma(frame, point, kappa)
-        residual = self.whitened(frame, point, sigma)
-        weight = torch.where(self.forwards[frame].problem.valid, 1 / sigma, 0.0)
-        if math.isfinite(robust):
-            halving = torch.rsqrt(1 + (residual / robust) ** 2)
-            residual, weight = residual * halving, weight * halving
-        return residual, weight
+    def weights(self, state: State, kappa: float, robust: float) -> list[Weights]:
+        """Weights of all frames, made robust about a state.
+
+        Parameters
+        ----------
+        state : State
+        kappa : float
+            Assumed error of the star model, as a fraction of the star.
+        robust : float
+            Residual, in standard deviations, of half weight; inf for least squares.
+        """
+        weights = []
+        for k, point in enumerate(state.points):
+            problem = self.forwards[k].problem
+            whole = self.sigma(k, point, kappa)
+            own = torch.hypot(problem.sigma, kappa * point.total) if self.shares_pattern else whole
+            weight = torch.where(problem.valid, 1 / own, 0.0)
+            if math.isfinite(robust):
+                # Outliers show against all errors, that of the pattern included.
+                residual = self.whitened(k, point, whole)
+                weight = weight * torch.rsqrt(1 + (residual / robust) ** 2)
+            weights.append(Weights(weight, torch.zeros_like(weight)))
+        if not self.shares_pattern:
+            return weights
+        error = self.forwards[0].problem.gain_error
+        light = [self._multiplied(k, point) for k, point in enumerate(state.points)]
+        seen = sum((each.weight * s) ** 2 for each, s in zip(weights, light, strict=True))
+        scale = error / torch.sqrt(1 + error**2 * seen)
+        return [Weights(each.weight, s * scale) for each, s in zip(weights, light, strict=True)]
+
+    def residual(self, frame: int, point: Point) -> Tensor:
+        """Data minus model; 0 where masked."""
+        problem = self.forwards[frame].problem
+        return torch.where(problem.valid, problem.data - point.total, 0.0)
+
+    def chi2(self, state: State, weights: Sequence[Weights]) -> float:
+        """Chi-squared of all frames, with the pattern that they share marginalised."""
+        total, summed = 0.0, torch.zeros((), dtype=torch.float64)
+        for k, (point, each) in enumerate(zip(state.points, weights, strict=True)):
+            residual = self.residual(k, point)
+            total += float(((each.weight * residual) ** 2).sum())
+            if self.shares_pattern:
+                summed = summed + each.weight**2 * each.common * residual
+        return total - float((summed**2).sum())
 
     def chi2_per_pixel(self, state: State) -> float:
         """Chi-squared per pixel without a model error."""
-        total = sum(
-            float((self.whitened(k, point, self.noise(k, point)) ** 2).sum())
-            for k, point in enumerate(state.points)
-        )
-        return total / self.pixels
+        return self.chi2(state, self.weights(state, 0.0, math.inf)) / self.pixels
 
     def model_error(self, state: State) -> float:
         """The model error kappa at which chi-squared per pixel is 1, at least 0 and at most 10."""
@@ -118,13 +175,18 @@ class Objective:
             low, high = (middle, high) if too_small else (low, middle)
         return high
 
-    def loss(self, state: State, sigmas: Sequence[Tensor]) -> float:
-        """Chi-squared of all frames for fixed standard deviations, or Cauchy's loss if robust."""
-        total = 0.0
-        for k, (point, sigma) in enumerate(zip(state.points, sigmas, strict=True)):
-            squared = self.whitened(k, point, sigma) ** 2
-            if math.isfinite(self.robust):
-                limit = self.robust**2
-                squared = limit * torch.log1p(squared / limit)
-            total += float(squared.sum())
-        return total
+
+def _share_pattern(problems: Sequence[Problem]) -> bool:
+    """Whether several frames show the same pixels of the detector with an uncertain pattern."""
+    first = problems[0].observation
+    return (
+        len(problems) > 1
+        and first.first_pixel is not None
+        and bool((problems[0].gain_error > 0).any())
+        and all(
+            problem.observation.first_pixel == first.first_pixel
+            and problem.observation.shape == first.shape
+            and problem.systematics is problems[0].systematics
+            for problem in problems
+        )
+    )

@@ -179,9 +179,9 @@ def _on_full_model(
     linear = tuple(name for name in ("flux", "background") if name in free)
     start = {name: float(frame.values[name][0]) for name in ("flux", "background")}
     flux, level = problem.flux_and_background(
-        image, problem.sigma, linear, data=before, start=start
+        image, problem.sigma, linear, data=before - problem.pedestal, start=start
     )
-    star = flux * image + level
+    star = flux * image + level + problem.pedestal
     away = ((star - before) / problem.sigma)[problem.valid].abs()
     error = ModelError(float(away.square().mean().sqrt()), float(away.max()))
     fitted = {**frame.values, "flux": np.array([flux]), "background": np.array([level])}

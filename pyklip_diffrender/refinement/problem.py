@@ -72,10 +72,12 @@ class Problem:
             raise NoValidPixelsError(f"{self.observation.name}: all pixels are masked")
         self.gain = torch.ones_like(self.data)
         self.gain_error = torch.zeros_like(self.data)
+        self.thermal = 0.0
         if self.systematics is not None:
             pattern, error = self.systematics.at(self.observation)
             self.gain = 1 + torch.from_numpy(pattern).to(device)
             self.gain_error = torch.from_numpy(error).to(device)
+            self.thermal = self.systematics.thermal
 
     def starting_opd(self, npix: int) -> Tensor:
         """The starting wavefront on a pupil array of (npix, npix), m."""
@@ -85,6 +87,11 @@ class Problem:
     def with_model(self, model: OpticalSystem) -> Problem:
         """The same problem for a cheaper model; companions stay with the present one."""
         return replace(self, model=model, full_model=self.full_model or self.model)
+
+    @property
+    def pedestal(self) -> Tensor:
+        """What the pattern of the model's error makes of the thermal background, (ny, nx)."""
+        return (self.gain - 1) * self.thermal
 
     @property
     def pixels(self) -> int:

@@ -190,7 +190,7 @@ def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Obs
     )
 
 
-_FRAME_ARRAYS = ("residual", "weight", "jacobian", "rows", "drift")
+_FRAME_ARRAYS = ("residual", "weight", "jacobian", "rows", "drift", "common")
 
 
 def linear_hdus(linear: LinearModel) -> list[Any]:

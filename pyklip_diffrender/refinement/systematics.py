@@ -28,9 +28,10 @@ class Systematics:
 
     What no wavefront explains in the image of one star is largely the same fraction of the light
     in the image of another, on the same pixels of the detector: mostly an error of the flat field.
-    The star in pixel p is taken to be ``model_p * (1 + m_p)``, where m_p is Gaussian with mean
-    `pattern` and standard deviation `error`. Light of companions is not multiplied: nothing of it
-    can be mistaken for the pattern.
+    The star in pixel p is taken to be ``model_p * (1 + m_p) + thermal * m_p``, where m_p is
+    Gaussian with mean `pattern` and standard deviation `error`. Frames of the same pixels that are
+    fitted together share m_p. Light of companions is not multiplied: nothing of it can be mistaken
+    for the pattern.
 
     Attributes
     ----------
@@ -42,6 +43,9 @@ class Systematics:
         x, y of the star in the pattern, 0-indexed pixels.
     unknown : float
         Standard deviation of the pattern where it has not been measured.
+    thermal : float
+        Light per pixel, in the unit of the frames, that the pattern multiplies besides the star:
+        the thermal background, which was subtracted without the pattern.
     first_pixel : tuple of int or None
         Column and row of the pattern's first pixel on the full detector, as of an `Observation`.
     filter, image_mask : str or None
@@ -56,6 +60,7 @@ class Systematics:
     error: NDArray[np.float64]
     center: tuple[float, float]
     unknown: float
+    thermal: float = 0.0
     first_pixel: tuple[int, int] | None = None
     filter: str | None = None
     image_mask: str | None = None
@@ -85,6 +90,7 @@ class Systematics:
         if self.first_pixel is not None:
             header["COLUMN"], header["ROW"] = self.first_pixel
         header["UNKNOWN"] = (self.unknown, "deviation where nothing was measured")
+        header["THERMAL"] = (self.thermal, "subtracted light that the pattern multiplies")
         header["FILTER"], header["CORONMSK"] = self.filter or "", self.image_mask or ""
         for key, value in self.provenance.items():
             header[f"HIERARCH {key.upper()}"] = json.dumps(value)
@@ -99,6 +105,7 @@ class Systematics:
             error=native_float64(hdus["PATTERN_ERROR"].data),
             center=(float(header["STARX"]), float(header["STARY"])),
             unknown=float(header["UNKNOWN"]),
+            thermal=float(header["THERMAL"]),
             first_pixel=(header["COLUMN"], header["ROW"]) if "COLUMN" in header else None,
             filter=header["FILTER"] or None,
             image_mask=header["CORONMSK"] or None,

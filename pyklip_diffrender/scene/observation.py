@@ -32,6 +32,7 @@ from pyklip_diffrender.io.units import (
     to_unit,
 )
 from pyklip_diffrender.scene.detector_pixels import first_pixel, net_shifts, shift_frames
+from pyklip_diffrender.scene.noise import calibrated_errors
 
 __all__ = ["BAD_PIXEL_BITS", "Observation"]
 
@@ -198,6 +199,8 @@ class Observation:
         position from STARCENX/Y, else CRPIX1/2 (1-indexed). Of spaceKLIP's aligned files also
         MASKOFFS, the position of the mask from the star, and IMSHIFTS: the shift is undone, so that
         the pixels are those of the detector, whose flat-field errors then stay in their pixels.
+        Errors of NIRCam frames are corrected for the noise that is measured far from the star, see
+        `pyklip_diffrender.scene.noise.calibrated_errors`.
 
         Raises
         ------
@@ -248,6 +251,12 @@ class Observation:
         elif "STARCENX" not in header:
             origin = first_pixel(header, np.zeros(2, dtype=np.int64), path.name)
             observation = replace(observation, first_pixel=origin)
+        if observation.is_nircam:
+            errors = calibrated_errors(
+                observation.data, observation.error, observation.valid, observation.center,
+                observation.pixelscale, path.name,
+            )  # fmt: skip
+            observation = replace(observation, error=errors)
         if mask is None:
             return observation
         # spaceKLIP says where the mask is from the star, in pixels, for every integration.

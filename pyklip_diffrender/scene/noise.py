@@ -1,0 +1,99 @@
+"""Noise of real frames, measured where there is no starlight.
+
+The errors in the ERR extension of coadded JWST frames may be wrong by up to a factor of two in the
+part that does not depend on the light (read noise and background). That part is measured here on
+the frame itself, far from the star.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import convolve
+from scipy.stats import median_abs_deviation
+
+__all__ = ["calibrated_errors"]
+
+_log = logging.getLogger(__name__)
+
+Image = NDArray[np.float64]
+
+_FAR = 6.0
+"""arcsec from the star beyond which its light adds no noise. Closer than that a bright star's light
+still shows in differences of neighbouring pixels."""
+
+_ENOUGH = 2000
+"""Number of far pixels below which the errors are left as they are."""
+
+_NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
+
+
+def calibrated_errors(
+    data: Image,
+    error: Image,
+    valid: NDArray[np.bool_],
+    center: Image,
+    pixelscale: tuple[float, float],
+    name: str = "frames",
+) -> Image:
+    """Correct the part of the errors that does not depend on the light.
+
+    Pixels are compared with the mean of their four neighbours, 6 arcsec or more from the star. The
+    robust scatter of these differences over what the errors predict is the factor f by which the
+    errors there are wrong. Let b be the median of these errors: (f^2 - 1) b^2 is added to the
+    variance of every pixel, which leaves the photon noise of the star as it is.
+
+    Parameters
+    ----------
+    data, error : ndarray, (frames, ny, nx)
+        Frames and their standard deviations, in the same unit.
+    valid : ndarray of bool, (frames, ny, nx)
+    center : ndarray, (frames, 2)
+        x, y of the star, 0-indexed pixels.
+    pixelscale : tuple of float
+        x, y, arcsec per pixel.
+    name : str
+        For the log.
+
+    Returns
+    -------
+    ndarray, (frames, ny, nx)
+        New standard deviations. Frames with fewer than 2000 usable pixels that far from the star
+        keep theirs.
+
+    Notes
+    -----
+    Noise that neighbouring pixels share, such as 1/f noise, cancels in the differences and is not
+    counted.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> noise = np.random.default_rng(1).normal(0.0, 0.5, (1, 300, 300))
+    >>> ones = np.ones_like(noise)
+    >>> error = calibrated_errors(noise, ones, ones > 0, np.array([[150, 150]]), (0.063, 0.063))
+    >>> bool(abs(error.mean() - 0.5) < 0.01)
+    True
+    """
+    corrected = error.copy()
+    y, x = np.indices(data.shape[1:])
+    for k, (frame, sigma, usable) in enumerate(zip(data, error, valid, strict=True)):
+        away = np.hypot((x - center[k, 0]) * pixelscale[0], (y - center[k, 1]) * pixelscale[1])
+        # A pixel is compared only where all of its neighbours are usable.
+        complete = convolve(usable.astype(float), _NEIGHBOURS, mode="constant") > 0.99
+        far = usable & complete & (away > _FAR)
+        if far.sum() < _ENOUGH:
+            continue
+        difference = frame - convolve(frame, _NEIGHBOURS, mode="nearest")
+        predicted = np.sqrt(sigma**2 + convolve(sigma**2, _NEIGHBOURS, mode="nearest") / 4)
+        ratio = float(median_abs_deviation((difference / predicted)[far], scale="normal"))
+        if not ratio > 0:
+            continue
+        floor = float(np.median(sigma[far]))
+        least = min(ratio, 1.0) * sigma
+        variance = np.maximum(sigma**2 + (ratio**2 - 1) * floor**2, least**2)
+        corrected[k] = np.where(usable, np.sqrt(variance), sigma)
+        _log.info("%s, frame %d: the noise far from the star is %.2f of ERR", name, k, ratio)
+    return corrected
