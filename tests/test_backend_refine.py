@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from pyklip.instruments.Instrument import GenericData
 from pyklip.parallelized import klip_dataset
 
 from pyklip_diffrender.errors import (
+    DiffrenderWarning,
     IncompatibleSetupError,
     NoValidPixelsError,
     RefinementError,
@@ -107,8 +109,9 @@ def test_star_goes_companion_stays(
     with backend(opd=OLD):
         refined, outdated = copy.deepcopy(made), copy.deepcopy(made)
         image, header = reduce(refined, tmp_path)
-        outdated.diffrender = replace(made.diffrender, fit=ALIGNED)
-        reduce(outdated, tmp_path)
+        outdated.diffrender = replace(made.diffrender, fit=ALIGNED, max_chi2=np.inf)
+        with pytest.warns(DiffrenderWarning, match="roll0.*MODEL_MISMATCH.*What to do: .*filter"):
+            reduce(outdated, tmp_path)
     x, y = made.centers[0]
     peak = np.unravel_index(np.nanargmax(image), image.shape)
     np.testing.assert_allclose(peak, (y + SEPARATION / 0.062424185, x), atol=1.0)
@@ -129,11 +132,14 @@ def test_star_goes_companion_stays(
 
     # The fit saw 32 x 32 pixels, the product covers all that the frames hold.
     assert np.isfinite(image).sum() > 1.0 * frames[0].size
-    assert header["DRNFIT"] == len(ANGLES)
     assert header["DRMETH"] == "gauss-newton"
-    assert header["DRSTAT"] in ("converged", "model_mismatch")
-    fits_of_rolls = refined.diffrender_results[0].subtraction.fits
-    assert header["DRCHI2"] == pytest.approx(max(f.result.chi2_per_pixel for f in fits_of_rolls))
+    assert header["DRSTAT"] == "converged"
+    # Both rolls share a fit.
+    assert header["DRNFIT"] == 1
+    (fit,) = refined.diffrender_results[0].subtraction.fits
+    assert fit.frames == (0, 1)
+    assert header["DRCHI2"] == pytest.approx(fit.result.chi2_per_pixel)
+    assert (header["DRSYST"], header["DRREFS"]) == ("none", 0)
     assert header["DROPD"] == OLD.name
     assert header["DRSHA256"] == OLD.sha256
 
@@ -152,7 +158,7 @@ def test_what_is_detected_keeps_its_light(small: OpticalSystem, tmp_path: Path) 
             reduced = copy.deepcopy(made)
             _, header = reduce(reduced, tmp_path)
         found = reduced.diffrender_results[0].subtraction
-        assert [len(fit.result.companions) for fit in found.fits] == [int(keep)] * len(ANGLES)
+        assert [len(fit.result.companions) for fit in found.fits] == [int(keep)]
         assert header["DRKEPT"] == int(keep)
         taken = found.star[:, PAD:-PAD, PAD:-PAD] - star
         shares = [
@@ -182,7 +188,7 @@ def test_a_model_without_recipe_is_good_for_its_own_square(
 ) -> None:
     bare = OpticalSystem(small.entrance, small.planes, small.detector, small.bandpass)
     made = dataset(frames[:1], bare, fit_pixels=32)
-    with backend(opd=OLD, fit=ALIGNED):
+    with backend(opd=OLD, fit=ALIGNED, max_chi2=np.inf), pytest.warns(DiffrenderWarning):
         image, _ = reduce(made, tmp_path)
     assert "pixels outside its 32 x 32 are NaN" in caplog.text
     assert 800 < np.isfinite(image).sum() <= 32**2
@@ -202,21 +208,30 @@ def test_a_fit_that_diverges_stops_the_reduction(
     assert made.output is None
 
 
-def test_each_roll_and_dither_has_its_own_fit(
+def test_frames_at_one_place_are_averaged_and_all_share_a_fit(
     small: OpticalSystem, frames: NDArray[np.float64]
 ) -> None:
-    cube = frames[[0, 1, 0, 0]]
-    center = np.array([[19.5, 21.5], [19.5, 21.5], [20.5, 21.5], [19.5, 21.5]])
+    cube = frames[[0, 1, 0, 0, 0]]
+    center = np.array([[19.5, 21.5], [19.5, 21.5], [20.5, 21.5], [19.54, 21.5], [19.5, 21.56]])
     observation = Observation.from_arrays(
         cube, np.sqrt(cube), pixelscale=0.0624, center=center,
-        position_angles=np.array([0.0, 10.0, 0.0, 0.0]), filter="F444W",
+        position_angles=np.array([0.0, 10.0, 0.0, 0.009, 0.0]), filter="F444W",
     )  # fmt: skip
-    settings = DiffrenderSettings(model=small, fit=ALIGNED)
-    found = subtract_by_refinement(observation, OLD, settings)
-    assert [fit.frames for fit in found.fits] == [(0, 3), (1,), (2,)]
+    told: list[str] = []
+    settings = DiffrenderSettings(model=small, fit=ALIGNED, max_chi2=np.inf)
+    with pytest.warns(DiffrenderWarning):
+        found = subtract_by_refinement(observation, OLD, settings, tell=told.append)
+    (fit,) = found.fits
+    assert fit.frames == (0, 1, 2, 3, 4)
+    assert [len(frame.observation) for frame in fit.result.frames] == [2, 1, 1, 1]
+    assert "5 frames of 4 pointings together" in told[0]
     assert found.star.shape == cube.shape
     np.testing.assert_array_equal(found.star[0], found.star[3])
     assert np.isfinite(found.star).all()
+
+    with pytest.warns(DiffrenderWarning, match="COMPLETED"):
+        alone = subtract_by_refinement(observation, OLD, replace(settings, fit=Adam(iterations=1)))
+    assert [each.frames for each in alone.fits] == [(0, 3), (1,), (2,), (4,)]
 
 
 def test_start_plan_and_systematics_reach_the_fit(
@@ -240,7 +255,10 @@ def test_start_plan_and_systematics_reach_the_fit(
     )
     chi2 = {}
     for known in (None, systematics):
-        found = subtract_by_refinement(observation, OLD, replace(settings, systematics=known))
+        chosen = replace(settings, systematics=known)
+        with contextlib.nullcontext() if known else pytest.warns(DiffrenderWarning):
+            found = subtract_by_refinement(observation, OLD, chosen)
+        assert found.systematics == ("given (systematics)" if known else "none")
         (fit,) = found.fits
         assert fit.result.plan is None
         assert fit.result.frames[0].values["star_offset"].tolist() == [0.02, 0.0]

@@ -112,6 +112,16 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         ("DRCHI2", _number(worst.chi2), "chi2 per fitted pixel"),
         ("DRNFIT", len(fits_of_all), "number of refinements"),
         ("DRKEPT", companions, "most companions that a fit knew of"),
+        (
+            "DRSYST",
+            _shared(r.subtraction.systematics for r in records),
+            "pattern of the model's error",
+        ),
+        (
+            "DRREFS",
+            sum(r.subtraction.references for r in records),
+            "reference frames that were used",
+        ),
         ("DRPIXELS", _shared(r.frames.pixels for r in records), "pixels that were fitted"),
         ("DRFILLED", sum(r.filled for r in records), "flagged pixels replaced by neighbours"),
         ("DRNOISE", _shared(r.frames.noise for r in records), "where the errors came from"),

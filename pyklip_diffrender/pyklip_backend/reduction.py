@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,13 @@ from pyklip_diffrender.pyklip_backend.products import (
     staging,
     stamp,
 )
+from pyklip_diffrender.pyklip_backend.references import (
+    References,
+    library_files,
+    require_same_setup,
+)
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
+from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE as SOURCE
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
 from pyklip_diffrender.wavefront.opd import OPDMap
 
@@ -128,12 +135,30 @@ class Reduction:
                 "mode: 'SDI' compares wavelengths, and this dataset has one. Use mode='ADI', or "
                 "mode='RDI' with a psf_library: the star is rendered, so neither needs references"
             )
+        source = getattr(dataset, SOURCE, None)
+        if source is not None:
+            require_same_setup(source.headers[0], self._reference_files())
         if getattr(dataset, _FILTERED, None) is dataset.input:
             raise IncompatibleSetupError(
                 "dataset.input was high-pass filtered by an earlier call of klip_dataset, and a "
                 "star cannot be fitted to filtered frames. Make the dataset again, or give each "
                 "call with highpass=True its own copy.deepcopy(dataset)"
             )
+
+    @property
+    def _rdi(self) -> bool:
+        return "RDI" in str(self.arguments["mode"]).upper()
+
+    def _reference_files(self) -> tuple[Path, ...]:
+        """Files of the reference frames that the call gives."""
+        library = self.arguments["psf_library"]
+        return () if library is None or not self._rdi else library_files(self.dataset, library)
+
+    def _tell(self, line: str) -> None:
+        """Say what is being done, as pyKLIP does."""
+        logger.info(line)
+        if self.arguments["verbose"]:
+            print(f"diffrender: {line}", flush=True)
 
     def _high_pass(
         self, imgs: NDArray[Any], numthreads: int | None = None, filtersize: float = 10
@@ -220,8 +245,18 @@ class Reduction:
     ) -> NDArray[np.float64]:
         """Frames minus their star, (m, ny, nx), high-pass filtered if the call asks for it."""
         observation = frames.observation
-        subtractor = settings.subtractor or subtract_by_refinement
-        subtraction = subtractor(observation, opd, settings)
+        if settings.subtractor is not None:
+            subtraction = settings.subtractor(observation, opd, settings)
+        else:
+            references = References(self._reference_files(), frames.references)
+            subtraction = subtract_by_refinement(
+                observation,
+                opd,
+                settings,
+                pointings=frames.pointings,
+                references=references if self._rdi else None,
+                tell=self._tell,
+            )
         if subtraction.star.shape != frames.data.shape:
             raise ShapeError(
                 f"star: got shape {subtraction.star.shape}, expected {frames.data.shape}"

@@ -23,7 +23,7 @@ from pyklip_diffrender.pyklip_backend.settings import (
     OPDLike,
     settings_of,
 )
-from pyklip_diffrender.pyklip_backend.source import keeping_source
+from pyklip_diffrender.pyklip_backend.source import keeping_references, keeping_source
 
 __all__ = [
     "ALGORITHM",
@@ -61,6 +61,7 @@ class _Patches:
             logger.info("pyKLIP's JWST reader cannot be imported, so is not extended: %s", error)
         else:
             self._all.append(PatchedMethod(JWSTData, "readdata", keeping_source))
+            self._all.append(PatchedMethod(JWSTData, "readpsflib", keeping_references))
 
     def apply(self) -> None:
         for patch in self._all:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from astropy import units as u
@@ -70,16 +70,22 @@ class DiffrenderSettings:
         Settings of the fit; see `refine`.
     start : dict, optional
         Starting values by parameter name; see `refine`.
-    systematics : Systematics, optional
-        Known pattern of the model's error; see `refine`.
+    systematics : Systematics, "auto", "references" or "off", optional
+        Pattern of the model's error. "auto", the default for real NIRCam frames, takes that of the
+        library, and fits the reference frames only where it has none; "references" fits them in
+        any case and uses both; see `reduce`. Reference frames are those of a psf_library that
+        `JWSTData` has read, if the mode contains RDI, and any in the dataset.
     plan : Plan or str, optional
         "auto" (the default), "off", or an existing plan, which is used for all fits of a
         reduction; see `refine`.
     keep_detected : bool, optional
-        Search the fits for companions (`detect`) and refine the star once more with them in the
-        model, so that none of their light is subtracted with the star; False by default.
-        Undetected companions still lose light, so the throughput of bright injected companions
-        then does not apply to faint ones.
+        Search the fit for companions (`detect`) and refine the star once more with them in the
+        model, so that none of their light is subtracted with the star; True by default for real
+        NIRCam frames, else False. Undetected companions still lose light, as much as the
+        throughput map says.
+    max_chi2 : float, optional
+        Reduced chi-squared above which a fit is implausible and the reduction stops with a
+        `RefinementError`; 100 by default, inf for no limit.
     model_options : mapping, optional
         Further keywords of `nircam_coronagraph`, such as ``npix`` and ``nlambda``.
     subtractor : Subtractor, optional
@@ -96,9 +102,10 @@ class DiffrenderSettings:
     seed: int | None = None
     fit: GaussNewton | Adam | None = None
     start: Mapping[str, Any] | None = None
-    systematics: Systematics | None = None
+    systematics: Systematics | Literal["auto", "references", "off"] | None = None
     plan: Plan | str | None = None
     keep_detected: bool | None = None
+    max_chi2: float | None = None
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
 
