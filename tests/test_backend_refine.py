@@ -42,9 +42,9 @@ OLD = random_opd(1, npix=128)
 NEW = OLD.data + random_drift(2, 40.0, npix=128).data
 
 
-def planet_pixels(angle: float) -> tuple[float, float]:
+def planet_pixels(angle: float, position_angle: float = 0.0) -> tuple[float, float]:
     """Where pyKLIP turns up to north from: x, y offset of the companion in a frame, arcsec."""
-    t = np.radians(90 - angle)
+    t = np.radians(90 + position_angle - angle)
     return SEPARATION * float(np.cos(t)), SEPARATION * float(np.sin(t))
 
 
@@ -71,12 +71,16 @@ def exposed(contrast: float) -> NDArray[np.float64]:
     return rng.poisson(np.array(photons) + SKY).astype(np.float64)
 
 
+def padded(frames: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.pad(frames, ((0, 0), (PAD, PAD), (PAD, PAD)), constant_values=np.nan)
+
+
 def dataset(frames: NDArray[np.float64], model: Any, **settings: Any) -> GenericData:
     """Frames padded with NaN as spaceKLIP does, and no header."""
-    padded = np.pad(frames, ((0, 0), (PAD, PAD), (PAD, PAD)), constant_values=np.nan)
+    filled = padded(frames)
     center = ((SHAPE[1] - 1) / 2 + PAD, (SHAPE[0] - 1) / 2 + PAD)
     made = GenericData(
-        padded,
+        filled,
         np.tile(center, (len(frames), 1)),
         parangs=np.array(ANGLES[: len(frames)]),
         wvs=np.full(len(frames), 4.44),
@@ -86,16 +90,19 @@ def dataset(frames: NDArray[np.float64], model: Any, **settings: Any) -> Generic
     made.OWA = 40.0
     made.diffrender = DiffrenderSettings(
         model=model,
-        error=np.sqrt(np.nan_to_num(np.abs(padded), nan=1.0)),
-        **{"fit": GaussNewton(basis=default_basis(6.0), response_npix=128), **settings},
+        **{
+            "error": np.sqrt(np.nan_to_num(np.abs(filled), nan=1.0)),
+            "fit": GaussNewton(basis=default_basis(6.0), response_npix=128),
+            **settings,
+        },
     )
     return made
 
 
-def reduce(made: Any, folder: Path) -> tuple[NDArray[np.float64], fits.Header]:
+def reduce(made: Any, folder: Path, algo: str = "klip") -> tuple[NDArray[np.float64], fits.Header]:
     klip_dataset(
         made, mode="ADI", outputdir=str(folder), fileprefix="x", annuli=1, subsections=1,
-        numbasis=[1], movement=0, numthreads=1, verbose=False, algo="klip",
+        numbasis=[1], movement=0, numthreads=1, verbose=False, algo=algo,
         aligned_center=made.centers[0],
     )  # fmt: skip
     cube, header = fits.getdata(folder / "x-KLmodes-all.fits", header=True)
@@ -168,6 +175,41 @@ def test_what_is_detected_keeps_its_light(small: OpticalSystem, tmp_path: Path) 
         kept[keep] = np.mean(shares)
     assert kept[False] < 0.85
     assert kept[True] == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_faint_planet_loses_what_the_throughput_map_says(
+    small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path
+) -> None:
+    """The difference of two reductions, against the closed form; the planet is east of north."""
+    camera = nircam_coronagraph("F444W", fov_pixels=SHAPE, **NUMERICS)
+    light = np.array(
+        [1e-7 * FLUX * camera(NEW, star_offset=planet_pixels(a, 70.0)).numpy() for a in ANGLES]
+    )
+    images = {}
+    for name, shots, algo in (
+        ("without", frames, "klip"), ("with", frames + light, "klip"), ("light", light, "none"),
+    ):  # fmt: skip
+        made = dataset(
+            shots, small, error=np.sqrt(np.nan_to_num(padded(frames), nan=1.0)), plan="off"
+        )
+        with backend(opd=OLD):
+            images[name], header = reduce(made, tmp_path, algo=algo)
+        if name == "without":
+            throughput, about = fits.getdata(tmp_path / "x-throughput.fits", header=True)
+            assert header["DRTHRU"] == pytest.approx(np.nanmedian(throughput), abs=0.2)
+            assert about["DRTHRU"] == header["DRTHRU"]
+            np.testing.assert_array_equal(np.isnan(throughput), np.isnan(images[name]))
+    x, y = made.centers[0]
+    turn = np.radians(70.0)
+    column = round(x - SEPARATION * np.sin(turn) / 0.062424185)
+    row = round(y + SEPARATION * np.cos(turn) / 0.062424185)
+    about_planet = np.s_[row - 5 : row + 6, column - 5 : column + 6]
+    planet = images["light"][about_planet]
+    change = (images["with"] - images["without"])[about_planet]
+    kept = float(np.sum(change * planet) / np.sum(planet**2))
+    print("KEPT", kept, throughput[row, column], np.nanmedian(throughput))
+    assert 0.2 < kept < 0.9
+    assert throughput[row, column] == pytest.approx(kept, abs=0.05)
 
 
 def test_companions_cannot_be_kept_by_a_method_without_their_errors(

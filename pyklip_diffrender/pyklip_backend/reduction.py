@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy.io import fits
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import (
-    IncompatibleSetupError,
-    NoValidPixelsError,
-    RefinementError,
-    ShapeError,
+from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError, ShapeError
+from pyklip_diffrender.pyklip_backend.checks import (
+    check_arguments,
+    check_dataset,
+    check_settings,
 )
-from pyklip_diffrender.pyklip_backend.frames import Frames, frames_of, require_frames
+from pyklip_diffrender.pyklip_backend.frames import Frames, frames_of
 from pyklip_diffrender.pyklip_backend.placement import (
     aligned_before,
     annuli_of,
@@ -38,14 +39,14 @@ from pyklip_diffrender.pyklip_backend.products import (
     staging,
     stamp,
 )
-from pyklip_diffrender.pyklip_backend.references import (
-    References,
-    library_files,
-    require_same_setup,
-)
+from pyklip_diffrender.pyklip_backend.references import References, library_files
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
-from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE as SOURCE
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
+from pyklip_diffrender.pyklip_backend.throughput import (
+    on_product,
+    throughput_map,
+    write_throughput,
+)
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["RESULTS", "Reduction", "mark_filtered"]
@@ -107,7 +108,9 @@ class Reduction:
         try:
             with staging(folder) as stage:
                 reduce(**{**self.arguments, "outputdir": str(stage)})
-                stamp(stage, provenance(self.records))
+                cards = provenance(self.records)
+                self._write_throughput(stage, cards)
+                stamp(stage, cards)
         except BaseException:
             vars(self.dataset).clear()
             vars(self.dataset).update(before)
@@ -117,27 +120,12 @@ class Reduction:
 
     def _check(self) -> None:
         """Raise for input that cannot work, before anything is changed."""
-        dataset, mode = self.dataset, str(self.arguments["mode"])
-        if np.ndim(dataset.input) != 3:
-            raise ShapeError(f"dataset.input: got shape {np.shape(dataset.input)}, expected 3-D")
-        require_frames(dataset)
-        if not np.isfinite(dataset.input).any():
-            raise NoValidPixelsError(
-                f"{list(map(str, dataset.filenames))}: every pixel of every frame is NaN, nothing "
-                "is left to fit"
-            )
-        if not any(part in mode.upper() for part in ("ADI", "RDI", "SDI")):
-            raise IncompatibleSetupError(
-                f"mode: got {mode!r}, expected ADI, RDI, SDI or a sum of them such as 'ADI+RDI'"
-            )
-        if mode.strip().upper() == "SDI" and len(np.unique(dataset.wvs)) == 1:
-            raise IncompatibleSetupError(
-                "mode: 'SDI' compares wavelengths, and this dataset has one. Use mode='ADI', or "
-                "mode='RDI' with a psf_library: the star is rendered, so neither needs references"
-            )
-        source = getattr(dataset, SOURCE, None)
-        if source is not None:
-            require_same_setup(source.headers[0], self._reference_files())
+        dataset = self.dataset
+        check_dataset(dataset)
+        check_arguments(self.arguments, self._reference_files())
+        check_settings(self.settings)
+        for wave in np.unique(dataset.wvs):
+            self._settings_at(wave)
         if getattr(dataset, _FILTERED, None) is dataset.input:
             raise IncompatibleSetupError(
                 "dataset.input was high-pass filtered by an earlier call of klip_dataset, and a "
@@ -224,6 +212,38 @@ class Reduction:
         if kw.get("save_aligned"):
             outputs += (aligned_before(imgs, centers, wvs, center, dtype),)
         return outputs
+
+    def _write_throughput(self, stage: Path, cards: fits.Header) -> None:
+        """Write the throughput map, and add its median to the cards of all products.
+
+        Fits without a linear model have none.
+        """
+        results = [fit.result for record in self.records for fit in record.subtraction.fits]
+        linear = all(getattr(result, "linear", None) is not None for result in results)
+        if not linear or len(results) != len(self.records):
+            return
+        self._tell("throughput of faint sources")
+        dataset, maps = self.dataset, []
+        center = np.asarray(dataset.output_centers[0], dtype=float)
+        for k, result in enumerate(results):
+            frame = result.frames[0].observation
+            turned = on_product(
+                throughput_map(result),
+                frame.center[0],
+                dataset.output.shape[-2:],
+                center,
+                0.0 if self.arguments["skip_derot"] else frame.position_angle,
+                dataset.flipx,
+            )
+            turned[np.isnan(dataset.output[0, :, k]).all(axis=0)] = np.inf
+            maps.append(turned)
+        cube = np.array(maps)
+        cards["DRTHRU"] = (
+            float(np.median(cube[np.isfinite(cube)])),
+            "median throughput of faint sources",
+        )
+        cube = np.where(np.isnan(cube), 1.0, np.where(np.isinf(cube), np.nan, cube))
+        write_throughput(stage / f"{self.arguments['fileprefix']}-throughput.fits", cube, center)
 
     def _settings_at(self, wave: float) -> DiffrenderSettings:
         """The settings with the model for this wavelength."""

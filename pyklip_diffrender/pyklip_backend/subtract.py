@@ -223,13 +223,14 @@ def _with_companions(results: list[Refinement], tell: Callable[[str], None]) -> 
     from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
 
     # No relinearisation: the fits are refined again below.
+    tell("searching for companions")
     detection = detect(results, relinearise=math.inf)
     logger.info("companions kept out of the star: %s", detection.table)
-    count = len(detection.candidates)
+    number = _counted(len(detection.candidates), "companion")
     if not lacks_candidates(results, detection.candidates):
-        tell(f"{_counted(count, 'companion')} detected, {'all' if count else 'none'} in the model")
+        tell(f"{number} detected, as many as the fit has")
         return results
-    tell(f"{_counted(count, 'companion')} detected: the star is fitted again with them")
+    tell(f"{number} detected, {len(results[0].companions)} in the fit: the star is fitted again")
     results = with_companions(results, detection.candidates)
     tell(_described(results[0]))
     return results
