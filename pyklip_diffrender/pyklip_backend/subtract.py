@@ -16,7 +16,11 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend.pointings import Pointing, pointings_of
 from pyklip_diffrender.pyklip_backend.references import References, pattern_for
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
-from pyklip_diffrender.pyklip_backend.verdict import require_plausible, warn_of_status
+from pyklip_diffrender.pyklip_backend.verdict import (
+    breakdown_explained,
+    require_plausible,
+    warn_of_status,
+)
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.observation import Observation
@@ -166,7 +170,8 @@ def subtract_by_refinement(
     windows = [Window.about(g.observation.center[0], model.detector.shape) for g in groups]
     cut = [window.of(group.observation) for window, group in zip(windows, groups, strict=True)]
     references = References() if references is None else references
-    pattern = pattern_for(cut, references, model, opd, settings, tell)
+    with breakdown_explained(cut[0].name):
+        pattern = pattern_for(cut, references, model, opd, settings, tell)
     adam = isinstance(settings.fit, Adam)
     # The Adam recipe takes one observation at a time.
     together = [(k,) for k in range(len(groups))] if adam else [tuple(range(len(groups)))]
@@ -177,17 +182,19 @@ def subtract_by_refinement(
     )
     results: list[Refinement] = []
     for chosen in together:
-        result = refine(
-            model,
-            [pattern.science[k] for k in chosen],
-            opd,
-            settings=pattern.settings,
-            start=settings.start,
-            systematics=pattern.systematics,
-            plan="auto" if settings.plan is None else settings.plan,
-            seed=seed,
-        )
-        require_plausible(cut[chosen[0]].name, result, settings.max_chi2)
+        name = cut[chosen[0]].name
+        with breakdown_explained(name):
+            result = refine(
+                model,
+                [pattern.science[k] for k in chosen],
+                opd,
+                settings=pattern.settings,
+                start=settings.start,
+                systematics=pattern.systematics,
+                plan="auto" if settings.plan is None else settings.plan,
+                seed=seed,
+            )
+        require_plausible(name, result, settings.max_chi2)
         tell(f"{_described(result)}, {result.seconds:.0f} s")
         results.append(result)
     keep = settings.keep_detected
