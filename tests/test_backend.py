@@ -113,7 +113,7 @@ def spied(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         found[name + " dict"] = dict(vars(function))
     from pyklip.instruments.JWST import JWSTData
 
-    found["readers"] = [vars(JWSTData)[name] for name in ("readdata", "readpsflib")]
+    found["readers"] = {name: vars(JWSTData)[name] for name in ("readdata", "readpsflib")}
     found["names"] = dict(vars(parallelized))
     found["fm names"] = dict(vars(fm))
     return found
