@@ -26,9 +26,11 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, subtract_by_refinement
+from pyklip_diffrender.pyklip_backend.references import ChosenPattern
 from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
 from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics, refine
+from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import default_basis
@@ -205,7 +207,7 @@ def test_a_companion_in_the_model_keeps_its_light(
         companions=(Planet.from_offset(CONTRAST, x, y),),
     )  # fmt: skip
     fit = refine(small, cut, OLD, settings=known, plan="off")
-    kept = throughput_map(fit)
+    kept = throughput_map(fit, spacing=8)
     row, column = round(15.5 + y / 0.0624), round(15.5 + x / 0.0624)
     assert kept[row, column] == pytest.approx(1.0, abs=0.04)
     mirrored = kept[31 - row, column]
@@ -378,6 +380,34 @@ def test_start_plan_and_systematics_reach_the_fit(
     # 1024 pixels: known to 4.4 %; the star's flux, to 1e-4.
     assert chi2[False][0] == pytest.approx(1.0, abs=0.13)
     assert chi2[False][1] < 0.1
+
+
+@pytest.mark.parametrize("side", [32, 44])
+def test_frames_that_were_moved_for_the_fit_are_subtracted_where_they_are(
+    side: int, small: OpticalSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = nircam_coronagraph("F444W", fov_pixels=side, **NUMERICS)
+    # Not so bright that the ringing at the edges is above the noise.
+    star = FLUX / 100 * camera(OLD.data, (0.02, 0.0)).numpy() + SKY
+    observation = Observation.from_arrays(
+        star, np.sqrt(star), pixelscale=small.detector.pixelscale, filter="F444W"
+    )
+    away = np.array([0.3, -0.2])
+
+    def moved(science: Any, references: Any, model: Any, opd: Any, settings: Any, tell: Any) -> Any:
+        (frame,) = science
+        shifted = shift_frames(frame.data, away[np.newaxis])
+        there = replace(frame, data=shifted, center=frame.center + away)
+        return ChosenPattern((there,), None, settings.fit)
+
+    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract.pattern_for", moved)
+    settings = DiffrenderSettings(model=small, fit=ALIGNED, start={"star_offset": (0.02, 0.0)})
+    found = subtract_by_refinement(observation, OLD, settings)
+    inner = np.s_[6:-6, 6:-6]
+    wrong = (found.star[0] - star)[inner] / np.sqrt(star)[inner]
+    unmoved = (shift_frames(star[np.newaxis], away[np.newaxis])[0] - star)[inner]
+    assert np.sqrt(np.mean(wrong**2)) < 0.2
+    assert np.sqrt(np.mean((unmoved / np.sqrt(star)[inner]) ** 2)) > 1.0
 
 
 def test_windows_that_stick_out_of_the_frame(rng: np.random.Generator) -> None:
