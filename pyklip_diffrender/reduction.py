@@ -23,7 +23,8 @@ from pyklip_diffrender.refinement.registration import register
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
+from pyklip_diffrender.wavefront.map_choice import wavefront_for
+from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["Reduction", "reduce"]
 
@@ -104,7 +105,8 @@ def reduce(
     ----------
     sequence : Sequence, or files as for `Sequence.from_files`
     opd : path, OPDMap, Quantity or array
-        The wavefront to start from, as for `refine`.
+        The wavefront to start from, as for `refine`. Of a folder of maps, the one nearest in time
+        is taken; see `choose_map` for other rules.
     target, filter : str, optional
         See `Sequence.from_files`.
     size : int
@@ -132,7 +134,7 @@ def reduce(
     """
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
-    wavefront = as_opd_map(opd)
+    wavefront = wavefront_for(opd, sequence.date)
     model = model_for(sequence.science[0], size)
     sequence = sequence.cutout(size)
     common: dict[str, Any] = {"settings": settings, "progress": progress}
