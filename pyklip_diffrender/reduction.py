@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from pyklip_diffrender.detection import Detection, detect
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import (
     GaussNewton,
@@ -93,6 +94,7 @@ def reduce(
     systematics: Systematics | Literal["auto", "references", "off"] = "auto",
     settings: GaussNewton | None = None,
     threshold: float = 5.0,
+    device: str = "cpu",
     progress: bool = False,
 ) -> Reduction:
     """Search a sequence of real frames for planets.
@@ -120,6 +122,8 @@ def reduce(
         Of the fits; default those of `refine`.
     threshold : float
         S/N of a candidate.
+    device : str
+        PyTorch device of the optical model.
     progress : bool
         Show progress bars.
 
@@ -135,7 +139,7 @@ def reduce(
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
     wavefront = wavefront_for(opd, sequence.date)
-    model = model_for(sequence.science[0], size)
+    model = model_for(sequence.science[0], size, device=device)
     sequence = sequence.cutout(size)
     common: dict[str, Any] = {"settings": settings, "progress": progress}
     references: list[Refinement] = []
@@ -158,8 +162,10 @@ def reduce(
         )
     if pattern is not None and settings is None and sequence.science[0].is_nircam:
         common["settings"] = GaussNewton.nircam(min_model_error=_KNOWN_MODEL_ERROR)
-    fit = refine(model, sequence.science, wavefront, systematics=pattern, **common)
-    detection = detect(fit, threshold=threshold, progress=progress)
+    with stage("2 of 4: wavefront"):
+        fit = refine(model, sequence.science, wavefront, systematics=pattern, **common)
+    with stage("3 of 4: search"):
+        detection = detect(fit, threshold=threshold, progress=progress)
     return Reduction(sequence, fit, detection, tuple(references), pattern, tuple(failed))
 
 
@@ -169,9 +175,9 @@ def _fit_references(
     """One fit for every reference star; names of those that fail, and why."""
     fits, failed = [], []
     for star, frames in _by_star(sequence.references).items():
-        _log.info("reference star %s: %d frames", star, len(frames))
         try:
-            fits.append(refine(model, frames, wavefront, **common))
+            with stage(f"1 of 4: reference star {star}"):
+                fits.append(refine(model, frames, wavefront, **common))
         except DiffrenderError as error:
             _log.warning("reference star %s is left out: %s", star, error)
             failed.append((star, str(error)))
@@ -190,8 +196,8 @@ def _registered(
     for each in sequence.science:
         frame: Observation | None = each
         if each.first_pixel is None:
-            _log.info("%s: looking for its place on the detector", each.name)
-            frame = register(refine(model, each, wavefront, **common), pattern)
+            with stage(f"1 of 4: place of {each.name} on the detector"):
+                frame = register(refine(model, each, wavefront, **common), pattern)
         if frame is None:
             _log.warning(
                 "%s: the file does not say which pixels of the detector its frames show, and the "
