@@ -10,7 +10,10 @@ import sys
 import tomllib
 import warnings
 from dataclasses import dataclass, replace
+from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,16 +22,20 @@ import torch
 from astropy.io import fits
 from astropy.time import Time
 
-from pyklip_diffrender import __version__, plotting, reduction
+from pyklip_diffrender import __version__, plotting, reduction, refinement
 from pyklip_diffrender.bridges import wss
 from pyklip_diffrender.cli import application, main
 from pyklip_diffrender.cli.estimate import steps_of
 from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.wavefront.map_choice import RULES
 from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, resample
+
+# The package has the command under the name of its module.
+doctor = import_module("pyklip_diffrender.cli.doctor")
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -46,7 +53,7 @@ def opd_file(path: Path, unit: str | None = "nm") -> Path:
 def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     shown = capsys.readouterr().out
-    for command in ("demo", "reduce", "detect", "psf"):
+    for command in ("demo", "reduce", "detect", "psf", "doctor"):
         assert command in shown
 
 
@@ -605,3 +612,77 @@ def test_the_shell_completes_commands_and_options() -> None:
         },
     )
     assert done.stdout.splitlines() == ["plain,--opd-folder", "plain,--opd-date"], done.stderr
+
+
+# -- doctor --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def without_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the self-test, which takes seconds."""
+    quick = tuple(check for check in doctor.CHECKS if check is not doctor.check_fit)
+    monkeypatch.setattr(doctor, "CHECKS", quick)
+
+
+@pytest.mark.usefixtures("without_fit")
+def test_doctor_reports_versions_data_and_machine(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("STPSF_PATH", raising=False)
+    monkeypatch.setattr(doctor, "free_memory", lambda: 8e9)
+    assert main(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert f"ok    torch {version('torch')}" in lines
+    assert any(line.startswith("ok    data files: ") for line in lines)
+    assert "ok    8.0 GB of memory are free" in lines
+    assert any("STPSF_PATH is not set" in line and line.startswith("note") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("library", "torchh cannot be imported"),
+        ("data", "data files cannot be read"),
+        ("stpsf", "which has no version.txt"),
+        ("memory", "1.0 GB of memory are free; the demo"),
+        ("disk", "0.1 GB are free on the disk"),
+    ],
+)
+@pytest.mark.usefixtures("without_fit")
+def test_doctor_fails_with_a_sentence(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    what: str,
+    words: str,
+) -> None:
+    monkeypatch.delenv("STPSF_PATH", raising=False)
+    monkeypatch.setattr(doctor, "free_memory", lambda: 1e9 if what == "memory" else 8e9)
+    if what == "library":
+        monkeypatch.setattr(doctor, "_LIBRARIES", ("torchh",))
+    elif what == "data":
+        monkeypatch.setattr(doctor, "_TABLES", ("nowhere",))
+    elif what == "stpsf":
+        monkeypatch.setenv("STPSF_PATH", str(tmp_path))
+    elif what == "disk":
+        usage = SimpleNamespace(free=1e8)
+        monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: usage)
+    assert main(["doctor"]) == 1
+    (failed,) = (x for x in capsys.readouterr().out.splitlines() if x.startswith("FAIL"))
+    assert words in failed
+
+
+@pytest.mark.slow
+def test_doctor_fits_a_wavefront() -> None:
+    (outcome,) = doctor.check_fit()
+    assert outcome.state == "ok", outcome
+
+
+def test_doctor_fails_if_the_fit_recovers_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stub(model: Any, frame: Any, opd: np.ndarray, **_: Any) -> SimpleNamespace:
+        return SimpleNamespace(wavefront=opd, chi2_per_pixel=0.8, status=Status.CONVERGED)
+
+    monkeypatch.setattr(refinement, "refine", stub)
+    (outcome,) = doctor.check_fit()
+    assert outcome.state == "FAIL"
+    assert "Do not use results" in outcome.text

@@ -10,6 +10,7 @@ import click
 
 from pyklip_diffrender import __version__
 from pyklip_diffrender.cli import commands
+from pyklip_diffrender.cli.doctor import doctor
 from pyklip_diffrender.cli.options import common
 from pyklip_diffrender.cli.run import PROGRAM, Run
 from pyklip_diffrender.errors import DiffrenderError
@@ -38,6 +39,7 @@ for _command in (
     commands.reduce_frames,
     commands.detect_in_file,
     commands.psf,
+    doctor,
 ):
     application.add_command(_command)
 
