@@ -95,6 +95,7 @@ def run_demo(
     hours: float = 40.0,
     seed: int = 1,
     progress: bool = False,
+    device: str = "cpu",
 ) -> DemoResult:
     """Simulate, refine, subtract, and run KLIP on the same frame.
 
@@ -108,9 +109,15 @@ def run_demo(
         Random seed of wavefront, drift and noise.
     progress : bool
         Show progress bars.
+    device : str
+        PyTorch device of the model.
     """
     model = nircam_coronagraph(
-        "F444W", monochromatic=4.5e-6, fov_pixels=80, segment_gap=PAPER_SEGMENT_GAP
+        "F444W",
+        monochromatic=4.5e-6,
+        fov_pixels=80,
+        segment_gap=PAPER_SEGMENT_GAP,
+        device=device,
     )
     measured = random_opd(seed)
     true_opd = measured.data + random_drift(seed + 1000, hours).data

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.detection import Detection, detect
+from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Systematics, refine
 from pyklip_diffrender.refinement.pattern_choice import PatternRequest, choose_systematics
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.wavefront.opd import as_opd_map
+from pyklip_diffrender.wavefront.map_choice import wavefront_for
 
 __all__ = ["Reduction", "reduce"]
 
@@ -76,6 +77,7 @@ def reduce(
     systematics: PatternRequest = "auto",
     settings: GaussNewton | None = None,
     threshold: float = 5.0,
+    device: str = "cpu",
     progress: bool = False,
 ) -> Reduction:
     """Search a sequence of real frames for planets.
@@ -88,7 +90,8 @@ def reduce(
     ----------
     sequence : Sequence, or files as for `Sequence.from_files`
     opd : path, OPDMap, Quantity or array
-        The wavefront to start from, as for `refine`.
+        The wavefront to start from, as for `refine`. Of a folder of maps, the one nearest in time
+        is taken; see `choose_map` for other rules.
     target, filter : str, optional
         See `Sequence.from_files`.
     size : int
@@ -102,6 +105,8 @@ def reduce(
         Of the fits; default those of `refine`.
     threshold : float
         S/N of a candidate.
+    device : str
+        PyTorch device of the optical model.
     progress : bool
         Show progress bars.
 
@@ -116,8 +121,8 @@ def reduce(
     """
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
-    wavefront = as_opd_map(opd)
-    model = model_for(sequence.science[0], size)
+    wavefront = wavefront_for(opd, sequence.date)
+    model = model_for(sequence.science[0], size, device=device)
     sequence = sequence.cutout(size)
     choice = choose_systematics(
         sequence.science,
@@ -129,13 +134,15 @@ def reduce(
         progress=progress,
     )
     sequence = replace(sequence, science=choice.science)
-    fit = refine(
-        model,
-        sequence.science,
-        wavefront,
-        systematics=choice.systematics,
-        settings=choice.settings,
-        progress=progress,
-    )
-    detection = detect(fit, threshold=threshold, progress=progress)
+    with stage("2 of 4: wavefront"):
+        fit = refine(
+            model,
+            sequence.science,
+            wavefront,
+            systematics=choice.systematics,
+            settings=choice.settings,
+            progress=progress,
+        )
+    with stage("3 of 4: search"):
+        detection = detect(fit, threshold=threshold, progress=progress)
     return Reduction(sequence, fit, detection, choice.references, choice.systematics, choice.failed)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.library import known_systematics
@@ -131,9 +132,9 @@ def _fit_references(
     """One fit for every reference star; names of those that fail, and why."""
     fits, failed = [], []
     for star, frames in _by_star(references).items():
-        _log.info("reference star %s: %d frames", star, len(frames))
         try:
-            fits.append(refine(model, frames, opd, **common))
+            with stage(f"1 of 4: reference star {star}"):
+                fits.append(refine(model, frames, opd, **common))
         except DiffrenderError as error:
             _log.warning("reference star %s is left out: %s", star, error)
             failed.append((star, str(error)))
@@ -152,8 +153,8 @@ def _registered(
     for each in science:
         frame: Observation | None = each
         if each.first_pixel is None:
-            _log.info("%s: looking for its place on the detector", each.name)
-            frame = register(refine(model, each, opd, **common), pattern)
+            with stage(f"1 of 4: place of {each.name} on the detector"):
+                frame = register(refine(model, each, opd, **common), pattern)
         if frame is None:
             _log.warning(
                 "%s: the file does not say which pixels of the detector its frames show, and the "

@@ -25,7 +25,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
-from pyklip_diffrender.io.headers import header_date, header_text, merged_header
+from pyklip_diffrender.io.headers import header_text, merged_header, sensing_date
 from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.units import native_float64, to_metres, warn_of_rms
 from pyklip_diffrender.optics.grid import PupilGrid, resample
@@ -82,6 +82,11 @@ def read_opd(
     >>> opd = read_opd("R2022081102-NRCA3_FP1-1.fits")  # doctest: +SKIP
     """
     path = Path(path)
+    if path.is_dir():
+        raise CorruptFileError(
+            f"{path} is a folder, expected a file. choose_map(folder, date) takes the map of a "
+            "folder that is nearest to a date"
+        )
     with open_fits(path) as hdus:
         if extension is None and EXTENSION in hdus:
             return _checked(load_wss_opd(path))
@@ -107,7 +112,7 @@ def read_opd(
             f"the HDU with extension=, out of {[each.name or k for k, each in enumerate(hdus)]}, "
             "or pass an array of zeros where a flat wavefront is meant"
         )
-    date = header_date(header, ("DATE-OBS", "DATE-BEG"), path.name)
+    date = sensing_date(header, path.name)
     return _checked(OPDMap(data, date, path.name, sha256(path)))
 
 
