@@ -13,12 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
-from backend_scene import OPD, calints, psf, render
+from backend_scene import OPD, RIPPLE, calints, psf, render
 from pyklip.instruments import JWST
 from pyklip.instruments.JWST import JWSTData
 from pyklip.parallelized import klip_dataset
 
-from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.errors import (
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    MissingOPDError,
+)
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
@@ -267,6 +271,55 @@ def test_simulations_and_the_adam_recipe_use_no_pattern_by_default() -> None:
         settings = DiffrenderSettings(fit=fit)
         chosen = pattern_for([science], References(), model, OPD, settings, print)
         assert (chosen.systematics, chosen.settings, chosen.label) == (None, fit, "none")
+
+
+# Which wavefront map is used
+
+
+@pytest.fixture
+def maps(tmp_path: Path) -> Path:
+    """Two dated maps, 49 hours before and 47 hours after the frames."""
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    for date in ("2022-07-28", "2022-08-01"):
+        cards = fits.Header({"BUNIT": "m", "DATE-OBS": f"{date}T00:00:00"})
+        fits.PrimaryHDU(RIPPLE, cards).writeto(folder / f"map_{date}.fits")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("opd", "date", "hours"),
+    [
+        ("folder", "2022-08-01", 46.966),
+        (None, "2022-08-01", 46.966),
+        ("closest", "2022-08-01", 46.966),
+        ("after", "2022-08-01", 46.966),
+        ("before", "2022-07-28", -49.034),
+    ],
+)
+def test_the_map_of_a_folder_is_chosen_by_the_date(
+    opd: str | None, date: str, hours: float, maps: Path, files: list[str], tmp_path: Path
+) -> None:
+    unregister()
+    given: dict[str, Any] = {"opd": maps} if opd == "folder" else {"opd": opd, "opd_folder": maps}
+    register(subtractor=render, **given)
+    header = reduce(JWSTData(files[:2]), tmp_path / "out", mode="ADI")
+    assert header["DROPD"] == header["DROPDNAM"] == f"map_{date}.fits"
+    assert header["DROPDDAT"].startswith(date)
+    assert header["DROPDHRS"] == pytest.approx(hours, abs=0.001)
+
+
+def test_a_map_needs_a_folder_and_the_frames_a_date(
+    maps: Path, files: list[str], tmp_path: Path
+) -> None:
+    unregister()
+    undated = JWSTData(files[:2])
+    register(opd="closest", subtractor=render)
+    with pytest.raises(MissingOPDError, match="as opd_folder"):
+        reduce(undated, tmp_path / "out", mode="ADI")
+    register(opd_folder=maps)
+    with pytest.raises(IncompatibleSetupError, match=r"after register\(\).*DATE-BEG"):
+        reduce(undated, tmp_path / "out", mode="ADI")
 
 
 # What is checked before a fit

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 from astropy.io import fits
+from astropy.time import Time
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import (
@@ -38,7 +39,7 @@ from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, settin
 from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE, SourceFrames
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["Frames", "frames_of", "observation_from_dataset", "require_frames"]
+__all__ = ["Frames", "date_of_frames", "frames_of", "observation_from_dataset", "require_frames"]
 
 logger = logging.getLogger(__name__)
 
@@ -112,6 +113,19 @@ def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> O
         raise IncompatibleSetupError(f"wavelength: got {wavelength}, the dataset has {wavelengths}")
     imgs = np.asarray(dataset.input)[index]
     return _gather(dataset, index, imgs, settings_of(dataset)).observation
+
+
+def date_of_frames(dataset: Any) -> Time | None:
+    """Mean date of the frames, as far as it is known."""
+    source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
+    if source is None:
+        return None
+    dates = [
+        header_date(header, ("DATE-BEG", "DATE-OBS"), name)
+        for header, name in zip(source.headers, source.filenames, strict=True)
+    ]
+    known = [date for date in dates if date is not None]
+    return Time(known).mean() if known else None
 
 
 def require_frames(dataset: Any) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from astropy.io import fits
+from astropy.time import Time
 
 from pyklip_diffrender import __version__
 from pyklip_diffrender.pyklip_backend.frames import Frames
@@ -126,6 +127,16 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         ("DRFILLED", sum(r.filled for r in records), "flagged pixels replaced by neighbours"),
         ("DRNOISE", _shared(r.frames.noise for r in records), "where the errors came from"),
     ]
+    dates = [pointing.observation.date for pointing in first.frames.pointings]
+    known = [date for date in dates if date is not None]
+    days = first.opd.days_after(Time(known).mean()) if known else None
+    if first.opd.date is not None:
+        values += [
+            ("DROPDNAM", first.opd.name, "wavefront map"),
+            ("DROPDDAT", first.opd.date.isot, "date of the wavefront map"),
+        ]
+    if days is not None:
+        values.append(("DROPDHRS", 24 * days, "[h] from the frames to the map"))
     for key, value, comment in values:
         header[key] = (value, comment) if comment else value
     header.add_history(

@@ -23,7 +23,7 @@ from pyklip_diffrender.pyklip_backend.checks import (
     check_dataset,
     check_settings,
 )
-from pyklip_diffrender.pyklip_backend.frames import Frames, frames_of
+from pyklip_diffrender.pyklip_backend.frames import Frames, date_of_frames, frames_of
 from pyklip_diffrender.pyklip_backend.placement import (
     aligned_before,
     annuli_of,
@@ -93,7 +93,7 @@ class Reduction:
             For bad input and failed fits. pyKLIP's own errors pass through.
         """
         self._check()
-        opd = starting_opd(self.settings.opd)
+        opd = starting_opd(self.settings, date_of_frames(self.dataset))
         folder = require_folder(self.arguments["outputdir"])
         before = dict(vars(self.dataset))
 

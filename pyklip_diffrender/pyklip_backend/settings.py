@@ -20,9 +20,11 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from astropy import units as u
+from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
+from pyklip_diffrender.wavefront.map_choice import RULES, Rule, choose_map, wavefront_for
 from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
 
 if TYPE_CHECKING:
@@ -33,6 +35,9 @@ __all__ = ["ATTRIBUTE", "DiffrenderSettings", "OPDLike", "settings_of", "startin
 
 OPDLike: TypeAlias = "str | os.PathLike[str] | NDArray[np.floating[Any]] | u.Quantity | OPDMap"
 """A wavefront map: a FITS file, an array in metres, a Quantity, or what `read_opd` returns."""
+
+_RULES: dict[str, Rule] = {"closest": "nearest", **{rule: rule for rule in RULES}}
+"""Values of `opd` that choose a map from `opd_folder`, and the rule for `choose_map`."""
 
 ATTRIBUTE = "diffrender"
 """Attribute of a dataset that holds its own settings."""
@@ -46,7 +51,11 @@ class DiffrenderSettings:
     ----------
     opd : path, ndarray, Quantity or OPDMap, optional
         Wavefront map to start from: a FITS file, or a square array in metres, OTE entrance-pupil
-        orientation. There is no default: a reduction without one raises `MissingOPDError`.
+        orientation. There is no default: a reduction without one raises `MissingOPDError`. Of a
+        folder of maps, the one closest in time to the frames is taken.
+    opd_folder : path, optional
+        Folder of maps from which `opd` chooses: "closest", the last one "before" the frames, the
+        first one "after" them, or "interpolate"; see `choose_map`.
     model : optical model or mapping, optional
         From `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping
         from the wavelength in ``dataset.wvs`` to a model. Made for the filter if not given.
@@ -93,6 +102,7 @@ class DiffrenderSettings:
     """
 
     opd: OPDLike | None = None
+    opd_folder: str | os.PathLike[str] | None = None
     model: Any = None
     filter: str | None = None
     pixelscale: float | tuple[float, float] | None = None
@@ -142,33 +152,71 @@ def settings_of(dataset: Any) -> DiffrenderSettings:
     return own
 
 
-def starting_opd(opd: OPDLike | None) -> OPDMap:
-    """Read the wavefront map that the settings name.
+def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
+    """Read the wavefront map that the settings name, or choose it by the date of the frames.
 
     Raises
     ------
     MissingOPDError
-        If `opd` is None.
+        If there is none, or none of that date.
+    IncompatibleSetupError
+        If a map is to be chosen by a date that is not known.
     CorruptFileError, UnitError, ShapeError, NonFiniteError
         As `read_opd`.
+
+    Warns
+    -----
+    DiffrenderWarning
+        If the map is more than 200 days from the date.
     """
+    opd, folder = settings.opd, settings.opd_folder
+    if isinstance(opd, str) and opd in _RULES:
+        if folder is None:
+            raise MissingOPDError(
+                f"opd={opd!r} chooses a wavefront map by its date: give the folder with the maps "
+                "as opd_folder"
+            )
+        return _chosen(folder, date, _RULES[opd])
+    if opd is None and folder is not None:
+        return _chosen(folder, date, "nearest")
+    if isinstance(opd, str | os.PathLike) and Path(opd).is_dir():
+        return _chosen(opd, date, "nearest")
     if opd is None:
         raise MissingOPDError(
             "algo='diffrender' starts from a measured wavefront map and none was given. Give a "
             "FITS file, an array in metres or a Quantity, in one of three ways: "
             "register(opd=...) once; `with backend(opd=...):` around klip_dataset; or "
             "dataset.diffrender = DiffrenderSettings(opd=...). For JWST, take the map measured "
-            "closest in time to the observation"
+            "closest in time to the observation, or give the folder with your maps"
         )
     if isinstance(opd, str | os.PathLike):
         path = Path(opd).resolve()
         # A contrast curve reads the same map for each of its 120 reductions.
         state = path.stat() if path.is_file() else None
-        return _read(path, state and (state.st_mtime_ns, state.st_size))
-    return as_opd_map(opd)
+        opd = _read(path, state and (state.st_mtime_ns, state.st_size))
+    return wavefront_for(opd, date)
 
 
 @lru_cache(maxsize=4)
 def _read(path: Path, version: tuple[int, int] | None) -> OPDMap:
     """Read a map once for each version of its file."""
     return as_opd_map(path)
+
+
+def _chosen(folder: str | os.PathLike[str], date: Time | None, rule: Rule) -> OPDMap:
+    """Choose a map from a folder."""
+    if date is None:
+        raise IncompatibleSetupError(
+            f"{folder} is a folder of wavefront maps, and the date of the frames is not known. "
+            "Make the JWSTData after register(), whose frames must have DATE-BEG in their header, "
+            "or give the file of the map as opd"
+        )
+    path = Path(folder).resolve()
+    version = path.stat().st_mtime_ns if path.is_dir() else 0
+    return _choose_once(path, version, date.isot, rule)
+
+
+@lru_cache(maxsize=4)
+def _choose_once(folder: Path, version: int, date: str, rule: Rule) -> OPDMap:
+    """Choose a map once for each state of the folder."""
+    return choose_map(folder, date, rule)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["on_product", "throughput_map", "write_throughput"]
 
-SPACING = 3
+SPACING = 2
 """Pixels between the positions at which the throughput is computed; between them it is
 interpolated."""
 
