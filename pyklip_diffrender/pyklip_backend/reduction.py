@@ -140,7 +140,9 @@ class Reduction:
     def _reference_files(self) -> tuple[Path, ...]:
         """Files of the reference frames that the call gives."""
         library = self.arguments["psf_library"]
-        return () if library is None or not self._rdi else library_files(self.dataset, library)
+        if library is None or not self._rdi:
+            return ()
+        return library_files(self.dataset, library)
 
     def _tell(self, line: str) -> None:
         """Say what is being done, as pyKLIP does."""
@@ -268,7 +270,10 @@ class Reduction:
         if settings.subtractor is not None:
             subtraction = settings.subtractor(observation, opd, settings)
         else:
-            references = References(self._reference_files(), frames.references)
+            files = self._reference_files()
+            if self._rdi and not files:
+                self._tell("psf_library is not used: no JWSTData read its files after register()")
+            references = References(files, frames.references)
             subtraction = subtract_by_refinement(
                 observation,
                 opd,

@@ -173,7 +173,7 @@ def pattern_for(
         tell("fitting the reference stars")
         choice = choose("references", references.cut(model.detector.shape))
     elif references:
-        logger.info("reference frames were given but are not needed")
+        tell("the reference frames are not needed")
     learned = [frame.observation for fit in choice.references for frame in fit.frames]
     stars = list(dict.fromkeys(each.target for each in learned))
     label = "none"
