@@ -176,8 +176,8 @@ def test_the_files_of_the_library_reach_the_fit(
     def subtract(observation: Any, opd: Any, settings: Any, **context: Any) -> Any:
         seen.append(context["references"])
         context["tell"]("at work")
-        found = render(observation, opd, settings)
-        return replace(found, systematics="references (REF)", references=2)
+        subtraction = render(observation, opd, settings)
+        return replace(subtraction, systematics="references (REF)", references=2)
 
     monkeypatch.setattr(
         "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
@@ -300,8 +300,8 @@ def test_the_map_of_a_folder_is_chosen_by_the_date(
     opd: str | None, date: str, hours: float, maps: Path, files: list[str], tmp_path: Path
 ) -> None:
     unregister()
-    given: dict[str, Any] = {"opd": maps} if opd == "folder" else {"opd": opd, "opd_folder": maps}
-    register(subtractor=render, **given)
+    options: dict[str, Any] = {"opd": maps} if opd == "folder" else {"opd": opd, "opd_folder": maps}
+    register(subtractor=render, **options)
     header = reduce(JWSTData(files[:2]), tmp_path / "out", mode="ADI")
     assert header["DROPD"] == header["DROPDNAM"] == f"map_{date}.fits"
     assert header["DROPDDAT"].startswith(date)

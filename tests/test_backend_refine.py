@@ -249,6 +249,31 @@ def test_a_faint_planet_loses_what_the_throughput_map_says(
     assert throughput[row, column] == pytest.approx(kept, abs=0.05)
 
 
+@pytest.mark.parametrize(
+    ("instrument", "keep", "searched"),
+    [("NIRCAM", None, True), ("NIRCAM", False, False), (None, None, False), (None, True, True)],
+)
+def test_companions_are_kept_by_default_in_real_frames_only(
+    instrument: str | None, keep: bool | None, searched: bool, small: OpticalSystem,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    calls: list[int] = []
+
+    def search(results: Any, tell: Any) -> Any:
+        calls.append(len(results))
+        return results
+
+    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract._with_companions", search)
+    star = FLUX * small(OLD.data).numpy() + SKY
+    header = fits.Header({} if instrument is None else {"INSTRUME": instrument})
+    observation = Observation.from_arrays(
+        star, np.sqrt(star), pixelscale=small.detector.pixelscale, header=header
+    )
+    settings = DiffrenderSettings(model=small, fit=ALIGNED, keep_detected=keep)
+    subtract_by_refinement(observation, OLD, settings)
+    assert calls == [1] * searched
+
+
 def test_companions_cannot_be_kept_by_a_method_without_their_errors(
     small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path
 ) -> None:
@@ -331,14 +356,14 @@ def test_frames_at_one_place_are_averaged_and_all_share_a_fit(
     told: list[str] = []
     settings = DiffrenderSettings(model=small, fit=ALIGNED, max_chi2=np.inf)
     with pytest.warns(DiffrenderWarning):
-        found = subtract_by_refinement(observation, OLD, settings, tell=told.append)
-    (fit,) = found.fits
+        rendered = subtract_by_refinement(observation, OLD, settings, tell=told.append)
+    (fit,) = rendered.fits
     assert fit.frames == (0, 1, 2, 3, 4)
     assert [len(frame.observation) for frame in fit.result.frames] == [2, 1, 1, 1]
     assert "5 frames of 4 pointings together" in told[0]
-    assert found.star.shape == cube.shape
-    np.testing.assert_array_equal(found.star[0], found.star[3])
-    assert np.isfinite(found.star).all()
+    assert rendered.star.shape == cube.shape
+    np.testing.assert_array_equal(rendered.star[0], rendered.star[3])
+    assert np.isfinite(rendered.star).all()
 
     with pytest.warns(DiffrenderWarning, match="COMPLETED"):
         alone = subtract_by_refinement(observation, OLD, replace(settings, fit=Adam(iterations=1)))
@@ -397,14 +422,14 @@ def test_frames_that_were_moved_for_the_fit_are_subtracted_where_they_are(
     def moved(science: Any, references: Any, model: Any, opd: Any, settings: Any, tell: Any) -> Any:
         (frame,) = science
         shifted = shift_frames(frame.data, away[np.newaxis])
-        there = replace(frame, data=shifted, center=frame.center + away)
-        return ChosenPattern((there,), None, settings.fit)
+        registered = replace(frame, data=shifted, center=frame.center + away)
+        return ChosenPattern((registered,), None, settings.fit)
 
     monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract.pattern_for", moved)
     settings = DiffrenderSettings(model=small, fit=ALIGNED, start={"star_offset": (0.02, 0.0)})
-    found = subtract_by_refinement(observation, OLD, settings)
+    rendered = subtract_by_refinement(observation, OLD, settings)
     inner = np.s_[6:-6, 6:-6]
-    wrong = (found.star[0] - star)[inner] / np.sqrt(star)[inner]
+    wrong = (rendered.star[0] - star)[inner] / np.sqrt(star)[inner]
     unmoved = (shift_frames(star[np.newaxis], away[np.newaxis])[0] - star)[inner]
     assert np.sqrt(np.mean(wrong**2)) < 0.2
     assert np.sqrt(np.mean((unmoved / np.sqrt(star)[inner]) ** 2)) > 1.0

@@ -275,10 +275,10 @@ def _star_everywhere(
             origin = frame.observation.first_pixel
             if origin is not None:
                 origin = (origin[0] - window.x, origin[1] - window.y)
-            there = box.of(
+            pixels = box.of(
                 dataclasses.replace(group, center=group.center + away, first_pixel=origin)
             )
-            star = star * (1 + result.systematics.at(there)[0])
+            star = star * (1 + result.systematics.at(pixels)[0])
         place, star = box, star + float(frame.values["background"][0])
     else:
         if box not in window:
