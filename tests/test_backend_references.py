@@ -187,8 +187,10 @@ def test_the_files_of_the_library_reach_the_fit(
     dataset = copy.deepcopy(JWSTData(files[:2], files[2:]))
     header = reduce(dataset, tmp_path / "out")
     assert [path.name for path in seen[0].files] == [Path(files[2]).name]
-    (cut,) = seen[0].cut((20, 20))
+    (cut,) = seen[0].cut((20, 20), frame("TARGET"))
     assert (cut.target, cut.shape, cut.reference) == ("REF", (20, 20), True)
+    # A star's own planets would become part of the pattern.
+    assert seen[0].cut((20, 20), frame("ref")) == []
     assert (header["DRSYST"], header["DRREFS"]) == ("references (REF)", 2)
     assert "at work" not in capsys.readouterr().out
     reduce(dataset, tmp_path / "out", mode="ADI", verbose=True)

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from pyklip_diffrender.io.headers import header_date
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["FrameDetails", "Pointing", "part_of", "pointings_of", "reference_frames"]
+__all__ = [
+    "FrameDetails",
+    "Pointing",
+    "may_be_one_star",
+    "part_of",
+    "pointings_of",
+    "reference_frames",
+]
 
 _SAME_PLACE = 0.05
 """Pixels by which the star may move within a pointing."""
@@ -56,14 +63,18 @@ def reference_frames(headers: Sequence[fits.Header]) -> NDArray[np.bool_]:
     target: somebody reduces a reference star.
     """
     marked = np.array([bool(header.get("IS_PSF", False)) for header in headers])
-    first = int(np.argmin(marked))
-    target = _star(headers[first])
-    others = np.array([_star(header) != target for header in headers])
+    target = headers[int(np.argmin(marked))]
+    others = np.array([not may_be_one_star(header, target) for header in headers])
     return others if marked.all() else marked | others
 
 
-def _star(header: fits.Header) -> str:
-    return "".join(c for c in str(header.get("TARGPROP", "")).upper() if c.isalnum())
+def may_be_one_star(header: fits.Header, other: fits.Header) -> bool:
+    """Whether two headers name the same star, or one of them none."""
+    one, two = (
+        "".join(c for c in str(each.get("TARGPROP", "")).upper() if c.isalnum())
+        for each in (header, other)
+    )
+    return one == two or not (one and two)
 
 
 def part_of(observation: Observation, which: NDArray[np.intp] | NDArray[np.bool_]) -> Observation:

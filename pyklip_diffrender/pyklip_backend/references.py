@@ -13,6 +13,7 @@ from astropy.io import fits
 
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.pyklip_backend.pointings import may_be_one_star
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.source import REFERENCES
 from pyklip_diffrender.pyklip_backend.windows import Window
@@ -49,17 +50,23 @@ class References:
     def __bool__(self) -> bool:
         return bool(self.files or self.frames)
 
-    def cut(self, shape: tuple[int, int]) -> list[Observation]:
+    def cut(self, shape: tuple[int, int], target: Observation) -> list[Observation]:
         """Read all frames and cut the pixels about the star out of them.
 
-        A file that cannot be used is left out.
+        A file that cannot be used is left out, and so are frames of the target itself: its planets
+        would become part of the pattern.
         """
         observations = list(self.frames)
         for path in self.files:
             try:
-                observations.append(replace(Observation.from_fits(path), reference=True))
+                frames = Observation.from_fits(path)
             except DiffrenderError as error:
                 logger.warning("reference frames are left out: %s", error)
+                continue
+            if may_be_one_star(frames.header, target.header):
+                logger.warning("%s is left out: it does not show another star", path.name)
+                continue
+            observations.append(replace(frames, reference=True))
         return [Window.about(each.center[0], shape).of(each) for each in observations]
 
 
@@ -171,7 +178,7 @@ def pattern_for(
     needed = requested == "references" or (requested == "auto" and choice.systematics is None)
     if needed and references:
         tell("fitting the reference stars")
-        choice = choose("references", references.cut(model.detector.shape))
+        choice = choose("references", references.cut(model.detector.shape, science[0]))
     elif references:
         tell("the reference frames are not needed")
     learned = [frame.observation for fit in choice.references for frame in fit.frames]
