@@ -29,7 +29,7 @@ from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, subtra
 from pyklip_diffrender.pyklip_backend.references import ChosenPattern
 from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
-from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics, refine
+from pyklip_diffrender.refinement import Adam, GaussNewton, Status, Systematics, refine
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
@@ -272,6 +272,20 @@ def test_companions_are_kept_by_default_in_real_frames_only(
     settings = DiffrenderSettings(model=small, fit=ALIGNED, keep_detected=keep)
     subtract_by_refinement(observation, OLD, settings)
     assert calls == [1] * searched
+
+
+def test_a_second_fit_that_fails_stops_the_reduction_too(
+    small: OpticalSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def worse(results: Any, tell: Any) -> Any:
+        return [replace(each, status=Status.DIVERGED) for each in results]
+
+    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract._with_companions", worse)
+    star = FLUX * small(OLD.data).numpy() + SKY
+    observation = Observation.from_arrays(star, np.sqrt(star), pixelscale=small.detector.pixelscale)
+    settings = DiffrenderSettings(model=small, fit=ALIGNED, keep_detected=True)
+    with pytest.raises(RefinementError, match="no light"):
+        subtract_by_refinement(observation, OLD, settings)
 
 
 def test_companions_cannot_be_kept_by_a_method_without_their_errors(

@@ -199,10 +199,13 @@ def subtract_by_refinement(
         results.append(result)
     keep = settings.keep_detected
     if (observation.is_nircam and not adam) if keep is None else keep:
-        results = _with_companions(results, tell)
+        with breakdown_explained(cut[0].name):
+            results = _with_companions(results, tell)
     star = np.full(observation.data.shape, np.nan)
     fits = []
     for chosen, result in zip(together, results, strict=True):
+        # It may have been refined again with companions.
+        require_plausible(cut[chosen[0]].name, result, settings.max_chi2)
         warn_of_status(cut[chosen[0]].name, result)
         for k, frame in zip(chosen, result.frames, strict=True):
             away = frame.observation.center[0] - cut[k].center[0]
