@@ -26,6 +26,7 @@ from pyklip_diffrender import __version__, plotting, reduction, refinement
 from pyklip_diffrender.bridges import wss
 from pyklip_diffrender.cli import application, main
 from pyklip_diffrender.cli.estimate import steps_of
+from pyklip_diffrender.cli.options import read_config
 from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
@@ -522,6 +523,26 @@ def test_mast_is_asked_for_the_map_of_the_date(
     assert asked == [("2022-07-30T02:03:04", "closest"), ("2022-07-30T02:03:04", "after")]
 
 
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [("nowhere/star.fits", "there is no folder"), (".", "is a folder, expected a file")],
+)
+def test_an_image_goes_into_a_folder_that_exists(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], path: str, words: str
+) -> None:
+    assert main(["psf", str(tmp_path / path)]) == 1
+    assert words in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_without_permission_is_refused_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
+    assert main(["demo", "-o", str(tmp_path / "products" / "deep")]) == 1
+    assert f"no permission in {tmp_path}\n" in capsys.readouterr().err
+
+
 def test_a_device_that_is_not_there_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -589,6 +610,15 @@ def test_tables_of_a_configuration_are_commands(
     config.write_text("quiet = true\n[fit]\nsize = 20\n")
     assert main(["--config", str(config), "psf", str(tmp_path / "star.fits")]) == 2
     assert "[fit] is no command" in capsys.readouterr().err
+
+
+def test_the_documented_configuration_is_valid(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "reference" / "command_line.md").read_text(encoding="utf-8")
+    example = page.partition("```toml\n")[2].partition("```")[0]
+    assert '[reduce]\nframes = ["calints"]' in example
+    path = tmp_path / "run.toml"
+    path.write_text(example)
+    assert read_config(application, path)["reduce"]["log_file"] == "products/run.log"
 
 
 def test_the_rules_are_those_of_the_package() -> None:
