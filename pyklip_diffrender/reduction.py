@@ -12,6 +12,7 @@ from typing import Any, Literal
 from pyklip_diffrender.detection import Detection, detect
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.progress import stage
+from pyklip_diffrender.io.units import require_bound
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import (
     GaussNewton,
@@ -136,6 +137,8 @@ def reduce(
     DiffrenderError
         If the target cannot be fitted. A reference star that cannot be is left out.
     """
+    # Before the fits, which take minutes.
+    require_bound(threshold, "threshold", "positive")
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
     wavefront = wavefront_for(opd, sequence.date)
