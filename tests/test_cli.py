@@ -305,7 +305,7 @@ def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(
 ) -> None:
     products = tmp_path / "products"
     arguments = ["reduce", str(frames), "--opd-folder", str(maps), "-o", str(products)]
-    arguments += ["--dry-run"]
+    arguments += ["--dry-run", "--size", "6"]
     assert main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
     target, reference = (
@@ -330,12 +330,12 @@ def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(
 
 def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
     sequence = Sequence.from_files(frames)
-    names = [name for name, _ in steps_of(sequence, 80, "auto")]
+    names = [name for name, _ in steps_of(sequence, 6, "auto")]
     assert names[0] == "reference stars: HIP-2"
-    alone = dict(steps_of(replace(sequence, references=()), 80, "auto"))
+    alone = dict(steps_of(replace(sequence, references=()), 6, "auto"))
     assert len(alone) == len(names) - 1
     twice = replace(sequence, science=sequence.science * 2)
-    both = dict(steps_of(twice, 80, "off"))
+    both = dict(steps_of(twice, 6, "off"))
     assert both["search of point sources"] == 2 * alone["search of point sources"]
     one, two = alone["wavefront: 1 file of the target"], both["wavefront: 2 files of the target"]
     assert one < two < 2 * one
@@ -469,6 +469,43 @@ def test_warnings_and_errors_are_messages(
     lines = capsys.readouterr().err.splitlines()
     assert "sensed 941 days before the frames" in lines[0]
     assert lines[1:] == ["pyklip-diffrender: warning: the map is old", "pyklip-diffrender: no fit"]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError("8 GB"), RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 GB")],
+    ids=["python", "torch"],
+)
+def test_too_little_memory_is_a_message(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(reduction, "reduce", fail)
+    arguments = ["detect", str(frames / "one_calints.fits"), "--opd-folder", str(maps)]
+    arguments += ["-o", str(tmp_path / "products")]
+    assert main(arguments) == 1
+    assert "pyklip-diffrender: not enough memory; a smaller --size" in capsys.readouterr().err
+    # Any other error is a fault of the program, with its traceback.
+    error = RuntimeError("a bug")
+    with pytest.raises(RuntimeError, match="a bug"):
+        main(arguments)
+
+
+def test_impossible_arguments_are_messages(
+    tmp_path: Path, frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    products = ["-o", str(tmp_path / "products")]
+    assert main(["demo", "--contrast", "-1", *products]) == 1
+    assert "contrast: got -1, expected 0 or more" in capsys.readouterr().err
+    assert main(["detect", str(frames), "--opd", "nowhere.fits", *products]) == 1
+    assert "is a folder, expected a file; the command reduce" in capsys.readouterr().err
 
 
 def test_an_interrupted_run_says_what_it_left(

@@ -158,6 +158,10 @@ def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
         from pyklip_diffrender.scene.observation import Observation
         from pyklip_diffrender.scene.sequence import Sequence
 
+        if frames.is_dir():
+            raise IncompatibleSetupError(
+                f"{frames} is a folder, expected a file; the command reduce takes folders"
+            )
         observation = Observation.from_fits(frames)
         return Sequence(observation.target, (observation,))
 
