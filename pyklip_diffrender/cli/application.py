@@ -60,6 +60,9 @@ def main(arguments: abc.Sequence[str] | None = None) -> int:
         except click.ClickException as error:
             error.show()
             return error.exit_code
+        except (click.Abort, KeyboardInterrupt):
+            _log.error("interrupted; %s", run.left())
+            return 130
         except (DiffrenderError, OSError) as error:
             _log.error("%s", error)
             return 1
@@ -69,7 +72,4 @@ def main(arguments: abc.Sequence[str] | None = None) -> int:
                 raise
             _log.error("not enough memory; a smaller --size or fewer frames need less (%s)", error)
             return 1
-        except (click.Abort, KeyboardInterrupt):
-            _log.error("interrupted; %s", run.left())
-            return 130
     return status if isinstance(status, int) else 0
