@@ -10,6 +10,7 @@ import sys
 import tomllib
 import warnings
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -43,8 +44,14 @@ ROOT = Path(__file__).resolve().parents[1]
 WAVELENGTH = ["--monochromatic", "4.5e-6"]
 
 
+@lru_cache(maxsize=1)
+def wavefront() -> np.ndarray:
+    """A wavefront, nm."""
+    return random_opd(3, npix=128).data * 1e9
+
+
 def opd_file(path: Path, unit: str | None = "nm") -> Path:
-    hdu = fits.PrimaryHDU(random_opd(3, npix=128).data * 1e9)
+    hdu = fits.PrimaryHDU(wavefront())
     if unit:
         hdu.header["BUNIT"] = unit
     hdu.writeto(path)
@@ -609,6 +616,7 @@ def test_a_written_configuration_gives_the_same_run(
     assert content["frames"] == [str(frames)]
     assert content["opd-folder"] == str(maps)
     assert content["quiet"] is True
+    assert content["json"] is False
     assert main(["reduce", "--config", str(config)]) == 0
     assert main(["--config", str(config), "reduce", "--size", "8", "--overwrite"]) == 0
     assert [call.arguments["size"] for call in reduced] == [6, 8]

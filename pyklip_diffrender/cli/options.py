@@ -228,6 +228,6 @@ search = _all(
            "stars), references (both), off, or a systematics.fits of an earlier reduction."),
     option("--dry-run", is_flag=True, section="Output",
            help="Show frames, wavefront map, steps, time and memory, and stop."),
-    option("--json", "as_json", is_flag=True, section="Output",
+    option("--json", is_flag=True, section="Output",
            help="Print the content of summary.json and nothing else on standard output."),
 )  # fmt: skip
