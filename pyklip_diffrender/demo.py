@@ -112,6 +112,8 @@ def run_demo(
     device : str
         PyTorch device of the model.
     """
+    planet = Planet(contrast, separation, position_angle)
+    scene = Scene(planets=(planet,))
     model = nircam_coronagraph(
         "F444W",
         monochromatic=4.5e-6,
@@ -121,8 +123,6 @@ def run_demo(
     )
     measured = random_opd(seed)
     true_opd = measured.data + random_drift(seed + 1000, hours).data
-    planet = Planet(contrast, separation, position_angle)
-    scene = Scene(planets=(planet,))
     observation = simulate(model, scene, true_opd, seed=seed)
     frame = observation.data[0]
     star = star_photons(model, scene, true_opd)

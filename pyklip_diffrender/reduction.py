@@ -10,6 +10,7 @@ from typing import Any
 
 from pyklip_diffrender.detection import Detection, detect
 from pyklip_diffrender.io.progress import stage
+from pyklip_diffrender.io.units import require_bound
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Systematics, refine
 from pyklip_diffrender.refinement.pattern_choice import PatternRequest, choose_systematics
 from pyklip_diffrender.scene.real_frames import model_for
@@ -119,6 +120,8 @@ def reduce(
     DiffrenderError
         If the target cannot be fitted. A reference star that cannot be is left out.
     """
+    # Before the fits, which take minutes.
+    require_bound(threshold, "threshold", "positive")
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
     wavefront = wavefront_for(opd, sequence.date)

@@ -10,6 +10,7 @@ import sys
 import tomllib
 import warnings
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -26,6 +27,7 @@ from pyklip_diffrender import __version__, plotting, reduction, refinement
 from pyklip_diffrender.bridges import wss
 from pyklip_diffrender.cli import application, main
 from pyklip_diffrender.cli.estimate import steps_of
+from pyklip_diffrender.cli.options import read_config
 from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
@@ -42,8 +44,14 @@ ROOT = Path(__file__).resolve().parents[1]
 WAVELENGTH = ["--monochromatic", "4.5e-6"]
 
 
+@lru_cache(maxsize=1)
+def wavefront() -> np.ndarray:
+    """A wavefront, nm."""
+    return random_opd(3, npix=128).data * 1e9
+
+
 def opd_file(path: Path, unit: str | None = "nm") -> Path:
-    hdu = fits.PrimaryHDU(random_opd(3, npix=128).data * 1e9)
+    hdu = fits.PrimaryHDU(wavefront())
     if unit:
         hdu.header["BUNIT"] = unit
     hdu.writeto(path)
@@ -304,7 +312,7 @@ def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(
 ) -> None:
     products = tmp_path / "products"
     arguments = ["reduce", str(frames), "--opd-folder", str(maps), "-o", str(products)]
-    arguments += ["--dry-run"]
+    arguments += ["--dry-run", "--size", "6"]
     assert main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
     target, reference = (
@@ -329,12 +337,12 @@ def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(
 
 def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
     sequence = Sequence.from_files(frames)
-    names = [name for name, _ in steps_of(sequence, 80, "auto")]
+    names = [name for name, _ in steps_of(sequence, 6, "auto")]
     assert names[0] == "reference stars: HIP-2"
-    alone = dict(steps_of(replace(sequence, references=()), 80, "auto"))
+    alone = dict(steps_of(replace(sequence, references=()), 6, "auto"))
     assert len(alone) == len(names) - 1
     twice = replace(sequence, science=sequence.science * 2)
-    both = dict(steps_of(twice, 80, "off"))
+    both = dict(steps_of(twice, 6, "off"))
     assert both["search of point sources"] == 2 * alone["search of point sources"]
     one, two = alone["wavefront: 1 file of the target"], both["wavefront: 2 files of the target"]
     assert one < two < 2 * one
@@ -470,6 +478,43 @@ def test_warnings_and_errors_are_messages(
     assert lines[1:] == ["pyklip-diffrender: warning: the map is old", "pyklip-diffrender: no fit"]
 
 
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError("8 GB"), RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 GB")],
+    ids=["python", "torch"],
+)
+def test_too_little_memory_is_a_message(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(reduction, "reduce", fail)
+    arguments = ["detect", str(frames / "one_calints.fits"), "--opd-folder", str(maps)]
+    arguments += ["-o", str(tmp_path / "products")]
+    assert main(arguments) == 1
+    assert "pyklip-diffrender: not enough memory; a smaller --size" in capsys.readouterr().err
+    # Any other error is a fault of the program, with its traceback.
+    error = RuntimeError("a bug")
+    with pytest.raises(RuntimeError, match="a bug"):
+        main(arguments)
+
+
+def test_impossible_arguments_are_messages(
+    tmp_path: Path, frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    products = ["-o", str(tmp_path / "products")]
+    assert main(["demo", "--contrast", "-1", *products]) == 1
+    assert "contrast: got -1, expected 0 or more" in capsys.readouterr().err
+    assert main(["detect", str(frames), "--opd", "nowhere.fits", *products]) == 1
+    assert "is a folder, expected a file; the command reduce" in capsys.readouterr().err
+
+
 def test_an_interrupted_run_says_what_it_left(
     tmp_path: Path,
     frames: Path,
@@ -522,6 +567,26 @@ def test_mast_is_asked_for_the_map_of_the_date(
     assert asked == [("2022-07-30T02:03:04", "closest"), ("2022-07-30T02:03:04", "after")]
 
 
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [("nowhere/star.fits", "there is no folder"), (".", "is a folder, expected a file")],
+)
+def test_an_image_goes_into_a_folder_that_exists(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], path: str, words: str
+) -> None:
+    assert main(["psf", str(tmp_path / path)]) == 1
+    assert words in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_without_permission_is_refused_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
+    assert main(["demo", "-o", str(tmp_path / "products" / "deep")]) == 1
+    assert f"no permission in {tmp_path}\n" in capsys.readouterr().err
+
+
 def test_a_device_that_is_not_there_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -551,6 +616,7 @@ def test_a_written_configuration_gives_the_same_run(
     assert content["frames"] == [str(frames)]
     assert content["opd-folder"] == str(maps)
     assert content["quiet"] is True
+    assert content["json"] is False
     assert main(["reduce", "--config", str(config)]) == 0
     assert main(["--config", str(config), "reduce", "--size", "8", "--overwrite"]) == 0
     assert [call.arguments["size"] for call in reduced] == [6, 8]
@@ -589,6 +655,15 @@ def test_tables_of_a_configuration_are_commands(
     config.write_text("quiet = true\n[fit]\nsize = 20\n")
     assert main(["--config", str(config), "psf", str(tmp_path / "star.fits")]) == 2
     assert "[fit] is no command" in capsys.readouterr().err
+
+
+def test_the_documented_configuration_is_valid(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "reference" / "command_line.md").read_text(encoding="utf-8")
+    example = page.partition("```toml\n")[2].partition("```")[0]
+    assert '[reduce]\nframes = ["calints"]' in example
+    path = tmp_path / "run.toml"
+    path.write_text(example)
+    assert read_config(application, path)["reduce"]["log_file"] == "products/run.log"
 
 
 def test_the_rules_are_those_of_the_package() -> None:

@@ -11,16 +11,20 @@ from astropy.io import fits
 from astropy.time import Time
 from stpsf_data import wss_file
 
+from pyklip_diffrender import reduction
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
     IncompatibleSetupError,
     MissingOPDError,
+    RefinementError,
 )
 from pyklip_diffrender.io.headers import sensing_date
 from pyklip_diffrender.optics.grid import resample
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.wavefront.map_choice import choose_map, wavefront_for
-from pyklip_diffrender.wavefront.opd import random_opd, read_opd
+from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, read_opd
 
 NPIX = 64
 
@@ -149,6 +153,30 @@ def test_a_folder_needs_the_date_of_the_frames(folder: Path) -> None:
         wavefront_for(folder, None)
     with pytest.raises(CorruptFileError, match=r"is a folder.*choose_map"):
         read_opd(folder)
+
+
+def test_reduce_takes_the_nearest_map_of_a_folder(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen: list[str] = []
+
+    def stop(model: None, frames: object, opd: OPDMap, **_: object) -> None:
+        chosen.append(opd.name)
+        raise RefinementError("that is all")
+
+    monkeypatch.setattr(reduction, "model_for", lambda *_, **__: None)
+    monkeypatch.setattr(reduction, "refine", stop)
+    frames = tuple(
+        Observation.from_arrays(
+            np.ones((8, 8)), np.ones((8, 8)), pixelscale=0.06, date=Time(f"2022-08-{day}")
+        )
+        for day in ("10", "18")
+    )
+    sequence = Sequence("star", frames)
+    assert sequence.date == Time("2022-08-14")
+    with pytest.raises(RefinementError, match="that is all"):
+        reduction.reduce(sequence, folder, size=8, systematics="off")
+    assert chosen == ["R2022081102-NRCA3_FP1-1.fits"]
 
 
 @pytest.mark.parametrize(

@@ -60,10 +60,16 @@ def main(arguments: abc.Sequence[str] | None = None) -> int:
         except click.ClickException as error:
             error.show()
             return error.exit_code
-        except (DiffrenderError, OSError, MemoryError) as error:
-            _log.error("%s", error or "not enough memory")
-            return 1
         except (click.Abort, KeyboardInterrupt):
             _log.error("interrupted; %s", run.left())
             return 130
+        except (DiffrenderError, OSError) as error:
+            _log.error("%s", error)
+            return 1
+        except (MemoryError, RuntimeError) as error:
+            # PyTorch has errors of its own for memory on the processor and on the GPU.
+            if isinstance(error, RuntimeError) and "memory" not in str(error):
+                raise
+            _log.error("not enough memory; a smaller --size or fewer frames need less (%s)", error)
+            return 1
     return status if isinstance(status, int) else 0

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from contextlib import nullcontext, redirect_stdout
+from json import dumps, loads
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -158,6 +158,10 @@ def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
         from pyklip_diffrender.scene.observation import Observation
         from pyklip_diffrender.scene.sequence import Sequence
 
+        if frames.is_dir():
+            raise IncompatibleSetupError(
+                f"{frames} is a folder, expected a file; the command reduce takes folders"
+            )
         observation = Observation.from_fits(frames)
         return Sequence(observation.target, (observation,))
 
@@ -223,7 +227,7 @@ def _reduction(
     *,
     output: Path,
     overwrite: bool,
-    as_json: bool,
+    json: bool,
     dry_run: bool,
     size: int,
     threshold: float,
@@ -235,11 +239,11 @@ def _reduction(
     """Reduce a sequence, write all products and say what they show."""
     if (opd is not None) == (opd_folder is not None or opd_date is not None):
         raise click.UsageError("Give either --opd FILE, or --opd-folder FOLDER or --opd-date.")
-    if dry_run and as_json:
+    if dry_run and json:
         raise click.UsageError("A --dry-run has no summary to print with --json.")
     run.claim_folder(output, _REDUCTION, overwrite)
     # Libraries may print, too.
-    with redirect_stdout(sys.stderr) if as_json else nullcontext():
+    with redirect_stdout(sys.stderr) if json else nullcontext():
         sequence = read()
         _show(sequence)
         map_ = _map(sequence, opd, opd_folder, opd_date)
@@ -273,9 +277,9 @@ def _reduction(
         click.echo(f"\n{reduction}")
         for path in (*written, figure):
             click.echo(f"wrote {path}")
-    if as_json:
-        summary = json.loads((output / "summary.json").read_text(encoding="utf-8"))
-        click.echo(json.dumps(summary, indent=2))
+    if json:
+        summary = loads((output / "summary.json").read_text(encoding="utf-8"))
+        click.echo(dumps(summary, indent=2))
 
 
 def _show(sequence: Sequence) -> None:

@@ -20,7 +20,15 @@ _MEMORY_PER_FRAME = 0.4e9
 
 
 def steps_of(sequence: Sequence, size: int, systematics: str) -> list[tuple[str, float]]:
-    """The steps of a reduction, each with its duration on two cores, s."""
+    """The steps of a reduction, each with its duration on two cores, s.
+
+    Raises
+    ------
+    ShapeError
+        If the frames are smaller than `size`.
+    """
+    # What of the library is known depends on the pixels that are fitted.
+    sequence = sequence.cutout(size)
     count = len(sequence.science)
     area = (size / 80) ** 2
     fit = _FIT * area**_PIXELS

@@ -177,7 +177,7 @@ common = _all(
     option("--device", default="cpu", show_default=True, section=_GENERAL,
            help="PyTorch device of the optical model, such as cuda."),
     option("--threads", type=click.IntRange(min=1), metavar="N", section=_GENERAL,
-           help="Number of threads; default: one for each core."),
+           help="Number of threads; default: PyTorch's choice."),
     option("--config", type=file_type(), metavar="FILE", section=_GENERAL, is_eager=True,
            expose_value=False, callback=_config_callback,
            help="Take defaults of the options from a TOML file."),
@@ -228,6 +228,6 @@ search = _all(
            "stars), references (both), off, or a systematics.fits of an earlier reduction."),
     option("--dry-run", is_flag=True, section="Output",
            help="Show frames, wavefront map, steps, time and memory, and stop."),
-    option("--json", "as_json", is_flag=True, section="Output",
+    option("--json", is_flag=True, section="Output",
            help="Print the content of summary.json and nothing else on standard output."),
 )  # fmt: skip

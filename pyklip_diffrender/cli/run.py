@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import sys
-import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -44,7 +43,6 @@ class Run:
 
     progress: bool = False
     device: str = "cpu"
-    began: float = field(default_factory=time.monotonic)
     _output: Path | None = None
     _before: dict[Path, int] = field(default_factory=dict)
     _handlers: list[logging.Handler] = field(default_factory=list)

@@ -27,7 +27,7 @@ from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
 from pyklip_diffrender.io.headers import header_text, merged_header, sensing_date
 from pyklip_diffrender.io.opd_map import OPDMap
-from pyklip_diffrender.io.units import native_float64, to_metres, warn_of_rms
+from pyklip_diffrender.io.units import native_float64, to_metres, to_number, warn_of_rms
 from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import FourierModes, SegmentMotions
 
@@ -179,18 +179,19 @@ def drift(before: Any, after: Any, hours: float, interval: float = 86.0) -> NDAr
     ----------
     before, after : OPDMap or ndarray, (npix, npix)
         m.
-    hours : float
-        Time since `before`.
-    interval : float
-        Hours from `before` to `after`.
+    hours : float or Quantity
+        Time since `before`, h.
+    interval : float or Quantity
+        Time from `before` to `after`, h.
 
     Returns
     -------
     ndarray, (npix, npix)
         m.
     """
-    first, second = native_float64(before), native_float64(after)
-    return first + hours / interval * (second - first)
+    first, second = to_metres(before, "before"), to_metres(after, "after")
+    hours = to_number(hours, u.h, "hours")
+    return first + hours / to_number(interval, u.h, "interval", "positive") * (second - first)
 
 
 def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
@@ -205,13 +206,14 @@ def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
     seed : int
     npix : int
         Samples across the pupil. The same seed gives the same wavefront at any sampling.
-    rms : float
+    rms : float or Quantity
         Over the pupil, m.
 
     Returns
     -------
     OPDMap
     """
+    rms = to_number(rms, u.m, "rms", "not negative")
     return _random(seed, npix, rms, 0.24, "random_opd")
 
 
@@ -225,7 +227,8 @@ def random_drift(seed: int, hours: float, npix: int = 1024) -> OPDMap:
     Parameters
     ----------
     seed : int
-    hours : float
+    hours : float or Quantity
+        Time since the wavefront was sensed, h.
     npix : int
         Samples across the pupil.
 
@@ -233,6 +236,7 @@ def random_drift(seed: int, hours: float, npix: int = 1024) -> OPDMap:
     -------
     OPDMap
     """
+    hours = to_number(hours, u.h, "hours")
     unit = _random(seed, npix, 1e-8, 0.62, "random_drift")
     data = unit.data * (9e-9 / 1e-8 * hours / 86.0)
     return OPDMap(data, None, f"random_drift(seed={seed}, hours={hours})", unit.sha256)
