@@ -4,6 +4,7 @@ import csv
 import os
 from pathlib import Path
 
+import click
 import latex2mathml.converter
 from docutils.nodes import SkipNode
 from numpydoc.xref import DEFAULT_LINKS
@@ -82,11 +83,13 @@ def _write_tables(app):
                 [size, each.unit, f"{each.start:g}", f"{each.lower:g} to {each.upper:g}",
                  f"{each.prior:g}", each.description]
             )  # fmt: skip
-    os.environ["COLUMNS"] = "88"
-    parser = cli._parser()
-    commands = next(a for a in parser._actions if a.dest == "command").choices
-    for name, command in {"pyklip-diffrender": parser, **commands}.items():
-        (folder / f"{name}.txt").write_text(command.format_help(), encoding="utf-8")
+    program = cli.application
+    group = click.Context(program, info_name="pyklip-diffrender", terminal_width=88)
+    pages = {"pyklip-diffrender": program.get_help(group)}
+    for name, command in program.commands.items():
+        pages[name] = command.get_help(click.Context(command, group, name, terminal_width=88))
+    for name, text in pages.items():
+        (folder / f"{name}.txt").write_text(text + "\n", encoding="utf-8")
 
 
 def setup(app):

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.scene.real_frames import model_for
     from pyklip_diffrender.scene.sequence import Sequence
     from pyklip_diffrender.scene.simulation import simulate
+    from pyklip_diffrender.wavefront.map_choice import choose_map
     from pyklip_diffrender.wavefront.opd import drift, random_opd, read_opd
     from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
 
@@ -63,6 +64,7 @@ __all__ = [
     "WavefrontPrior",
     "__version__",
     "backend",
+    "choose_map",
     "contrast_curve",
     "detect",
     "drift",
@@ -102,6 +104,7 @@ _NAMES = {
     "scene.real_frames": "model_for",
     "scene.sequence": "Sequence",
     "scene.simulation": "simulate",
+    "wavefront.map_choice": "choose_map",
     "wavefront.opd": "drift random_opd read_opd",
     "wavefront.priors": "WavefrontPrior learn_prior",
 }

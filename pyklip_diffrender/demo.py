@@ -95,6 +95,7 @@ def run_demo(
     hours: float = 40.0,
     seed: int = 1,
     progress: bool = False,
+    device: str = "cpu",
 ) -> DemoResult:
     """Simulate, refine, subtract, and run KLIP on the same frame.
 
@@ -108,14 +109,20 @@ def run_demo(
         Random seed of wavefront, drift and noise.
     progress : bool
         Show progress bars.
+    device : str
+        PyTorch device of the model.
     """
+    planet = Planet(contrast, separation, position_angle)
+    scene = Scene(planets=(planet,))
     model = nircam_coronagraph(
-        "F444W", monochromatic=4.5e-6, fov_pixels=80, segment_gap=PAPER_SEGMENT_GAP
+        "F444W",
+        monochromatic=4.5e-6,
+        fov_pixels=80,
+        segment_gap=PAPER_SEGMENT_GAP,
+        device=device,
     )
     measured = random_opd(seed)
     true_opd = measured.data + random_drift(seed + 1000, hours).data
-    planet = Planet(contrast, separation, position_angle)
-    scene = Scene(planets=(planet,))
     observation = simulate(model, scene, true_opd, seed=seed)
     frame = observation.data[0]
     star = star_photons(model, scene, true_opd)

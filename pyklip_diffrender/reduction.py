@@ -2,36 +2,22 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pyklip_diffrender.detection import Detection, detect
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
-from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement import (
-    GaussNewton,
-    Refinement,
-    Systematics,
-    known_systematics,
-    refine,
-)
-from pyklip_diffrender.refinement.registration import register
-from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.io.progress import stage
+from pyklip_diffrender.io.units import require_bound
+from pyklip_diffrender.refinement import GaussNewton, Refinement, Systematics, refine
+from pyklip_diffrender.refinement.pattern_choice import PatternRequest, choose_systematics
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
+from pyklip_diffrender.wavefront.map_choice import wavefront_for
 
 __all__ = ["Reduction", "reduce"]
-
-_log = logging.getLogger(__name__)
-
-_KNOWN_MODEL_ERROR = 0.002
-"""Smallest model error, as a fraction of the star, where the pattern of the model's error is known
-from other stars: the pattern's own error is counted apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +75,10 @@ def reduce(
     target: str | None = None,
     filter: str | None = None,
     size: int = 80,
-    systematics: Systematics | Literal["auto", "references", "off"] = "auto",
+    systematics: PatternRequest = "auto",
     settings: GaussNewton | None = None,
     threshold: float = 5.0,
+    device: str = "cpu",
     progress: bool = False,
 ) -> Reduction:
     """Search a sequence of real frames for planets.
@@ -104,7 +91,8 @@ def reduce(
     ----------
     sequence : Sequence, or files as for `Sequence.from_files`
     opd : path, OPDMap, Quantity or array
-        The wavefront to start from, as for `refine`.
+        The wavefront to start from, as for `refine`. Of a folder of maps, the one nearest in time
+        is taken; see `choose_map` for other rules.
     target, filter : str, optional
         See `Sequence.from_files`.
     size : int
@@ -118,6 +106,8 @@ def reduce(
         Of the fits; default those of `refine`.
     threshold : float
         S/N of a candidate.
+    device : str
+        PyTorch device of the optical model.
     progress : bool
         Show progress bars.
 
@@ -130,78 +120,32 @@ def reduce(
     DiffrenderError
         If the target cannot be fitted. A reference star that cannot be is left out.
     """
+    # Before the fits, which take minutes.
+    require_bound(threshold, "threshold", "positive")
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
-    wavefront = as_opd_map(opd)
-    model = model_for(sequence.science[0], size)
+    wavefront = wavefront_for(opd, sequence.date)
+    model = model_for(sequence.science[0], size, device=device)
     sequence = sequence.cutout(size)
-    common: dict[str, Any] = {"settings": settings, "progress": progress}
-    references: list[Refinement] = []
-    failed: list[tuple[str, str]] = []
-    pattern = systematics if isinstance(systematics, Systematics) else None
-    if systematics in ("auto", "references"):
-        first = sequence.science[0]
-        if systematics == "auto":
-            pattern = known_systematics(first)
-            if pattern is not None:
-                sequence, pattern = _registered(sequence, pattern, model, wavefront, common)
-        if pattern is None and sequence.references:
-            references, failed = _fit_references(sequence, model, wavefront, common)
-            pattern = known_systematics(first, references)
-        _log.info("pattern of the model's error: %s", pattern)
-    elif systematics != "off" and pattern is None:
-        raise IncompatibleSetupError(
-            f"systematics: got {systematics!r}, expected 'auto', 'references', 'off' or a "
-            "Systematics"
+    choice = choose_systematics(
+        sequence.science,
+        sequence.references,
+        model,
+        wavefront,
+        systematics=systematics,
+        settings=settings,
+        progress=progress,
+    )
+    sequence = replace(sequence, science=choice.science)
+    with stage("2 of 4: wavefront"):
+        fit = refine(
+            model,
+            sequence.science,
+            wavefront,
+            systematics=choice.systematics,
+            settings=choice.settings,
+            progress=progress,
         )
-    if pattern is not None and settings is None and sequence.science[0].is_nircam:
-        common["settings"] = GaussNewton.nircam(min_model_error=_KNOWN_MODEL_ERROR)
-    fit = refine(model, sequence.science, wavefront, systematics=pattern, **common)
-    detection = detect(fit, threshold=threshold, progress=progress)
-    return Reduction(sequence, fit, detection, tuple(references), pattern, tuple(failed))
-
-
-def _fit_references(
-    sequence: Sequence, model: OpticalSystem, wavefront: OPDMap, common: dict[str, Any]
-) -> tuple[list[Refinement], list[tuple[str, str]]]:
-    """One fit for every reference star; names of those that fail, and why."""
-    fits, failed = [], []
-    for star, frames in _by_star(sequence.references).items():
-        _log.info("reference star %s: %d frames", star, len(frames))
-        try:
-            fits.append(refine(model, frames, wavefront, **common))
-        except DiffrenderError as error:
-            _log.warning("reference star %s is left out: %s", star, error)
-            failed.append((star, str(error)))
-    return fits, failed
-
-
-def _registered(
-    sequence: Sequence,
-    pattern: Systematics,
-    model: OpticalSystem,
-    wavefront: OPDMap,
-    common: dict[str, Any],
-) -> tuple[Sequence, Systematics | None]:
-    """The sequence on the pixels of the library's pattern; no pattern if one frame is not."""
-    frames = []
-    for each in sequence.science:
-        frame: Observation | None = each
-        if each.first_pixel is None:
-            _log.info("%s: looking for its place on the detector", each.name)
-            frame = register(refine(model, each, wavefront, **common), pattern)
-        if frame is None:
-            _log.warning(
-                "%s: the file does not say which pixels of the detector its frames show, and the "
-                "known pattern of the flat field is not seen in them; it is not used", each.name
-            )  # fmt: skip
-            return sequence, None
-        frames.append(frame)
-    return replace(sequence, science=tuple(frames)), pattern
-
-
-def _by_star(observations: Iterable[Observation]) -> dict[str, list[Observation]]:
-    stars: dict[str, list[Observation]] = {}
-    for each in observations:
-        stars.setdefault(each.target, []).append(each)
-    return stars
+    with stage("3 of 4: search"):
+        detection = detect(fit, threshold=threshold, progress=progress)
+    return Reduction(sequence, fit, detection, choice.references, choice.systematics, choice.failed)

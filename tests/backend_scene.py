@@ -80,8 +80,12 @@ def calints(
     roll: float = 0.0,
     center: tuple[float, float] = (20.7, 25.2),
     nints: int = 2,
+    **cards: Any,
 ) -> NDArray[np.float64]:
-    """Write a file as the JWST pipeline does and return its pixels; two pixels are flagged."""
+    """Write a file as the JWST pipeline does and return its pixels; two pixels are flagged.
+
+    `cards` are further ones of the primary header.
+    """
     data = np.array([1000 * psf(*center) + BACKGROUND for _ in range(nints)])
     data += rng.normal(0, 0.05, data.shape)
     flags = np.zeros(data.shape, np.uint32)
@@ -91,7 +95,7 @@ def calints(
         {
             "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON", "FILTER": "F444W",
             "PUPIL": "MASKRND", "CORONMSK": "MASKA335R", "XOFFSET": 0.0, "YOFFSET": 0.0,
-            "DATE-BEG": "2022-07-30T01:02:03",
+            "DATE-BEG": "2022-07-30T01:02:03", **cards,
         }
     )  # fmt: skip
     science = fits.Header(

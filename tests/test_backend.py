@@ -35,6 +35,7 @@ from pyklip.parallelized import klip_dataset
 from pyklip_diffrender import backend as backend_module_or_function
 from pyklip_diffrender.errors import (
     CorruptFileError,
+    DiffrenderWarning,
     IncompatibleSetupError,
     MissingOPDError,
     NonFiniteError,
@@ -112,7 +113,7 @@ def spied(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         found[name + " dict"] = dict(vars(function))
     from pyklip.instruments.JWST import JWSTData
 
-    found["readdata"] = vars(JWSTData)["readdata"]
+    found["readers"] = {name: vars(JWSTData)[name] for name in ("readdata", "readpsflib")}
     found["names"] = dict(vars(parallelized))
     found["fm names"] = dict(vars(fm))
     return found
@@ -403,7 +404,8 @@ def test_block_wins_over_dataset_over_register(imgs: np.ndarray, tmp_path: Path)
         with backend(subtractor=seed(3)), backend(model_options={"c": 3}):
             header = reduce(copied, tmp_path, algo="klip")["x-KLmodes-all.fits"][1]
         assert (header["DRSEED"], header["DRSTAT"]) == (3, "{'a': 1, 'b': 2, 'c': 3}")
-        header = reduce(copied, tmp_path, algo="klip")["x-KLmodes-all.fits"][1]
+        with pytest.warns(DiffrenderWarning, match="runs KLIP"):
+            header = reduce(copied, tmp_path, algo="klip")["x-KLmodes-all.fits"][1]
         assert "DRSEED" not in header
     finally:
         unregister()
@@ -427,6 +429,47 @@ def test_block_takes_over_klip_and_nothing_else(imgs: np.ndarray, tmp_path: Path
         pass
     with pytest.raises(ValueError, match="Algo diffrender is not supported"):
         reduce(generic(imgs, ANGLES), tmp_path)
+
+
+def test_klip_on_a_dataset_that_was_reduced_here_says_so_once(
+    imgs: np.ndarray, tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    def klipped(dataset: Any) -> bool:
+        header = reduce(dataset, tmp_path, algo="klip")["x-KLmodes-all.fits"][1]
+        return "DRALGO" not in header
+
+    register(opd=OPD, subtractor=render)
+    try:
+        dataset = generic(imgs, ANGLES)
+        assert klipped(dataset)
+        reduce(dataset, tmp_path)
+        with pytest.warns(DiffrenderWarning, match=r"runs KLIP.*replace=True") as caught:
+            assert klipped(copy.deepcopy(dataset))
+        # The line of the script that made the call.
+        assert [each.filename for each in caught] == [__file__]
+        assert klipped(dataset)
+        reduce(dataset, tmp_path)
+        with backend(force=False):
+            assert klipped(dataset)
+        register(replace=False)
+        assert klipped(dataset)
+        register(replace=True)
+        assert not klipped(dataset)
+        with backend(force=False):
+            assert klipped(dataset)
+    finally:
+        unregister()
+    register(opd=OPD, subtractor=render)
+    try:
+        reduce(dataset, tmp_path)
+        with pytest.warns(DiffrenderWarning), pytest.raises(AttributeError):
+            fm.klip_dataset(dataset, None, numbasis=[1], mode="RDI")
+        register(replace=True)
+        with pytest.raises(IncompatibleSetupError, match="not supported by diffrender"):
+            fm.klip_dataset(dataset, None)
+    finally:
+        unregister()
+    assert not recwarn.list
 
 
 @pytest.mark.parametrize("kind", ["array", "quantity", "file", "path"])

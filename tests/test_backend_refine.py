@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +14,11 @@ import torch
 from astropy.io import fits
 from numpy.typing import NDArray
 from pyklip.instruments.Instrument import GenericData
+from pyklip.klip import rotate
 from pyklip.parallelized import klip_dataset
 
 from pyklip_diffrender.errors import (
+    DiffrenderWarning,
     IncompatibleSetupError,
     NoValidPixelsError,
     RefinementError,
@@ -23,8 +26,12 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, subtract_by_refinement
+from pyklip_diffrender.pyklip_backend.references import ChosenPattern
+from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
-from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
+from pyklip_diffrender.refinement import Adam, GaussNewton, Status, Systematics, refine
+from pyklip_diffrender.scene.detector_pixels import shift_frames
+from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
@@ -40,9 +47,9 @@ OLD = random_opd(1, npix=128)
 NEW = OLD.data + random_drift(2, 40.0, npix=128).data
 
 
-def planet_pixels(angle: float) -> tuple[float, float]:
+def planet_pixels(angle: float, position_angle: float = 0.0) -> tuple[float, float]:
     """Where pyKLIP turns up to north from: x, y offset of the companion in a frame, arcsec."""
-    t = np.radians(90 - angle)
+    t = np.radians(90 + position_angle - angle)
     return SEPARATION * float(np.cos(t)), SEPARATION * float(np.sin(t))
 
 
@@ -69,12 +76,16 @@ def exposed(contrast: float) -> NDArray[np.float64]:
     return rng.poisson(np.array(photons) + SKY).astype(np.float64)
 
 
+def padded(frames: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.pad(frames, ((0, 0), (PAD, PAD), (PAD, PAD)), constant_values=np.nan)
+
+
 def dataset(frames: NDArray[np.float64], model: Any, **settings: Any) -> GenericData:
     """Frames padded with NaN as spaceKLIP does, and no header."""
-    padded = np.pad(frames, ((0, 0), (PAD, PAD), (PAD, PAD)), constant_values=np.nan)
+    filled = padded(frames)
     center = ((SHAPE[1] - 1) / 2 + PAD, (SHAPE[0] - 1) / 2 + PAD)
     made = GenericData(
-        padded,
+        filled,
         np.tile(center, (len(frames), 1)),
         parangs=np.array(ANGLES[: len(frames)]),
         wvs=np.full(len(frames), 4.44),
@@ -84,16 +95,19 @@ def dataset(frames: NDArray[np.float64], model: Any, **settings: Any) -> Generic
     made.OWA = 40.0
     made.diffrender = DiffrenderSettings(
         model=model,
-        error=np.sqrt(np.nan_to_num(np.abs(padded), nan=1.0)),
-        **{"fit": GaussNewton(basis=default_basis(6.0), response_npix=128), **settings},
+        **{
+            "error": np.sqrt(np.nan_to_num(np.abs(filled), nan=1.0)),
+            "fit": GaussNewton(basis=default_basis(6.0), response_npix=128),
+            **settings,
+        },
     )
     return made
 
 
-def reduce(made: Any, folder: Path) -> tuple[NDArray[np.float64], fits.Header]:
+def reduce(made: Any, folder: Path, algo: str = "klip") -> tuple[NDArray[np.float64], fits.Header]:
     klip_dataset(
         made, mode="ADI", outputdir=str(folder), fileprefix="x", annuli=1, subsections=1,
-        numbasis=[1], movement=0, numthreads=1, verbose=False, algo="klip",
+        numbasis=[1], movement=0, numthreads=1, verbose=False, algo=algo,
         aligned_center=made.centers[0],
     )  # fmt: skip
     cube, header = fits.getdata(folder / "x-KLmodes-all.fits", header=True)
@@ -107,8 +121,9 @@ def test_star_goes_companion_stays(
     with backend(opd=OLD):
         refined, outdated = copy.deepcopy(made), copy.deepcopy(made)
         image, header = reduce(refined, tmp_path)
-        outdated.diffrender = replace(made.diffrender, fit=ALIGNED)
-        reduce(outdated, tmp_path)
+        outdated.diffrender = replace(made.diffrender, fit=ALIGNED, max_chi2=np.inf)
+        with pytest.warns(DiffrenderWarning, match="roll0.*MODEL_MISMATCH.*What to do: .*filter"):
+            reduce(outdated, tmp_path)
     x, y = made.centers[0]
     peak = np.unravel_index(np.nanargmax(image), image.shape)
     np.testing.assert_allclose(peak, (y + SEPARATION / 0.062424185, x), atol=1.0)
@@ -129,11 +144,14 @@ def test_star_goes_companion_stays(
 
     # The fit saw 32 x 32 pixels, the product covers all that the frames hold.
     assert np.isfinite(image).sum() > 1.0 * frames[0].size
-    assert header["DRNFIT"] == len(ANGLES)
     assert header["DRMETH"] == "gauss-newton"
-    assert header["DRSTAT"] in ("converged", "model_mismatch")
-    fits_of_rolls = refined.diffrender_results[0].subtraction.fits
-    assert header["DRCHI2"] == pytest.approx(max(f.result.chi2_per_pixel for f in fits_of_rolls))
+    assert header["DRSTAT"] == "converged"
+    # Both rolls share a fit.
+    assert header["DRNFIT"] == 1
+    (fit,) = refined.diffrender_results[0].subtraction.fits
+    assert fit.frames == (0, 1)
+    assert header["DRCHI2"] == pytest.approx(fit.result.chi2_per_pixel)
+    assert (header["DRSYST"], header["DRREFS"]) == ("none", 0)
     assert header["DROPD"] == OLD.name
     assert header["DRSHA256"] == OLD.sha256
 
@@ -152,7 +170,7 @@ def test_what_is_detected_keeps_its_light(small: OpticalSystem, tmp_path: Path) 
             reduced = copy.deepcopy(made)
             _, header = reduce(reduced, tmp_path)
         found = reduced.diffrender_results[0].subtraction
-        assert [len(fit.result.companions) for fit in found.fits] == [int(keep)] * len(ANGLES)
+        assert [len(fit.result.companions) for fit in found.fits] == [int(keep)]
         assert header["DRKEPT"] == int(keep)
         taken = found.star[:, PAD:-PAD, PAD:-PAD] - star
         shares = [
@@ -162,6 +180,112 @@ def test_what_is_detected_keeps_its_light(small: OpticalSystem, tmp_path: Path) 
         kept[keep] = np.mean(shares)
     assert kept[False] < 0.85
     assert kept[True] == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("angle", "flipx"), [(0.0, False), (70.0, False), (-130.0, True)])
+def test_maps_are_turned_as_pyklip_turns_frames(angle: float, flipx: bool) -> None:
+    y, x = np.indices((40, 46))
+    image = np.exp(-((x - 20) ** 2 + (y - 30) ** 2) / 200) + 0.01 * x
+    old, new = np.array([22.3, 18.8]), np.array([23.0, 20.0])
+    expected = rotate(image, angle, old, new, flipx=flipx)
+    turned = on_product(image, old, image.shape, new, angle, flipx)
+    both = np.isfinite(turned) & np.isfinite(expected)
+    assert both.sum() > 800
+    # Linear interpolation here, a spline that ripples at the edges there.
+    np.testing.assert_allclose(turned[both], expected[both], atol=0.012)
+
+
+def test_a_companion_in_the_model_keeps_its_light(
+    small: OpticalSystem, frames: NDArray[np.float64]
+) -> None:
+    cut = Window.about(np.array([19.5, 21.5]), (32, 32)).of(
+        Observation.from_arrays(frames[0], np.sqrt(frames[0]), pixelscale=small.detector.pixelscale)
+    )
+    x, y = planet_pixels(0.0)
+    known = GaussNewton(
+        basis=default_basis(3.0), response_npix=128,
+        companions=(Planet.from_offset(CONTRAST, x, y),),
+    )  # fmt: skip
+    fit = refine(small, cut, OLD, settings=known, plan="off")
+    kept = throughput_map(fit, spacing=8)
+    row, column = round(15.5 + y / 0.0624), round(15.5 + x / 0.0624)
+    assert kept[row, column] == pytest.approx(1.0, abs=0.04)
+    mirrored = kept[31 - row, column]
+    assert 0.2 < mirrored < 0.97
+
+
+@pytest.mark.slow
+def test_a_faint_planet_loses_what_the_throughput_map_says(
+    small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path
+) -> None:
+    """The difference of two reductions, against the closed form; the planet is east of north."""
+    camera = nircam_coronagraph("F444W", fov_pixels=SHAPE, **NUMERICS)
+    light = np.array(
+        [1e-7 * FLUX * camera(NEW, star_offset=planet_pixels(a, 70.0)).numpy() for a in ANGLES]
+    )
+    images = {}
+    for name, shots, algo in (
+        ("without", frames, "klip"), ("with", frames + light, "klip"), ("light", light, "none"),
+    ):  # fmt: skip
+        made = dataset(
+            shots, small, error=np.sqrt(np.nan_to_num(padded(frames), nan=1.0)), plan="off"
+        )
+        with backend(opd=OLD):
+            images[name], header = reduce(made, tmp_path, algo=algo)
+        if name == "without":
+            throughput, about = fits.getdata(tmp_path / "x-throughput.fits", header=True)
+            assert header["DRTHRU"] == pytest.approx(np.nanmedian(throughput), abs=0.2)
+            assert about["DRTHRU"] == header["DRTHRU"]
+            np.testing.assert_array_equal(np.isnan(throughput), np.isnan(images[name]))
+    x, y = made.centers[0]
+    turn = np.radians(70.0)
+    column = round(x - SEPARATION * np.sin(turn) / 0.062424185)
+    row = round(y + SEPARATION * np.cos(turn) / 0.062424185)
+    about_planet = np.s_[row - 5 : row + 6, column - 5 : column + 6]
+    planet = images["light"][about_planet]
+    change = (images["with"] - images["without"])[about_planet]
+    kept = float(np.sum(change * planet) / np.sum(planet**2))
+    assert 0.2 < kept < 0.9
+    assert throughput[row, column] == pytest.approx(kept, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("instrument", "keep", "searched"),
+    [("NIRCAM", None, True), ("NIRCAM", False, False), (None, None, False), (None, True, True)],
+)
+def test_companions_are_kept_by_default_in_real_frames_only(
+    instrument: str | None, keep: bool | None, searched: bool, small: OpticalSystem,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    calls: list[int] = []
+
+    def search(results: Any, tell: Any) -> Any:
+        calls.append(len(results))
+        return results
+
+    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract._with_companions", search)
+    star = FLUX * small(OLD.data).numpy() + SKY
+    header = fits.Header({} if instrument is None else {"INSTRUME": instrument})
+    observation = Observation.from_arrays(
+        star, np.sqrt(star), pixelscale=small.detector.pixelscale, header=header
+    )
+    settings = DiffrenderSettings(model=small, fit=ALIGNED, keep_detected=keep)
+    subtract_by_refinement(observation, OLD, settings)
+    assert calls == [1] * searched
+
+
+def test_a_second_fit_that_fails_stops_the_reduction_too(
+    small: OpticalSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def worse(results: Any, tell: Any) -> Any:
+        return [replace(each, status=Status.DIVERGED) for each in results]
+
+    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract._with_companions", worse)
+    star = FLUX * small(OLD.data).numpy() + SKY
+    observation = Observation.from_arrays(star, np.sqrt(star), pixelscale=small.detector.pixelscale)
+    settings = DiffrenderSettings(model=small, fit=ALIGNED, keep_detected=True)
+    with pytest.raises(RefinementError, match="no light"):
+        subtract_by_refinement(observation, OLD, settings)
 
 
 def test_companions_cannot_be_kept_by_a_method_without_their_errors(
@@ -182,10 +306,42 @@ def test_a_model_without_recipe_is_good_for_its_own_square(
 ) -> None:
     bare = OpticalSystem(small.entrance, small.planes, small.detector, small.bandpass)
     made = dataset(frames[:1], bare, fit_pixels=32)
-    with backend(opd=OLD, fit=ALIGNED):
+    with backend(opd=OLD, fit=ALIGNED, max_chi2=np.inf), pytest.warns(DiffrenderWarning):
         image, _ = reduce(made, tmp_path)
     assert "pixels outside its 32 x 32 are NaN" in caplog.text
     assert 800 < np.isfinite(image).sum() <= 32**2
+
+
+@pytest.mark.parametrize("wrong", ["nothing", "centre", "filter"])
+def test_a_header_that_contradicts_the_data_stops_the_reduction(
+    wrong: str, small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path
+) -> None:
+    model, numerics = small, {**NUMERICS, "monochromatic": 3.56e-6}
+    if wrong == "filter":
+        model = nircam_coronagraph("F356W", fov_pixels=32, **numerics)
+    made = dataset(frames[:1], model, fit=ALIGNED)
+    if wrong == "centre":
+        made.centers = made.centers + 10.0
+    if wrong == "nothing":
+        expected: Any = pytest.warns(DiffrenderWarning, match="MODEL_MISMATCH")
+    else:
+        expected = pytest.raises(RefinementError, match=r"roll0: .* max_chi2=100: .*STARCENX.*filt")
+    with backend(opd=OLD), expected:
+        reduce(made, tmp_path)
+    assert bool(list(tmp_path.iterdir())) == (wrong == "nothing")
+
+
+def test_a_fit_whose_algebra_breaks_down_says_what_to_check(
+    small: OpticalSystem, frames: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refine(*args: Any, **kw: Any) -> None:
+        torch.linalg.cholesky(-torch.eye(2))
+
+    monkeypatch.setattr("pyklip_diffrender.refinement.refine", refine)
+    observation = Observation.from_arrays(frames, np.sqrt(frames), pixelscale=0.0624, name="roll")
+    settings = DiffrenderSettings(model=small)
+    with pytest.raises(RefinementError, match=r"roll: the fit broke down.*Check the star's"):
+        subtract_by_refinement(observation, OLD, settings)
 
 
 def test_a_fit_that_diverges_stops_the_reduction(
@@ -202,21 +358,30 @@ def test_a_fit_that_diverges_stops_the_reduction(
     assert made.output is None
 
 
-def test_each_roll_and_dither_has_its_own_fit(
+def test_frames_at_one_place_are_averaged_and_all_share_a_fit(
     small: OpticalSystem, frames: NDArray[np.float64]
 ) -> None:
-    cube = frames[[0, 1, 0, 0]]
-    center = np.array([[19.5, 21.5], [19.5, 21.5], [20.5, 21.5], [19.5, 21.5]])
+    cube = frames[[0, 1, 0, 0, 0]]
+    center = np.array([[19.5, 21.5], [19.5, 21.5], [20.5, 21.5], [19.54, 21.5], [19.5, 21.56]])
     observation = Observation.from_arrays(
         cube, np.sqrt(cube), pixelscale=0.0624, center=center,
-        position_angles=np.array([0.0, 10.0, 0.0, 0.0]), filter="F444W",
+        position_angles=np.array([0.0, 10.0, 0.0, 0.009, 0.0]), filter="F444W",
     )  # fmt: skip
-    settings = DiffrenderSettings(model=small, fit=ALIGNED)
-    found = subtract_by_refinement(observation, OLD, settings)
-    assert [fit.frames for fit in found.fits] == [(0, 3), (1,), (2,)]
-    assert found.star.shape == cube.shape
-    np.testing.assert_array_equal(found.star[0], found.star[3])
-    assert np.isfinite(found.star).all()
+    told: list[str] = []
+    settings = DiffrenderSettings(model=small, fit=ALIGNED, max_chi2=np.inf)
+    with pytest.warns(DiffrenderWarning):
+        rendered = subtract_by_refinement(observation, OLD, settings, tell=told.append)
+    (fit,) = rendered.fits
+    assert fit.frames == (0, 1, 2, 3, 4)
+    assert [len(frame.observation) for frame in fit.result.frames] == [2, 1, 1, 1]
+    assert "5 frames of 4 pointings together" in told[0]
+    assert rendered.star.shape == cube.shape
+    np.testing.assert_array_equal(rendered.star[0], rendered.star[3])
+    assert np.isfinite(rendered.star).all()
+
+    with pytest.warns(DiffrenderWarning, match="COMPLETED"):
+        alone = subtract_by_refinement(observation, OLD, replace(settings, fit=Adam(iterations=1)))
+    assert [each.frames for each in alone.fits] == [(0, 3), (1,), (2,), (4,)]
 
 
 def test_start_plan_and_systematics_reach_the_fit(
@@ -240,7 +405,10 @@ def test_start_plan_and_systematics_reach_the_fit(
     )
     chi2 = {}
     for known in (None, systematics):
-        found = subtract_by_refinement(observation, OLD, replace(settings, systematics=known))
+        chosen = replace(settings, systematics=known)
+        with contextlib.nullcontext() if known else pytest.warns(DiffrenderWarning):
+            found = subtract_by_refinement(observation, OLD, chosen)
+        assert found.systematics == ("given (systematics)" if known else "none")
         (fit,) = found.fits
         assert fit.result.plan is None
         assert fit.result.frames[0].values["star_offset"].tolist() == [0.02, 0.0]
@@ -251,6 +419,34 @@ def test_start_plan_and_systematics_reach_the_fit(
     # 1024 pixels: known to 4.4 %; the star's flux, to 1e-4.
     assert chi2[False][0] == pytest.approx(1.0, abs=0.13)
     assert chi2[False][1] < 0.1
+
+
+@pytest.mark.parametrize("side", [32, 44])
+def test_frames_that_were_moved_for_the_fit_are_subtracted_where_they_are(
+    side: int, small: OpticalSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = nircam_coronagraph("F444W", fov_pixels=side, **NUMERICS)
+    # Not so bright that the ringing at the edges is above the noise.
+    star = FLUX / 100 * camera(OLD.data, (0.02, 0.0)).numpy() + SKY
+    observation = Observation.from_arrays(
+        star, np.sqrt(star), pixelscale=small.detector.pixelscale, filter="F444W"
+    )
+    away = np.array([0.3, -0.2])
+
+    def moved(science: Any, references: Any, model: Any, opd: Any, settings: Any, tell: Any) -> Any:
+        (frame,) = science
+        shifted = shift_frames(frame.data, away[np.newaxis])
+        registered = replace(frame, data=shifted, center=frame.center + away)
+        return ChosenPattern((registered,), None, settings.fit)
+
+    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract.pattern_for", moved)
+    settings = DiffrenderSettings(model=small, fit=ALIGNED, start={"star_offset": (0.02, 0.0)})
+    rendered = subtract_by_refinement(observation, OLD, settings)
+    inner = np.s_[6:-6, 6:-6]
+    wrong = (rendered.star[0] - star)[inner] / np.sqrt(star)[inner]
+    unmoved = (shift_frames(star[np.newaxis], away[np.newaxis])[0] - star)[inner]
+    assert np.sqrt(np.mean(wrong**2)) < 0.2
+    assert np.sqrt(np.mean((unmoved / np.sqrt(star)[inner]) ** 2)) > 1.0
 
 
 def test_windows_that_stick_out_of_the_frame(rng: np.random.Generator) -> None:

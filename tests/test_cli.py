@@ -2,29 +2,56 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import os
 import subprocess
 import sys
+import tomllib
+import warnings
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from astropy.io import fits
+from astropy.time import Time
 
-from pyklip_diffrender import __version__
-from pyklip_diffrender.cli import main
+from pyklip_diffrender import __version__, plotting, reduction, refinement
+from pyklip_diffrender.bridges import wss
+from pyklip_diffrender.cli import application, main
+from pyklip_diffrender.cli.estimate import steps_of
+from pyklip_diffrender.cli.options import read_config
+from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.wavefront.opd import random_opd, resample
+from pyklip_diffrender.refinement import Status
+from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.wavefront.map_choice import RULES
+from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, resample
+
+# The package has the command under the name of its module.
+doctor = import_module("pyklip_diffrender.cli.doctor")
 
 ROOT = Path(__file__).resolve().parents[1]
 
 WAVELENGTH = ["--monochromatic", "4.5e-6"]
 
 
+@lru_cache(maxsize=1)
+def wavefront() -> np.ndarray:
+    """A wavefront, nm."""
+    return random_opd(3, npix=128).data * 1e9
+
+
 def opd_file(path: Path, unit: str | None = "nm") -> Path:
-    hdu = fits.PrimaryHDU(random_opd(3, npix=128).data * 1e9)
+    hdu = fits.PrimaryHDU(wavefront())
     if unit:
         hdu.header["BUNIT"] = unit
     hdu.writeto(path)
@@ -32,26 +59,55 @@ def opd_file(path: Path, unit: str | None = "nm") -> Path:
 
 
 def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["--help"])
-    assert ended.value.code == 0
+    assert main(["--help"]) == 0
     shown = capsys.readouterr().out
-    for command in ("demo", "reduce", "detect", "psf"):
+    for command in ("demo", "reduce", "detect", "psf", "doctor"):
         assert command in shown
 
 
-def test_no_command_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main([])
-    assert ended.value.code == 2
-    assert "COMMAND" in capsys.readouterr().err
+@pytest.mark.parametrize("command", ["demo", "reduce", "detect", "psf"])
+def test_help_of_a_command_has_sections_and_examples(
+    capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    assert main([command, "-h"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.index("\nOutput:") < shown.index("\nGeneral:")
+    assert f"  pyklip-diffrender {command}" in shown.partition("Examples:")[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "Commands:"),
+        (["fit"], "No such command 'fit'"),
+        (["reduce", "-o", "x", "--opd", "y"], "Missing argument 'FRAMES...'"),
+        (["detect", "x", "--opd", "y"], "Missing option '-o'"),
+        (["detect", "x", "-o", "y"], "Give either --opd FILE, or --opd-folder"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--opd-date", "before"], "Give either --opd"),
+        (["detect", "x", "-o", "y", "--opd-date", "closest"], "nearest"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--dry-run", "--json"], "--dry-run has no"),
+        (["psf", "x.fits", "--threads", "0"], "--threads"),
+    ],
+)
+def test_wrong_options_are_usage_errors(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    shown = capsys.readouterr()
+    assert words in shown.err
+    assert shown.out == ""
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_help_does_not_wait_for_torch() -> None:
     program = (
         "import sys, pyklip_diffrender.cli as cli\n"
-        "try:\n    cli.main(['--help'])\n"
-        "except SystemExit:\n    pass\n"
+        "cli.main(['--help'])\n"
         "heavy = {'torch', 'numpy', 'pyklip', 'matplotlib', 'poppy'} & set(sys.modules)\n"
         "sys.exit(f'imported {heavy}' if heavy else 0)\n"
     )
@@ -143,9 +199,7 @@ def test_detect_in_a_broken_file_leaves_no_product(
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["--version"])
-    assert ended.value.code == 0
+    assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"pyklip-diffrender {__version__}\n"
 
 
@@ -232,15 +286,33 @@ def calints_file(path: Path, star: str, reference: bool) -> Path:
     return path
 
 
-def test_a_dry_run_lists_the_frames_and_writes_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.fixture
+def frames(tmp_path: Path) -> Path:
+    """A folder with frames of a target and of a reference star, and an empty file."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    calints_file(folder / "one_calints.fits", "HIP-1", reference=False)
+    calints_file(folder / "two_calints.fits", "HIP-2", reference=True)
+    (folder / "three_calints.fits").write_bytes(b"")
+    return folder
+
+
+@pytest.fixture
+def maps(tmp_path: Path) -> Path:
+    """A folder of wavefront maps from before and after the frames."""
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    opd_file(folder / "opd_2022-07-20.fits")
+    opd_file(folder / "opd_2022-07-31.fits")
+    return folder
+
+
+def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(
+    tmp_path: Path, frames: Path, maps: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    frames, products = tmp_path / "frames", tmp_path / "products"
-    frames.mkdir()
-    calints_file(frames / "one_calints.fits", "HIP-1", reference=False)
-    calints_file(frames / "two_calints.fits", "HIP-2", reference=True)
-    (frames / "three_calints.fits").write_bytes(b"")
-    arguments = ["reduce", str(frames), "--opd", "nowhere.fits", "-o", str(products), "--dry-run"]
+    products = tmp_path / "products"
+    arguments = ["reduce", str(frames), "--opd-folder", str(maps), "-o", str(products)]
+    arguments += ["--dry-run", "--size", "6"]
     assert main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
     target, reference = (
@@ -249,6 +321,11 @@ def test_a_dry_run_lists_the_frames_and_writes_nothing(
     assert target.split()[:2] == ["target", "HIP-1"]
     assert reference.split()[:2] == ["reference", "HIP-2"]
     assert any(line.startswith("left out: three_calints.fits: ") for line in lines)
+    sensed = "opd_2022-07-31.fits, sensed 2022-07-31T00:00, 0.9 days after the frames"
+    assert f"wavefront map: {sensed}" in lines
+    steps = [line for line in lines if line[:3] in ("1. ", "2. ", "3. ", "4. ")]
+    assert ["star" in steps[0], "wavefront" in steps[1], "search" in steps[2]] == [True] * 3
+    assert "GB of memory" in lines[-1]
     assert not products.exists()
     # Which is which follows from the option, too.
     assert main([*arguments, "--target", "HIP-2"]) == 0
@@ -256,3 +333,431 @@ def test_a_dry_run_lists_the_frames_and_writes_nothing(
     assert next(x for x in lines if "two_calints" in x).split()[:2] == ["target", "HIP-2"]
     assert main([*arguments, "--target", "HIP-3"]) == 1
     assert "HIP-3" in capsys.readouterr().err
+
+
+def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
+    sequence = Sequence.from_files(frames)
+    names = [name for name, _ in steps_of(sequence, 6, "auto")]
+    assert names[0] == "reference stars: HIP-2"
+    alone = dict(steps_of(replace(sequence, references=()), 6, "auto"))
+    assert len(alone) == len(names) - 1
+    twice = replace(sequence, science=sequence.science * 2)
+    both = dict(steps_of(twice, 6, "off"))
+    assert both["search of point sources"] == 2 * alone["search of point sources"]
+    one, two = alone["wavefront: 1 file of the target"], both["wavefront: 2 files of the target"]
+    assert one < two < 2 * one
+
+
+# -- a reduction, with a stub in the place of the fit --------------------------------------------
+
+
+@dataclass
+class StubReduction:
+    """Writes what a reduction writes, as far as the command line reads it."""
+
+    arguments: dict[str, Any]
+    detection: Any = None
+
+    def write(self, folder: Path) -> list[Path]:
+        folder.mkdir(exist_ok=True)
+        path = folder / "summary.json"
+        path.write_text('{"sentence": "One companion."}')
+        return [path]
+
+    def __str__(self) -> str:
+        return "what was found"
+
+
+@pytest.fixture
+def reduced(monkeypatch: pytest.MonkeyPatch) -> list[StubReduction]:
+    """Stub for `reduce`, which collects its calls."""
+    made: list[StubReduction] = []
+
+    def stub(sequence: Sequence, opd: OPDMap, **options: Any) -> StubReduction:
+        print("a library says hello")
+        made.append(StubReduction({"sequence": sequence, "opd": opd, **options}))
+        return made[-1]
+
+    monkeypatch.setattr(reduction, "reduce", stub)
+    monkeypatch.setattr(plotting, "draw_detection", lambda detection: None)
+    monkeypatch.setattr(plotting, "save", lambda figure, path: path.write_text(""))
+    return made
+
+
+def test_reduce_passes_its_options_on_and_names_the_products(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    reduced: list[StubReduction],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    products = tmp_path / "products"
+    arguments = ["reduce", str(frames), "--opd-folder", str(maps), "--opd-date", "before"]
+    arguments += ["-o", str(products), "--size", "6", "--threshold", "4", "--systematics", "off"]
+    assert main(arguments) == 0
+    shown = capsys.readouterr()
+    assert "what was found\n" in shown.out
+    assert f"wrote {products / 'summary.json'}\n" in shown.out
+    assert f"wrote {products / 'detection.png'}\n" in shown.out
+    (call,) = reduced
+    assert call.arguments["opd"].name == "opd_2022-07-20.fits"
+    wanted = {"size": 6, "threshold": 4.0, "systematics": "off", "device": "cpu"}
+    assert wanted.items() <= call.arguments.items()
+    # Not on a terminal: no bar, but the stages.
+    assert call.arguments["progress"] is False
+    assert "4 of 4: products" in shown.err
+
+
+def test_json_is_all_that_goes_to_standard_output(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    reduced: list[StubReduction],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    arguments = ["detect", str(frames / "one_calints.fits"), "--opd", str(maps / "x.fits")]
+    arguments[-1] = str(maps / "opd_2022-07-31.fits")
+    assert main([*arguments, "-o", str(tmp_path / "products"), "--json"]) == 0
+    shown = capsys.readouterr()
+    assert json.loads(shown.out) == {"sentence": "One companion."}
+    assert "a library says hello" in shown.err
+    assert "what was found" in shown.err
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_general_options_stand_before_or_after_the_command(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    reduced: list[StubReduction],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    before: bool,
+) -> None:
+    threads: list[int] = []
+    monkeypatch.setattr(torch, "set_num_threads", threads.append)
+    log = tmp_path / "logs" / "run.log"
+    general = ["-q", "--threads", "1", "--log-file", str(log)]
+    command = ["detect", str(frames / "one_calints.fits"), "--opd-folder", str(maps)]
+    command += ["-o", str(tmp_path / "products")]
+    assert main([*general, *command] if before else [*command, *general]) == 0
+    assert threads == [1]
+    assert capsys.readouterr().err == ""
+    lines = log.read_text().splitlines()
+    assert any(line.endswith("INFO 4 of 4: products") for line in lines)
+    assert any("opd_2022-07-31.fits" in line for line in lines)
+    # What the run changed is as it was.
+    assert not any(getattr(h, "baseFilename", "") == str(log) for h in logging.root.handlers)
+
+
+def test_warnings_and_errors_are_messages(
+    tmp_path: Path,
+    frames: Path,
+    reduced: list[StubReduction],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    old = opd_file(tmp_path / "opd_2020-01-01.fits")
+    maps = tmp_path / "old"
+    maps.mkdir()
+    old.rename(maps / old.name)
+    arguments = ["detect", str(frames / "one_calints.fits"), "--opd-folder", str(maps)]
+    arguments += ["-o", str(tmp_path / "products"), "-q"]
+
+    def twice(*_: Any, **__: Any) -> None:
+        for _ in range(2):
+            warnings.warn("the map is old", DiffrenderWarning, stacklevel=1)
+        raise RefinementError("no fit")
+
+    monkeypatch.setattr(reduction, "reduce", twice)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert main(arguments) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert "sensed 941 days before the frames" in lines[0]
+    assert lines[1:] == ["pyklip-diffrender: warning: the map is old", "pyklip-diffrender: no fit"]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError("8 GB"), RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 GB")],
+    ids=["python", "torch"],
+)
+def test_too_little_memory_is_a_message(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(reduction, "reduce", fail)
+    arguments = ["detect", str(frames / "one_calints.fits"), "--opd-folder", str(maps)]
+    arguments += ["-o", str(tmp_path / "products")]
+    assert main(arguments) == 1
+    assert "pyklip-diffrender: not enough memory; a smaller --size" in capsys.readouterr().err
+    # Any other error is a fault of the program, with its traceback.
+    error = RuntimeError("a bug")
+    with pytest.raises(RuntimeError, match="a bug"):
+        main(arguments)
+
+
+def test_impossible_arguments_are_messages(
+    tmp_path: Path, frames: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    products = ["-o", str(tmp_path / "products")]
+    assert main(["demo", "--contrast", "-1", *products]) == 1
+    assert "contrast: got -1, expected 0 or more" in capsys.readouterr().err
+    assert main(["detect", str(frames), "--opd", "nowhere.fits", *products]) == 1
+    assert "is a folder, expected a file; the command reduce" in capsys.readouterr().err
+
+
+def test_an_interrupted_run_says_what_it_left(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    reduced: list[StubReduction],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    products = tmp_path / "products"
+    products.mkdir()
+    (products / "notes.txt").write_text("mine")
+    arguments = ["detect", str(frames / "one_calints.fits"), "--opd-folder", str(maps), "-q"]
+    arguments += ["-o", str(products)]
+
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(plotting, "draw_detection", interrupt)
+    assert main(arguments) == 130
+    assert f"interrupted; these files in {products} are new and complete: summary.json\n" in (
+        capsys.readouterr().err
+    )
+    monkeypatch.setattr(reduction, "reduce", interrupt)
+    assert main([*arguments, "--overwrite"]) == 130
+    assert capsys.readouterr().err.strip() == "pyklip-diffrender: interrupted; nothing was written"
+
+
+def test_mast_is_asked_for_the_map_of_the_date(
+    tmp_path: Path,
+    frames: Path,
+    reduced: list[StubReduction],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[tuple[str, str]] = []
+
+    def retrieve(date: Time, choice: str) -> OPDMap:
+        asked.append((date.isot[:19], choice))
+        if choice == "after":
+            raise MissingOPDError("no wavefront map from MAST (no route to host)")
+        return random_opd(1, npix=64)
+
+    monkeypatch.setattr(wss, "load_wss_opd_by_date", retrieve)
+    arguments = ["detect", str(frames / "one_calints.fits"), "-o", str(tmp_path / "products")]
+    assert main([*arguments, "--opd-date", "nearest"]) == 0
+    assert reduced[0].arguments["opd"].name == "random_opd(seed=1)"
+    capsys.readouterr()
+    assert main([*arguments, "--opd-date", "after", "--overwrite"]) == 1
+    assert "no route to host" in capsys.readouterr().err
+    assert asked == [("2022-07-30T02:03:04", "closest"), ("2022-07-30T02:03:04", "after")]
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [("nowhere/star.fits", "there is no folder"), (".", "is a folder, expected a file")],
+)
+def test_an_image_goes_into_a_folder_that_exists(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], path: str, words: str
+) -> None:
+    assert main(["psf", str(tmp_path / path)]) == 1
+    assert words in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_without_permission_is_refused_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
+    assert main(["demo", "-o", str(tmp_path / "products" / "deep")]) == 1
+    assert f"no permission in {tmp_path}\n" in capsys.readouterr().err
+
+
+def test_a_device_that_is_not_there_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "star.fits"
+    assert main(["psf", str(path), "--device", "abacus"]) == 1
+    assert "--device: PyTorch" in capsys.readouterr().err
+    assert not path.exists()
+
+
+# -- configuration files -------------------------------------------------------------------------
+
+
+def test_a_written_configuration_gives_the_same_run(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    reduced: list[StubReduction],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config, products = tmp_path / "run.toml", tmp_path / "products"
+    arguments = ["reduce", str(frames), "--opd-folder", str(maps), "-o", str(products), "-q"]
+    arguments += ["--size", "6", "--target", "HIP-1"]
+    assert main([*arguments, "--write-config", str(config)]) == 0
+    assert capsys.readouterr().out == f"wrote {config}\n"
+    assert reduced == []
+    content = tomllib.loads(config.read_text())["reduce"]
+    assert content["frames"] == [str(frames)]
+    assert content["opd-folder"] == str(maps)
+    assert content["quiet"] is True
+    assert content["json"] is False
+    assert main(["reduce", "--config", str(config)]) == 0
+    assert main(["--config", str(config), "reduce", "--size", "8", "--overwrite"]) == 0
+    assert [call.arguments["size"] for call in reduced] == [6, 8]
+    assert reduced[0].arguments["sequence"].target == "HIP-1"
+    assert capsys.readouterr().err == ""
+    # It is a product like others.
+    assert main([*arguments, "--write-config", str(config)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("[psf]\nsise = 20\n", "[psf] has 'sise'"),
+        ("sise = 20\n", "has 'sise'"),
+        ("[psf\n", "run.toml: Expected"),
+        ("[psf]\nsize = 'large'\n", "'large' is not a valid int"),
+        (None, "No such file"),
+    ],
+)
+def test_a_wrong_configuration_is_a_usage_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str | None, words: str
+) -> None:
+    config, star = tmp_path / "run.toml", tmp_path / "star.fits"
+    if content is not None:
+        config.write_text(content)
+    assert main(["psf", str(star), "--config", str(config)]) == 2
+    assert words in capsys.readouterr().err
+    assert not star.exists()
+
+
+def test_tables_of_a_configuration_are_commands(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "run.toml"
+    config.write_text("quiet = true\n[fit]\nsize = 20\n")
+    assert main(["--config", str(config), "psf", str(tmp_path / "star.fits")]) == 2
+    assert "[fit] is no command" in capsys.readouterr().err
+
+
+def test_the_documented_configuration_is_valid(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "reference" / "command_line.md").read_text(encoding="utf-8")
+    example = page.partition("```toml\n")[2].partition("```")[0]
+    assert '[reduce]\nframes = ["calints"]' in example
+    path = tmp_path / "run.toml"
+    path.write_text(example)
+    assert read_config(application, path)["reduce"]["log_file"] == "products/run.log"
+
+
+def test_the_rules_are_those_of_the_package() -> None:
+    (option,) = (p for p in application.commands["reduce"].params if p.name == "opd_date")
+    assert tuple(option.type.choices) == RULES
+
+
+def test_the_shell_completes_commands_and_options() -> None:
+    """What the shell's completion function calls."""
+    done = subprocess.run(
+        [sys.executable, "-m", "pyklip_diffrender.cli"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={
+            **os.environ,
+            "PYTHONPATH": str(ROOT),
+            "_PYKLIP_DIFFRENDER_COMPLETE": "bash_complete",
+            "COMP_WORDS": "pyklip-diffrender reduce --opd-",
+            "COMP_CWORD": "2",
+        },
+    )
+    assert done.stdout.splitlines() == ["plain,--opd-folder", "plain,--opd-date"], done.stderr
+
+
+# -- doctor --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def without_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the self-test, which takes seconds."""
+    quick = tuple(check for check in doctor.CHECKS if check is not doctor.check_fit)
+    monkeypatch.setattr(doctor, "CHECKS", quick)
+
+
+@pytest.mark.usefixtures("without_fit")
+def test_doctor_reports_versions_data_and_machine(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("STPSF_PATH", raising=False)
+    monkeypatch.setattr(doctor, "free_memory", lambda: 8e9)
+    assert main(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert f"ok    torch {version('torch')}" in lines
+    assert any(line.startswith("ok    data files: ") for line in lines)
+    assert "ok    8.0 GB of memory are free" in lines
+    assert any("STPSF_PATH is not set" in line and line.startswith("note") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("library", "torchh cannot be imported"),
+        ("data", "data files cannot be read"),
+        ("stpsf", "which has no version.txt"),
+        ("memory", "1.0 GB of memory are free; the demo"),
+        ("disk", "0.1 GB are free on the disk"),
+    ],
+)
+@pytest.mark.usefixtures("without_fit")
+def test_doctor_fails_with_a_sentence(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    what: str,
+    words: str,
+) -> None:
+    monkeypatch.delenv("STPSF_PATH", raising=False)
+    monkeypatch.setattr(doctor, "free_memory", lambda: 1e9 if what == "memory" else 8e9)
+    if what == "library":
+        monkeypatch.setattr(doctor, "_LIBRARIES", ("torchh",))
+    elif what == "data":
+        monkeypatch.setattr(doctor, "_TABLES", ("nowhere",))
+    elif what == "stpsf":
+        monkeypatch.setenv("STPSF_PATH", str(tmp_path))
+    elif what == "disk":
+        usage = SimpleNamespace(free=1e8)
+        monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: usage)
+    assert main(["doctor"]) == 1
+    (failed,) = (x for x in capsys.readouterr().out.splitlines() if x.startswith("FAIL"))
+    assert words in failed
+
+
+@pytest.mark.slow
+def test_doctor_fits_a_wavefront() -> None:
+    (outcome,) = doctor.check_fit()
+    assert outcome.state == "ok", outcome
+
+
+def test_doctor_fails_if_the_fit_recovers_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stub(model: Any, frame: Any, opd: np.ndarray, **_: Any) -> SimpleNamespace:
+        return SimpleNamespace(wavefront=opd, chi2_per_pixel=0.8, status=Status.CONVERGED)
+
+    monkeypatch.setattr(refinement, "refine", stub)
+    (outcome,) = doctor.check_fit()
+    assert outcome.state == "FAIL"
+    assert "Do not use results" in outcome.text

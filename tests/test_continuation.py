@@ -323,7 +323,7 @@ def test_a_single_number_of_cycles_will_do(cycles: object) -> None:
     ("changes", "complaint"),
     [
         ({"iterations": 0}, r"iterations: got 0, expected a positive"),
-        ({"learning_rate": -1e-11}, r"learning_rate: got -1e-11, expected a positive"),
+        ({"learning_rate": -1e-11}, r"learning_rate: got -1e-11 m, expected a positive"),
     ],
 )
 def test_the_recipe_has_limits_too(changes: dict[str, float], complaint: str) -> None:

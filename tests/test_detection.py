@@ -814,6 +814,8 @@ def test_positions_may_have_a_unit(one: Detection) -> None:
                 np.testing.assert_allclose(table[name], plain[name], rtol=1e-12)
     with pytest.raises(UnitError, match="offsets"):
         one.measure([[1.0, 2.0]] * u.m)
+    with pytest.raises(UnitError, match="inner"):
+        dr.detect(one.fits, inner=1 * u.m)
 
 
 def test_a_position_outside_the_field_is_refused(one: Detection) -> None:

@@ -275,8 +275,10 @@ def test_references_are_fitted_only_where_they_are_needed(
     def from_library(observation: Observation, references: object = ()) -> Systematics | None:
         return known if library or references else None
 
-    monkeypatch.setattr("pyklip_diffrender.reduction.refine", fit)
-    monkeypatch.setattr("pyklip_diffrender.reduction.known_systematics", from_library)
+    choosing = "pyklip_diffrender.refinement.pattern_choice"
+    for module in ("pyklip_diffrender.reduction", choosing):
+        monkeypatch.setattr(f"{module}.refine", fit)
+    monkeypatch.setattr(f"{choosing}.known_systematics", from_library)
     monkeypatch.setattr("pyklip_diffrender.reduction.detect", lambda fit, **options: None)
     there = replace(frame("TARGET", 20), first_pixel=(0, 0))
     sequence = Sequence("TARGET", (there,), (frame("REF", 10), frame("REF", 11)))

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from astropy import units as u
 from astropy.io import fits
 
 from pyklip_diffrender.bridges.convert import Conversion
@@ -23,7 +24,7 @@ from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
 from pyklip_diffrender.bridges.maps import check_opd, opd_to_hdus
 from pyklip_diffrender.bridges.poppy import PoppySystem, check_supported, refuse_saving
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import to_metres
+from pyklip_diffrender.io.units import to_metres, to_number
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.psf_file import poppy_psf, save
@@ -210,6 +211,8 @@ def from_webbpsf(
     CorruptFileError
         If a file of stpsf's data is missing.
     """
+    if fov_arcsec is not None:
+        fov_arcsec = to_number(fov_arcsec, u.arcsec, "fov_arcsec", "positive")
     recipe = {k: v for k, v in locals().items() if k != "recipe"}
     if getattr(nircam, "name", None) != "NIRCam" or not hasattr(nircam, "get_optical_system"):
         raise IncompatibleSetupError(

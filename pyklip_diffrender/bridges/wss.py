@@ -8,7 +8,6 @@ both at the sensing field point.
 from __future__ import annotations
 
 import hashlib
-import logging
 import os
 import re
 import warnings
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.io import fits
 from astropy.time import Time
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
@@ -32,15 +30,13 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
-from pyklip_diffrender.io.headers import card_error
+from pyklip_diffrender.io.headers import header_text, sensing_date
 from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.units import native_float64, require_shape
 
 __all__ = ["EXTENSION", "interpolate_wss", "load_wss_opd", "load_wss_opd_by_date"]
 
 Array = NDArray[np.float64]
-
-_LOG = logging.getLogger(__name__)
 
 EXTENSION = "RESULT_PHASE"
 """Name of the extension that holds the map; only these files have one."""
@@ -108,7 +104,9 @@ def load_wss_opd(
                 "wavefront-sensing product of MAST"
             )
         coarse = native_float64(hdus[EXTENSION].data)
-        header, unit = hdus[0].header.copy(), hdus[EXTENSION].header.get("BUNIT", "micron")
+        header = hdus[0].header.copy()
+        # MAST's files are in microns and do not say so.
+        unit = header_text(hdus[EXTENSION].header, "BUNIT", path.name) or "micron"
     require_shape(coarse, (None, None), f"{path}: {EXTENSION}", "It must be an image")
     if unit.strip().lower() not in _TO_METRES:
         raise IncompatibleSetupError(f"{path}: {EXTENSION} has BUNIT={unit!r}, expected 'micron'")
@@ -138,7 +136,7 @@ def load_wss_opd(
         else:
             opd = opd - terms * pupil
             history.append(f"subtracted SI WFE ({source}) and OTE field dependence at {aperture}")
-    date = _date(header, path.name)
+    date = sensing_date(header, path.name)
     return OPDMap(opd, date, path.name, sha256(path), aperture, tuple(history))
 
 
@@ -202,7 +200,8 @@ def load_wss_opd_by_date(
         raise MissingOPDError(
             f"no wavefront map for {when.isot} from MAST ({type(error).__name__}: {error}). "
             "Where the network does not allow it, download the file elsewhere "
-            "(https://mast.stsci.edu, product type OPD) and pass its path to load_wss_opd"
+            "(https://mast.stsci.edu, product type OPD) and pass its path to load_wss_opd, or "
+            "to --opd on the command line"
         ) from error
     maps = [load_wss_opd(path, npix=npix, backout_si_wfe=backout_si_wfe) for path in paths]
     return maps[0] if len(maps) == 1 else interpolate_wss(maps[0], maps[1], when)
@@ -359,20 +358,3 @@ def _sensing_terms(aperture: str, opd: Array, npix: int, name: str) -> tuple[Arr
     if len(si_wfe) != npix:
         si_wfe = native_float64(zoom(si_wfe, npix / len(si_wfe)))
     return si_wfe + ote_wfe, source
-
-
-def _date(header: fits.Header, name: str) -> Time | None:
-    """Date of the measurement, from the header or (to the day) from the file's name."""
-    if "DATE-OBS" in header:
-        date = f"{header['DATE-OBS']}T{header.get('TIME-OBS', '00:00:00')}"
-        try:
-            return Time(date, scale="utc")
-        except ValueError as error:
-            raise card_error(
-                name, "DATE-OBS with TIME-OBS", date, "a date such as '2022-08-11T01:02:03'"
-            ) from error
-    match = re.match(r"[A-Z](\d{4})(\d{2})(\d{2})\d{2}-", name)
-    if match is None:
-        _LOG.warning("%s: no DATE-OBS, and no date in its name", name)
-        return None
-    return Time("-".join(match.groups()), scale="utc")

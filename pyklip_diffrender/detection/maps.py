@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group
+from pyklip_diffrender.io.progress import ProgressBar
 
 __all__ = ["Maps"]
 
@@ -52,9 +52,8 @@ class Maps:
     def _batches(self, name: str) -> Iterator[tuple[int, slice, dict[int, Tensor]]]:
         """Index of the group, flat indices of pixels, and their templates by frame."""
         ny, nx = self.shape
-        with tqdm(
-            total=ny * nx * len(self.groups), desc=name, disable=not self.progress
-        ) as progress_bar:
+        pixels = ny * nx * len(self.groups)
+        with ProgressBar(name, pixels, shown=self.progress) as progress_bar:
             for g, (_, templates) in enumerate(self.groups):
                 for start in range(0, ny * nx, _BATCH):
                     index = np.arange(start, min(start + _BATCH, ny * nx))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from astropy import units as u
 from numpy.typing import ArrayLike
 from torch import Tensor
 
@@ -20,6 +21,7 @@ from pyklip_diffrender.instrument.aberrations import (
 from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
 from pyklip_diffrender.instrument.masks import ROUND_MASKS, require_mask_and_filter
 from pyklip_diffrender.instrument.spectrum import filter_bandpass, filter_throughput
+from pyklip_diffrender.io.units import to_metres, to_number, to_pair
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.detector_effects import ChainDetector, PixelCrosstalk
@@ -99,6 +101,8 @@ def nircam_coronagraph(
 ) -> OpticalSystem:
     """NIRCam's coronagraph with a round mask and the MASKRND stop as a differentiable system.
 
+    Lengths, angles and temperatures may be Quantities.
+
     Parameters
     ----------
     filter : str
@@ -164,6 +168,20 @@ def nircam_coronagraph(
         For an incompatible filter, mask or wavelength, or a field so wide that the image of a pupil
         of `npix` samples repeats inside it.
     """
+    if monochromatic is not None:
+        monochromatic = to_number(monochromatic, u.m, "monochromatic", "positive")
+    if fov_arcsec is not None:
+        fov_arcsec = to_number(fov_arcsec, u.arcsec, "fov_arcsec", "positive")
+    if pixelscale is not None:
+        pixelscale = to_pair(pixelscale, u.arcsec, "pixelscale", "positive")
+    if segment_gap is not None:
+        segment_gap = to_number(segment_gap, u.m, "segment_gap", "not negative")
+    if chromatic_reference is not None:
+        chromatic_reference = to_number(chromatic_reference, u.m, "chromatic_reference", "positive")
+    if not isinstance(source, tuple):
+        source = to_number(source, u.K, "source", "positive")
+    if not isinstance(si_wfe, bool | Tensor):
+        si_wfe = to_metres(si_wfe, "si_wfe")
     recipe: dict[str, Any] = {k: v for k, v in locals().items() if k != "recipe"}
     recipe["defaults"] = dict(defaults or {})  # A copy, because the caller may change theirs.
     mask = require_mask_and_filter(image_mask, filter)
@@ -191,8 +209,7 @@ def nircam_coronagraph(
     if dtype not in (torch.float32, torch.float64):
         raise IncompatibleSetupError(f"dtype: got {dtype}, expected torch.float32 or float64")
 
-    pixelscale = mask.pixelscale if pixelscale is None else pixelscale
-    scale = (pixelscale, pixelscale) if isinstance(pixelscale, int | float) else pixelscale
+    scale = to_pair(mask.pixelscale if pixelscale is None else pixelscale, u.arcsec, "pixelscale")
     shape = _field_of_view(fov_pixels, fov_arcsec, scale)
     field = max(shape[1] * scale[0], shape[0] * scale[1])
     needed = samples_for_field(field, min(bandpass.wavelengths))

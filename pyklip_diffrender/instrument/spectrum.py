@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import embedded_table
-from pyklip_diffrender.io.units import native_float64
+from pyklip_diffrender.io.units import native_float64, to_metres, to_number, to_unit
 from pyklip_diffrender.optics.bandpass import Bandpass
 
 __all__ = ["blackbody", "filter_bandpass", "filter_throughput"]
@@ -82,7 +82,7 @@ def filter_bandpass(
         intervals without light are omitted.
     source : float or (wavelengths, flux)
         Temperature of a blackbody in K (default as in stpsf), or a spectrum: wavelengths in m
-        and photons per unit wavelength.
+        and photons per unit wavelength; either may be a Quantity.
 
     Raises
     ------
@@ -98,7 +98,8 @@ def filter_bandpass(
     fine = np.linspace(used[0], used[-1], 200 * nlambda + 1)
     middle = (fine[1:] + fine[:-1]) / 2
     if isinstance(source, tuple):
-        grid, flux = native_float64(source[0]), native_float64(source[1])
+        grid = to_metres(source[0], "source: wavelengths")
+        flux = to_unit(source[1], "photon / (s m2 um)", "source: photons")
         if grid.min() > fine[0] or grid.max() < fine[-1]:
             raise IncompatibleSetupError(
                 f"the spectrum covers {grid.min():.3e} to {grid.max():.3e} m, the filter "
@@ -106,7 +107,7 @@ def filter_bandpass(
             )
         photons = np.interp(middle, grid, flux)
     else:
-        photons = blackbody(source, middle)
+        photons = blackbody(to_number(source, u.K, "source", "positive"), middle)
     photons = (photons * np.interp(middle, wavelength, throughput)).reshape(nlambda, -1)
     weights = photons.sum(axis=1)
     seen = weights > 0

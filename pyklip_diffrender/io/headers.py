@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from numbers import Real
 from typing import Any
 
@@ -11,7 +12,17 @@ from astropy.time import Time
 
 from pyklip_diffrender.errors import CorruptFileError
 
-__all__ = ["card_error", "header_date", "header_number", "header_text", "merged_header"]
+__all__ = [
+    "card_error",
+    "header_date",
+    "header_number",
+    "header_text",
+    "merged_header",
+    "sensing_date",
+]
+
+_DATED_NAME = re.compile(r"(?<!\d)(20\d\d)-?([01]\d)-?([0-3]\d)")
+"""A date in the name of a file: opd_2022-08-14.fits.gz, R2022081402-NRCA3_FP1-1.fits."""
 
 
 def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fits.Header:
@@ -96,3 +107,33 @@ def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time |
         except ValueError as error:
             raise card_error(name, key, text, "a date such as '2022-08-11T01:02:03'") from error
     return None
+
+
+def sensing_date(header: fits.Header, name: str) -> Time | None:
+    """Date (UTC) at which a wavefront map was sensed, None if it is not known.
+
+    It is DATE-OBS with TIME-OBS, as MAST and stpsf write them, DATE-OBS alone, DATE-BEG, or else
+    the date in the name of the file, `name`.
+
+    Raises
+    ------
+    CorruptFileError
+        If the cards do not hold a date.
+    """
+    day, hour = (header_text(header, key, name) for key in ("DATE-OBS", "TIME-OBS"))
+    if day and hour and "T" not in day:
+        try:
+            return Time(f"{day}T{hour}", scale="utc")
+        except ValueError as error:
+            raise card_error(
+                name, "DATE-OBS with TIME-OBS", f"{day}T{hour}", "a date such as "
+                "'2022-08-11T01:02:03'",
+            ) from error  # fmt: skip
+    stated = header_date(header, ("DATE-OBS", "DATE-BEG"), name)
+    match = _DATED_NAME.search(name)
+    if stated is not None or match is None:
+        return stated
+    try:
+        return Time("-".join(match.groups()), scale="utc")
+    except ValueError:  # Digits that are no date.
+        return None

@@ -46,3 +46,7 @@ class OPDMap:
     def shape(self) -> tuple[int, ...]:
         """Shape of the map."""
         return self.data.shape
+
+    def days_after(self, date: str | Time) -> float | None:
+        """Days from `date` (UTC) to the sensing of the map; None if its date is not known."""
+        return None if self.date is None else float((self.date - Time(date)).jd)

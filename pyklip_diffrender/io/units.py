@@ -7,25 +7,39 @@ is 1.0 and `torch.from_numpy` refuses big-endian arrays. Inputs are never modifi
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from astropy import units as u
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pyklip_diffrender.errors import DiffrenderWarning, NonFiniteError, ShapeError, UnitError
+from pyklip_diffrender.errors import (
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    NonFiniteError,
+    ShapeError,
+    UnitError,
+)
 
 __all__ = [
     "ARCSEC",
+    "Bound",
     "native_float64",
+    "require_bound",
     "require_finite",
     "require_shape",
+    "set_numbers",
     "to_arcsec",
     "to_metres",
+    "to_number",
+    "to_pair",
     "to_unit",
     "warn_of_rms",
 ]
+
+Bound = Literal["any", "not negative", "positive"]
+"""Which finite numbers a value may be."""
 
 _PLAUSIBLE_RMS = (1e-9, 2e-6)
 """Plausible rms of a wavefront of JWST, m."""
@@ -73,6 +87,73 @@ def to_unit(value: Any, unit: str | u.UnitBase, name: str) -> NDArray[np.float64
                 f"{name}: got the unit '{value.unit}', expected one that converts to '{unit}'"
             ) from error
     return native_float64(value)
+
+
+def to_number(value: Any, unit: str | u.UnitBase, name: str, bound: Bound = "any") -> float:
+    """Convert a single number or Quantity to a unit; bare numbers already have it.
+
+    Raises
+    ------
+    UnitError
+        If the unit does not convert.
+    ShapeError
+        For an array, or something that is no number.
+    NonFiniteError, IncompatibleSetupError
+        For a number that is not finite, or out of bounds.
+    """
+    try:
+        array = to_unit(value, unit, name)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, UnitError):
+            raise
+        raise ShapeError(f"{name}: got {value!r}, expected a number") from error
+    if array.size != 1:
+        raise ShapeError(f"{name}: got shape {array.shape}, expected a single number")
+    number = float(array.reshape(()))
+    require_bound(number, name, bound, unit)
+    return number
+
+
+def to_pair(
+    value: Any, unit: str | u.UnitBase, name: str, bound: Bound = "any"
+) -> tuple[float, float]:
+    """Convert two numbers or Quantities, or one that stands for both, to a unit.
+
+    Raises
+    ------
+    UnitError, ShapeError, NonFiniteError, IncompatibleSetupError
+        As `to_number`.
+    """
+    array = to_unit(value, unit, name)
+    if array.size not in (1, 2):
+        raise ShapeError(f"{name}: got shape {array.shape}, expected one number or two")
+    pair = np.broadcast_to(array.ravel(), (2,))
+    x, y = (to_number(each, unit, name, bound) for each in pair)
+    return x, y
+
+
+def require_bound(
+    number: float, name: str, bound: Bound, unit: str | u.UnitBase = u.dimensionless_unscaled
+) -> None:
+    """Check that a number is finite and within its bound.
+
+    Raises
+    ------
+    NonFiniteError, IncompatibleSetupError
+    """
+    if not np.isfinite(number):
+        raise NonFiniteError(f"{name}: got {number}, expected a finite number")
+    if (bound == "positive" and not number > 0) or (bound == "not negative" and number < 0):
+        expected = "a positive number" if bound == "positive" else "0 or more"
+        raise IncompatibleSetupError(
+            f"{name}: got {f'{number:g} {u.Unit(unit)}'.strip()}, expected {expected}"
+        )
+
+
+def set_numbers(instance: Any, **fields: tuple[str | u.UnitBase, Bound]) -> None:
+    """Convert fields of a frozen dataclass to numbers in their units; see `to_number`."""
+    for name, (unit, bound) in fields.items():
+        object.__setattr__(instance, name, to_number(getattr(instance, name), unit, name, bound))
 
 
 def require_shape(array: NDArray[Any], shape: tuple[int | None, ...], name: str, fix: str) -> None:

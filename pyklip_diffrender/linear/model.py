@@ -299,18 +299,27 @@ class LinearModel:
             parts.append(TemplateProducts(numerator, photon - lost, photon))
         return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
+    def response(self, templates: Mapping[int, Tensor]) -> Tensor:
+        """Change of the most probable unknowns when templates (k, ny, nx) are added to the data.
+
+        Returns
+        -------
+        Tensor, (unknowns, k), float64
+        """
+        solved = torch.linalg.solve_triangular(
+            self._factor.T, self.projected(templates), upper=True
+        )
+        return solved * self._scale[:, None]
+
     def clean(self, templates: Mapping[int, Tensor]) -> dict[int, Tensor]:
         """Sigma^-1 p of templates (k, ny, nx) by frame, whitened, for every frame of the model.
 
         This is the part of the templates that the unknowns cannot reproduce.
         """
-        solved = torch.linalg.solve_triangular(
-            self._factor.T, self.projected(templates), upper=True
-        )
-        solved = solved * self._scale[:, None]
+        change = self.response(templates)
         images = {}
         for k, frame in enumerate(self.frames):
-            images[k] = -frame.image(solved)
+            images[k] = -frame.image(change)
             if k in templates:
                 images[k] += templates[k].double()
         return self._whitened(images)

@@ -15,9 +15,9 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.linear.parameter_derivatives import field_derivatives, image_derivatives
 from pyklip_diffrender.optics.grid import PupilGrid, samples_for_field
@@ -159,17 +159,19 @@ class WavefrontResponse:
         with torch.no_grad():
             small = downsample(opd, coarse.npix)
             pupils = [coarse.pupil_field(small, w, values) for w in bandpass.wavelengths]
-            for start in tqdm(
-                range(0, len(basis), batch), desc="response", unit="batch", disable=not progress
-            ):
-                stop = min(start + batch, len(basis))
-                sampled = basis.modes(full, start, stop)
-                modes = coarse.entrance.on_window(sampled).to(model.device, coarse.dtype)
-                for kept, wavefront in zip(self.fields, pupils, strict=True):
-                    # d(exp(i k OPD)) = i k exp(i k OPD) d(OPD), for 1 nm.
-                    wavenumber = 2 * math.pi / wavefront.wavelength * NANOMETRE
-                    moved = replace(wavefront, field=modes * (1j * wavenumber * wavefront.field))
-                    kept[start:stop] = coarse.propagate(moved, values)
+            with ProgressBar("response", len(basis), shown=progress) as bar:
+                for start in range(0, len(basis), batch):
+                    stop = min(start + batch, len(basis))
+                    sampled = basis.modes(full, start, stop)
+                    modes = coarse.entrance.on_window(sampled).to(model.device, coarse.dtype)
+                    for kept, wavefront in zip(self.fields, pupils, strict=True):
+                        # d(exp(i k OPD)) = i k exp(i k OPD) d(OPD), for 1 nm.
+                        wavenumber = 2 * math.pi / wavefront.wavelength * NANOMETRE
+                        moved = replace(
+                            wavefront, field=modes * (1j * wavenumber * wavefront.field)
+                        )
+                        kept[start:stop] = coarse.propagate(moved, values)
+                    bar.update(stop - start)
         self._slopes = field_derivatives(coarse, downsample(opd, coarse.npix), values, names)
         _log.debug("response of %d modes at %d pupil samples", len(basis), coarse.npix)
 

@@ -9,30 +9,44 @@ companion, for example). Only the subtracted frames are then shifted.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from astropy import units as u
 from astropy.io import fits
+from astropy.time import Time
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
+from pyklip_diffrender.errors import (
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    NoValidPixelsError,
+    ShapeError,
+)
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.io.headers import header_date
 from pyklip_diffrender.io.units import native_float64
+from pyklip_diffrender.pyklip_backend.pointings import (
+    FrameDetails,
+    Pointing,
+    part_of,
+    pointings_of,
+    reference_frames,
+)
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, settings_of
 from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE, SourceFrames
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["Frames", "frames_of", "observation_from_dataset", "require_frames"]
+__all__ = ["Frames", "date_of_frames", "frames_of", "observation_from_dataset", "require_frames"]
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """The frames of one wavelength that have any pixel to fit.
+    """The target's frames of one wavelength that have any pixel to fit.
 
     Attributes
     ----------
@@ -46,6 +60,10 @@ class Frames:
         "recorded", or "as given" for the pixels of ``dataset.input``.
     noise : str
         Origin of the errors: "ERR", "given" or "estimated".
+    pointings : tuple of Pointing
+        The same frames, sorted by where they show the star.
+    references : tuple of Observation
+        Frames of reference stars in the dataset, by pointing.
     """
 
     observation: Observation
@@ -53,6 +71,8 @@ class Frames:
     usable: NDArray[np.bool_]
     pixels: str
     noise: str
+    pointings: tuple[Pointing, ...] = ()
+    references: tuple[Observation, ...] = ()
 
 
 def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> Observation:
@@ -92,7 +112,20 @@ def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> O
     if index.size == 0:
         raise IncompatibleSetupError(f"wavelength: got {wavelength}, the dataset has {wavelengths}")
     imgs = np.asarray(dataset.input)[index]
-    return frames_of(dataset, index, imgs, settings_of(dataset)).observation
+    return _gather(dataset, index, imgs, settings_of(dataset)).observation
+
+
+def date_of_frames(dataset: Any) -> Time | None:
+    """Mean date of the frames, as far as it is known."""
+    source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
+    if source is None:
+        return None
+    dates = [
+        header_date(header, ("DATE-BEG", "DATE-OBS"), name)
+        for header, name in zip(source.headers, source.filenames, strict=True)
+    ]
+    known = [date for date in dates if date is not None]
+    return Time(known).mean() if known else None
 
 
 def require_frames(dataset: Any) -> None:
@@ -104,7 +137,7 @@ def require_frames(dataset: Any) -> None:
 def frames_of(
     dataset: Any, index: NDArray[np.intp], imgs: NDArray[Any], settings: DiffrenderSettings
 ) -> Frames:
-    """Gather frames of one wavelength with their errors, masks and metadata.
+    """Gather the target's frames of one wavelength with their errors, masks and metadata.
 
     Parameters
     ----------
@@ -122,6 +155,54 @@ def frames_of(
     NoValidPixelsError
         If no frame has a valid pixel.
     """
+    every = _gather(dataset, index, imgs, settings)
+    observation, chosen = every.observation, index[every.usable]
+    source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
+    if source is None or not source.lists(dataset):
+        return replace(every, pointings=tuple(pointings_of(observation)))
+    recorded = every.pixels == "recorded"
+    details = [
+        FrameDetails(
+            str(dataset.filenames[i]),
+            source.headers[i],
+            source.first_pixels[i] if recorded else None,
+            source.star_offsets[i],
+        )
+        for i in chosen
+    ]
+    others = reference_frames([each.header for each in details])
+    if not others.any():
+        return replace(every, pointings=tuple(pointings_of(observation, details)))
+    warnings.warn(
+        f"{int(others.sum())} of {len(others)} frames of the dataset show a reference star (IS_PSF "
+        "or TARGPROP in their headers) and stay NaN in the products. Give them to JWSTData as "
+        "psflib_filepaths",
+        DiffrenderWarning,
+        stacklevel=2,
+    )
+    usable = every.usable.copy()
+    usable[np.flatnonzero(usable)[others]] = False
+    target, rest = (
+        pointings_of(
+            part_of(observation, which), [d for d, w in zip(details, which, strict=True) if w]
+        )
+        for which in (~others, others)
+    )
+    return Frames(
+        part_of(observation, ~others),
+        every.data[~others],
+        usable,
+        every.pixels,
+        every.noise,
+        tuple(target),
+        tuple(replace(each.observation, reference=True) for each in rest),
+    )
+
+
+def _gather(
+    dataset: Any, index: NDArray[np.intp], imgs: NDArray[Any], settings: DiffrenderSettings
+) -> Frames:
+    """Gather all frames of one wavelength, of whatever star."""
     imgs = native_float64(imgs)
     source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
     data, valid, error = imgs, np.isfinite(imgs), None

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from astropy.io import fits
+from astropy.time import Time
 
 from pyklip_diffrender import __version__
 from pyklip_diffrender.pyklip_backend.frames import Frames
@@ -112,10 +113,30 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         ("DRCHI2", _number(worst.chi2), "chi2 per fitted pixel"),
         ("DRNFIT", len(fits_of_all), "number of refinements"),
         ("DRKEPT", companions, "most companions that a fit knew of"),
+        (
+            "DRSYST",
+            _shared(r.subtraction.systematics for r in records),
+            "pattern of the model's error",
+        ),
+        (
+            "DRREFS",
+            sum(r.subtraction.references for r in records),
+            "reference frames that were used",
+        ),
         ("DRPIXELS", _shared(r.frames.pixels for r in records), "pixels that were fitted"),
         ("DRFILLED", sum(r.filled for r in records), "flagged pixels replaced by neighbours"),
         ("DRNOISE", _shared(r.frames.noise for r in records), "where the errors came from"),
     ]
+    dates = [pointing.observation.date for pointing in first.frames.pointings]
+    known = [date for date in dates if date is not None]
+    days = first.opd.days_after(Time(known).mean()) if known else None
+    if first.opd.date is not None:
+        values += [
+            ("DROPDNAM", first.opd.name, "wavefront map"),
+            ("DROPDDAT", first.opd.date.isot, "date of the wavefront map"),
+        ]
+    if days is not None:
+        values.append(("DROPDHRS", 24 * days, "[h] from the frames to the map"))
     for key, value, comment in values:
         header[key] = (value, comment) if comment else value
     header.add_history(

@@ -10,18 +10,20 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy.io import fits
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import (
-    IncompatibleSetupError,
-    NoValidPixelsError,
-    RefinementError,
-    ShapeError,
+from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError, ShapeError
+from pyklip_diffrender.pyklip_backend.checks import (
+    check_arguments,
+    check_dataset,
+    check_settings,
 )
-from pyklip_diffrender.pyklip_backend.frames import Frames, frames_of, require_frames
+from pyklip_diffrender.pyklip_backend.frames import Frames, date_of_frames, frames_of
 from pyklip_diffrender.pyklip_backend.placement import (
     aligned_before,
     annuli_of,
@@ -37,8 +39,14 @@ from pyklip_diffrender.pyklip_backend.products import (
     staging,
     stamp,
 )
+from pyklip_diffrender.pyklip_backend.references import References, library_files
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
+from pyklip_diffrender.pyklip_backend.throughput import (
+    on_product,
+    throughput_map,
+    write_throughput,
+)
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["RESULTS", "Reduction", "mark_filtered"]
@@ -85,7 +93,7 @@ class Reduction:
             For bad input and failed fits. pyKLIP's own errors pass through.
         """
         self._check()
-        opd = starting_opd(self.settings.opd)
+        opd = starting_opd(self.settings, date_of_frames(self.dataset))
         folder = require_folder(self.arguments["outputdir"])
         before = dict(vars(self.dataset))
 
@@ -100,7 +108,9 @@ class Reduction:
         try:
             with staging(folder) as stage:
                 reduce(**{**self.arguments, "outputdir": str(stage)})
-                stamp(stage, provenance(self.records))
+                cards = provenance(self.records)
+                self._write_throughput(stage, cards)
+                stamp(stage, cards)
         except BaseException:
             vars(self.dataset).clear()
             vars(self.dataset).update(before)
@@ -110,30 +120,35 @@ class Reduction:
 
     def _check(self) -> None:
         """Raise for input that cannot work, before anything is changed."""
-        dataset, mode = self.dataset, str(self.arguments["mode"])
-        if np.ndim(dataset.input) != 3:
-            raise ShapeError(f"dataset.input: got shape {np.shape(dataset.input)}, expected 3-D")
-        require_frames(dataset)
-        if not np.isfinite(dataset.input).any():
-            raise NoValidPixelsError(
-                f"{list(map(str, dataset.filenames))}: every pixel of every frame is NaN, nothing "
-                "is left to fit"
-            )
-        if not any(part in mode.upper() for part in ("ADI", "RDI", "SDI")):
-            raise IncompatibleSetupError(
-                f"mode: got {mode!r}, expected ADI, RDI, SDI or a sum of them such as 'ADI+RDI'"
-            )
-        if mode.strip().upper() == "SDI" and len(np.unique(dataset.wvs)) == 1:
-            raise IncompatibleSetupError(
-                "mode: 'SDI' compares wavelengths, and this dataset has one. Use mode='ADI', or "
-                "mode='RDI' with a psf_library: the star is rendered, so neither needs references"
-            )
+        dataset = self.dataset
+        check_dataset(dataset)
+        check_arguments(self.arguments, self._reference_files())
+        check_settings(self.settings)
+        for wave in np.unique(dataset.wvs):
+            self._settings_at(wave)
         if getattr(dataset, _FILTERED, None) is dataset.input:
             raise IncompatibleSetupError(
                 "dataset.input was high-pass filtered by an earlier call of klip_dataset, and a "
                 "star cannot be fitted to filtered frames. Make the dataset again, or give each "
                 "call with highpass=True its own copy.deepcopy(dataset)"
             )
+
+    @property
+    def _rdi(self) -> bool:
+        return "RDI" in str(self.arguments["mode"]).upper()
+
+    def _reference_files(self) -> tuple[Path, ...]:
+        """Files of the reference frames that the call gives."""
+        library = self.arguments["psf_library"]
+        if library is None or not self._rdi:
+            return ()
+        return library_files(self.dataset, library)
+
+    def _tell(self, line: str) -> None:
+        """Say what is being done, as pyKLIP does."""
+        logger.info(line)
+        if self.arguments["verbose"]:
+            print(f"diffrender: {line}", flush=True)
 
     def _high_pass(
         self, imgs: NDArray[Any], numthreads: int | None = None, filtersize: float = 10
@@ -200,6 +215,38 @@ class Reduction:
             outputs += (aligned_before(imgs, centers, wvs, center, dtype),)
         return outputs
 
+    def _write_throughput(self, stage: Path, cards: fits.Header) -> None:
+        """Write the throughput map, and add its median to the cards of all products.
+
+        Fits without a linear model have none.
+        """
+        results = [fit.result for record in self.records for fit in record.subtraction.fits]
+        linear = all(getattr(result, "linear", None) is not None for result in results)
+        if not linear or len(results) != len(self.records):
+            return
+        self._tell("throughput of faint sources")
+        dataset, maps = self.dataset, []
+        center = np.asarray(dataset.output_centers[0], dtype=float)
+        for k, result in enumerate(results):
+            frame = result.frames[0].observation
+            turned = on_product(
+                throughput_map(result),
+                frame.center[0],
+                dataset.output.shape[-2:],
+                center,
+                0.0 if self.arguments["skip_derot"] else frame.position_angle,
+                dataset.flipx,
+            )
+            turned[np.isnan(dataset.output[0, :, k]).all(axis=0)] = np.inf
+            maps.append(turned)
+        cube = np.array(maps)
+        cards["DRTHRU"] = (
+            float(np.median(cube[np.isfinite(cube)])),
+            "median throughput of faint sources",
+        )
+        cube = np.where(np.isnan(cube), 1.0, np.where(np.isinf(cube), np.nan, cube))
+        write_throughput(stage / f"{self.arguments['fileprefix']}-throughput.fits", cube, center)
+
     def _settings_at(self, wave: float) -> DiffrenderSettings:
         """The settings with the model for this wavelength."""
         model = self.settings.model
@@ -220,8 +267,21 @@ class Reduction:
     ) -> NDArray[np.float64]:
         """Frames minus their star, (m, ny, nx), high-pass filtered if the call asks for it."""
         observation = frames.observation
-        subtractor = settings.subtractor or subtract_by_refinement
-        subtraction = subtractor(observation, opd, settings)
+        if settings.subtractor is not None:
+            subtraction = settings.subtractor(observation, opd, settings)
+        else:
+            files = self._reference_files()
+            if self._rdi and not files:
+                self._tell("psf_library is not used: no JWSTData read its files after register()")
+            references = References(files, frames.references)
+            subtraction = subtract_by_refinement(
+                observation,
+                opd,
+                settings,
+                pointings=frames.pointings,
+                references=references if self._rdi else None,
+                tell=self._tell,
+            )
         if subtraction.star.shape != frames.data.shape:
             raise ShapeError(
                 f"star: got shape {subtraction.star.shape}, expected {frames.data.shape}"

@@ -11,19 +11,22 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+import warnings
+import weakref
 from collections.abc import Iterator
 from contextvars import ContextVar
 from typing import Any
 
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
-from pyklip_diffrender.pyklip_backend.reduction import Reduction, mark_filtered
+from pyklip_diffrender.pyklip_backend.products import ReductionRecord
+from pyklip_diffrender.pyklip_backend.reduction import RESULTS, Reduction, mark_filtered
 from pyklip_diffrender.pyklip_backend.settings import (
     DiffrenderSettings,
     OPDLike,
     settings_of,
 )
-from pyklip_diffrender.pyklip_backend.source import keeping_source
+from pyklip_diffrender.pyklip_backend.source import keeping_references, keeping_source
 
 __all__ = [
     "ALGORITHM",
@@ -61,6 +64,7 @@ class _Patches:
             logger.info("pyKLIP's JWST reader cannot be imported, so is not extended: %s", error)
         else:
             self._all.append(PatchedMethod(JWSTData, "readdata", keeping_source))
+            self._all.append(PatchedMethod(JWSTData, "readpsflib", keeping_references))
 
     def apply(self) -> None:
         for patch in self._all:
@@ -80,6 +84,7 @@ class _Registry:
         self.registered = False
         self.blocks = 0
         self.defaults = DiffrenderSettings()
+        self.replace: bool | None = None
 
     def use(self, registered: bool, blocks: int) -> None:
         """Set the users; patch pyKLIP for the first and restore it after the last."""
@@ -96,9 +101,14 @@ class _Registry:
 
 _registry = _Registry()
 
-_NO_BLOCK = (DiffrenderSettings(), False)
-_block: ContextVar[tuple[DiffrenderSettings, bool]] = ContextVar("diffrender", default=_NO_BLOCK)
-"""Settings of the enclosing `backend` blocks, and whether they take over KLIP."""
+_NO_BLOCK = (DiffrenderSettings(), None)
+_block: ContextVar[tuple[DiffrenderSettings, bool | None]] = ContextVar(
+    "diffrender", default=_NO_BLOCK
+)
+"""Settings of the enclosing `backend` blocks, and whether they take over KLIP; None without."""
+
+_warned: weakref.WeakSet[ReductionRecord] = weakref.WeakSet()
+"""Reductions whose dataset, or a copy of it, was given to KLIP with a warning."""
 
 
 def is_registered() -> bool:
@@ -106,7 +116,9 @@ def is_registered() -> bool:
     return _registry.patches is not None
 
 
-def register(opd: OPDLike | None = None, model: Any = None, **options: Any) -> None:
+def register(
+    opd: OPDLike | None = None, model: Any = None, *, replace: bool | None = None, **options: Any
+) -> None:
     """Make ``klip_dataset(..., algo="diffrender")`` work until `unregister`.
 
     Calling it again changes only the settings that are given. While registered, `JWSTData` also
@@ -119,6 +131,10 @@ def register(opd: OPDLike | None = None, model: Any = None, **options: Any) -> N
         Default wavefront map, see `DiffrenderSettings`.
     model : optical model, optional
         Default model; if not given, one is made for the dataset's filter.
+    replace : bool, optional
+        True takes over calls with ``algo="klip"`` as well, for code that hard-codes it. With False
+        they run KLIP. By default they run KLIP too, with a warning if the same dataset was reduced
+        by this backend before.
     **options
         Other fields of `DiffrenderSettings`.
 
@@ -137,6 +153,7 @@ def register(opd: OPDLike | None = None, model: Any = None, **options: Any) -> N
     with _registry.lock:
         _registry.use(True, _registry.blocks)
         _registry.defaults = settings.over(_registry.defaults)
+        _registry.replace = _registry.replace if replace is None else replace
 
 
 def unregister() -> None:
@@ -146,6 +163,7 @@ def unregister() -> None:
     """
     with _registry.lock:
         _registry.defaults = DiffrenderSettings()
+        _registry.replace = None
         _registry.use(False, _registry.blocks)
 
 
@@ -195,11 +213,31 @@ def backend(
             _registry.use(_registry.registered, _registry.blocks - 1)
 
 
+def _takes_klip() -> bool | None:
+    """Whether calls with ``algo="klip"`` are for this backend; None if nobody has said so."""
+    _, force = _block.get()
+    return _registry.replace if force is None else force
+
+
 def _is_ours(algo: Any) -> bool:
     """Whether a call with this `algo` is for this backend."""
-    _, force = _block.get()
     name = str(algo).lower()
-    return name == ALGORITHM or (force and name == "klip")
+    return name == ALGORITHM or (name == "klip" and bool(_takes_klip()))
+
+
+def _warn_of_klip(dataset: Any, function: str) -> None:
+    """Say once that KLIP runs on a dataset, or a copy of one, that this backend has reduced."""
+    records = getattr(dataset, RESULTS, ())
+    if not records or records[0] in _warned or _takes_klip() is not None:
+        return
+    _warned.add(records[0])
+    warnings.warn(
+        f"{function} runs KLIP on a dataset that was reduced with algo='diffrender' before. "
+        "register(replace=True) or `with backend():` redirects calls of klip_dataset that ask for "
+        "algo='klip'; register(replace=False) runs KLIP without this warning",
+        DiffrenderWarning,
+        stacklevel=4,
+    )
 
 
 def _patches() -> _Patches:
@@ -226,6 +264,8 @@ def dispatch(*args: Any, **kwargs: Any) -> None:
         settings = settings.over(settings_of(arguments["dataset"])).over(_registry.defaults)
         Reduction(arguments, settings).run(klip_dataset.original)
     else:
+        if str(arguments["algo"]).lower() == "klip":
+            _warn_of_klip(arguments["dataset"], "klip_dataset")
         klip_dataset.original()(*args, **kwargs)
     if arguments["highpass"] not in (False, None):
         mark_filtered(arguments["dataset"])
@@ -242,9 +282,11 @@ def dispatch_fm(*args: Any, **kwargs: Any) -> Any:
     if _is_ours(kwargs.get("algo", "klip")):
         raise IncompatibleSetupError(
             "pyklip.fm.klip_dataset is not supported by diffrender yet: it models how KLIP "
-            "subtracts a companion from itself. Call it outside the backend block and without "
-            "algo='diffrender', or use pyklip.parallelized.klip_dataset"
+            "subtracts a companion from itself. For KLIP, call it outside the backend block, "
+            "without algo='diffrender' and without register(replace=True). For positions and "
+            "contrasts use pyklip_diffrender.detect on the fits, see diffrender_results"
         )
+    _warn_of_klip(args[0] if args else kwargs.get("dataset"), "pyklip.fm.klip_dataset")
     return _patches().fm_klip_dataset.original()(*args, **kwargs)
 
 

@@ -16,13 +16,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from astropy import units as u
+from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
+from pyklip_diffrender.wavefront.map_choice import RULES, Rule, choose_map, wavefront_for
 from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
 
 if TYPE_CHECKING:
@@ -33,6 +35,9 @@ __all__ = ["ATTRIBUTE", "DiffrenderSettings", "OPDLike", "settings_of", "startin
 
 OPDLike: TypeAlias = "str | os.PathLike[str] | NDArray[np.floating[Any]] | u.Quantity | OPDMap"
 """A wavefront map: a FITS file, an array in metres, a Quantity, or what `read_opd` returns."""
+
+_RULES: dict[str, Rule] = {"closest": "nearest", **{rule: rule for rule in RULES}}
+"""Values of `opd` that choose a map from `opd_folder`, and the rule for `choose_map`."""
 
 ATTRIBUTE = "diffrender"
 """Attribute of a dataset that holds its own settings."""
@@ -46,7 +51,11 @@ class DiffrenderSettings:
     ----------
     opd : path, ndarray, Quantity or OPDMap, optional
         Wavefront map to start from: a FITS file, or a square array in metres, OTE entrance-pupil
-        orientation. There is no default: a reduction without one raises `MissingOPDError`.
+        orientation. There is no default: a reduction without one raises `MissingOPDError`. Of a
+        folder of maps, the one closest in time to the frames is taken.
+    opd_folder : path, optional
+        Folder of maps from which `opd` chooses: "closest", the last one "before" the frames, the
+        first one "after" them, or "interpolate"; see `choose_map`.
     model : optical model or mapping, optional
         From `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping
         from the wavelength in ``dataset.wvs`` to a model. Made for the filter if not given.
@@ -70,16 +79,22 @@ class DiffrenderSettings:
         Settings of the fit; see `refine`.
     start : dict, optional
         Starting values by parameter name; see `refine`.
-    systematics : Systematics, optional
-        Known pattern of the model's error; see `refine`.
+    systematics : Systematics, "auto", "references" or "off", optional
+        Pattern of the model's error. "auto", the default for real NIRCam frames, takes that of the
+        library, and fits the reference frames only where it has none; "references" fits them in
+        any case and uses both; see `reduce`. Reference frames are those of a psf_library that
+        `JWSTData` has read, if the mode contains RDI, and any in the dataset.
     plan : Plan or str, optional
         "auto" (the default), "off", or an existing plan, which is used for all fits of a
         reduction; see `refine`.
     keep_detected : bool, optional
-        Search the fits for companions (`detect`) and refine the star once more with them in the
-        model, so that none of their light is subtracted with the star; False by default.
-        Undetected companions still lose light, so the throughput of bright injected companions
-        then does not apply to faint ones.
+        Search the fit for companions (`detect`) and refine the star once more with them in the
+        model, so that none of their light is subtracted with the star; True by default for real
+        NIRCam frames, else False. Undetected companions still lose light, as much as the
+        throughput map says.
+    max_chi2 : float, optional
+        Reduced chi-squared above which a fit is implausible and the reduction stops with a
+        `RefinementError`; 100 by default, inf for no limit.
     model_options : mapping, optional
         Further keywords of `nircam_coronagraph`, such as ``npix`` and ``nlambda``.
     subtractor : Subtractor, optional
@@ -87,6 +102,7 @@ class DiffrenderSettings:
     """
 
     opd: OPDLike | None = None
+    opd_folder: str | os.PathLike[str] | None = None
     model: Any = None
     filter: str | None = None
     pixelscale: float | tuple[float, float] | None = None
@@ -96,9 +112,10 @@ class DiffrenderSettings:
     seed: int | None = None
     fit: GaussNewton | Adam | None = None
     start: Mapping[str, Any] | None = None
-    systematics: Systematics | None = None
+    systematics: Systematics | Literal["auto", "references", "off"] | None = None
     plan: Plan | str | None = None
     keep_detected: bool | None = None
+    max_chi2: float | None = None
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
 
@@ -135,33 +152,71 @@ def settings_of(dataset: Any) -> DiffrenderSettings:
     return own
 
 
-def starting_opd(opd: OPDLike | None) -> OPDMap:
-    """Read the wavefront map that the settings name.
+def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
+    """Read the wavefront map that the settings name, or choose it by the date of the frames.
 
     Raises
     ------
     MissingOPDError
-        If `opd` is None.
+        If there is none, or none of that date.
+    IncompatibleSetupError
+        If a map is to be chosen by a date that is not known.
     CorruptFileError, UnitError, ShapeError, NonFiniteError
         As `read_opd`.
+
+    Warns
+    -----
+    DiffrenderWarning
+        If the map is more than 200 days from the date.
     """
+    opd, folder = settings.opd, settings.opd_folder
+    if isinstance(opd, str) and opd in _RULES:
+        if folder is None:
+            raise MissingOPDError(
+                f"opd={opd!r} chooses a wavefront map by its date: give the folder with the maps "
+                "as opd_folder"
+            )
+        return _chosen(folder, date, _RULES[opd])
+    if opd is None and folder is not None:
+        return _chosen(folder, date, "nearest")
+    if isinstance(opd, str | os.PathLike) and Path(opd).is_dir():
+        return _chosen(opd, date, "nearest")
     if opd is None:
         raise MissingOPDError(
             "algo='diffrender' starts from a measured wavefront map and none was given. Give a "
             "FITS file, an array in metres or a Quantity, in one of three ways: "
             "register(opd=...) once; `with backend(opd=...):` around klip_dataset; or "
             "dataset.diffrender = DiffrenderSettings(opd=...). For JWST, take the map measured "
-            "closest in time to the observation"
+            "closest in time to the observation, or give the folder with your maps"
         )
     if isinstance(opd, str | os.PathLike):
         path = Path(opd).resolve()
         # A contrast curve reads the same map for each of its 120 reductions.
         state = path.stat() if path.is_file() else None
-        return _read(path, state and (state.st_mtime_ns, state.st_size))
-    return as_opd_map(opd)
+        opd = _read(path, state and (state.st_mtime_ns, state.st_size))
+    return wavefront_for(opd, date)
 
 
 @lru_cache(maxsize=4)
 def _read(path: Path, version: tuple[int, int] | None) -> OPDMap:
     """Read a map once for each version of its file."""
     return as_opd_map(path)
+
+
+def _chosen(folder: str | os.PathLike[str], date: Time | None, rule: Rule) -> OPDMap:
+    """Choose a map from a folder."""
+    if date is None:
+        raise IncompatibleSetupError(
+            f"{folder} is a folder of wavefront maps, and the date of the frames is not known. "
+            "Make the JWSTData after register(), whose frames must have DATE-BEG in their header, "
+            "or give the file of the map as opd"
+        )
+    path = Path(folder).resolve()
+    version = path.stat().st_mtime_ns if path.is_dir() else 0
+    return _choose_once(path, version, date.isot, rule)
+
+
+@lru_cache(maxsize=4)
+def _choose_once(folder: Path, version: int, date: str, rule: Rule) -> OPDMap:
+    """Choose a map once for each state of the folder."""
+    return choose_map(folder, date, rule)

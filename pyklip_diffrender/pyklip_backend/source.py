@@ -2,7 +2,8 @@
 
 `JWSTData.readdata` keeps the base name of each file and frames that a cubic spline has shifted to
 the centre of the array. A wavefront fit needs the pixels as the detector recorded them, with their
-errors. While the backend is registered, reading a dataset also attaches a `SourceFrames` to it.
+errors. While the backend is registered, reading a dataset also attaches a `SourceFrames` to it, and
+reading its library of reference stars attaches the paths of their files.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from astropy.io import fits
@@ -18,14 +20,25 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import merged_header
-from pyklip_diffrender.scene.observation import BAD_PIXEL_BITS
+from pyklip_diffrender.scene.detector_pixels import first_pixel
+from pyklip_diffrender.scene.observation import BAD_PIXEL_BITS, Observation
 
-__all__ = ["ATTRIBUTE", "SourceFrames", "keeping_source", "read_source"]
+__all__ = [
+    "ATTRIBUTE",
+    "REFERENCES",
+    "SourceFrames",
+    "keeping_references",
+    "keeping_source",
+    "read_source",
+]
 
 logger = logging.getLogger(__name__)
 
 ATTRIBUTE = "_diffrender_source"
 """Attribute of the dataset that holds its `SourceFrames`."""
+
+REFERENCES = "_diffrender_references"
+"""Attribute of the dataset with the paths of the files in its library of reference stars."""
 
 NON_SCIENCE = 512
 """The one bit of the JWST data-quality flags that pyKLIP uses: it sets such pixels to NaN."""
@@ -33,7 +46,9 @@ NON_SCIENCE = 512
 
 @dataclass(frozen=True, eq=False)
 class SourceFrames:
-    """The N frames of a JWST dataset as its files hold them, in the order of the dataset.
+    """The N frames of a JWST dataset before pyKLIP shifted them, in the order of the dataset.
+
+    Frames that spaceKLIP has aligned are back on the pixels of the detector.
 
     Attributes
     ----------
@@ -53,6 +68,10 @@ class SourceFrames:
         Copy of ``dataset.centers`` after reading.
     filenames : tuple of str
         ``dataset.filenames`` after reading.
+    first_pixels : list of (int, int) or None
+        Detector column and row of the first pixel of every frame, where known.
+    star_offsets : list of (float, float) or None
+        x, y of the star from the occulter as the file says, arcsec, where it does.
     """
 
     headers: list[fits.Header]
@@ -63,6 +82,8 @@ class SourceFrames:
     aligned: NDArray[np.floating[Any]]
     aligned_centers: NDArray[np.float64]
     filenames: tuple[str, ...]
+    first_pixels: list[tuple[int, int] | None]
+    star_offsets: list[tuple[float, float] | None]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> SourceFrames:
         """Itself: it never changes, so copies of a dataset can share it."""
@@ -77,9 +98,13 @@ class SourceFrames:
         """Whether the dataset still has the frames, shape and centres it was read with."""
         return (
             np.shape(dataset.input) == self.aligned.shape
-            and tuple(dataset.filenames) == self.filenames
+            and self.lists(dataset)
             and np.array_equal(dataset.centers, self.aligned_centers)
         )
+
+    def lists(self, dataset: Any) -> bool:
+        """Whether the dataset still has the same frames, however they were changed."""
+        return tuple(dataset.filenames) == self.filenames
 
 
 def keeping_source(readdata: Callable[..., None]) -> Callable[..., None]:
@@ -111,20 +136,25 @@ def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
     from pyklip.klip import align_and_scale
 
     paths = [filepaths] if isinstance(filepaths, str) else list(filepaths)
-    headers, data, errors, usable, centers = zip(*(_read(p, dataset) for p in paths), strict=True)
+    files = [_read(path, dataset) for path in paths]
+    counts = [len(file.data) for file in files]
     source = SourceFrames(
-        headers=[header for header, frames in zip(headers, data, strict=True) for _ in frames],
-        data=np.concatenate(data),
-        error=None if any(error is None for error in errors) else np.concatenate(errors),
-        usable=np.concatenate(usable),
-        centers=np.concatenate(centers),
+        headers=[file.header for file, n in zip(files, counts, strict=True) for _ in range(n)],
+        data=np.concatenate([file.data for file in files]),
+        error=None
+        if any(file.error is None for file in files)
+        else np.concatenate([file.error for file in files if file.error is not None]),
+        usable=np.concatenate([file.usable for file in files]),
+        centers=np.concatenate([file.centers for file in files]),
         aligned=np.array(dataset.input),
         aligned_centers=np.array(dataset.centers),
         filenames=tuple(dataset.filenames),
+        first_pixels=[f.first_pixel for f, n in zip(files, counts, strict=True) for _ in range(n)],
+        star_offsets=[f.star_offset for f, n in zip(files, counts, strict=True) for _ in range(n)],
     )
     first = source.aligned[0]
     shifted = align_and_scale(
-        source.data[0], new_center=dataset.centers[0], old_center=source.centers[0]
+        files[0].as_read, new_center=dataset.centers[0], old_center=files[0].center_read
     ).astype(first.dtype)
     same_shape = source.data.shape == source.aligned.shape
     if not same_shape or not np.array_equal(shifted, first, equal_nan=True):
@@ -132,14 +162,30 @@ def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
     return source
 
 
-def _read(path: str, dataset: Any) -> tuple[fits.Header, Any, Any, Any, Any]:
-    """Header, pixels, errors or None, usable pixels, and star centres of one file."""
+class _File(NamedTuple):
+    """The frames of one file; see `SourceFrames`."""
+
+    header: fits.Header
+    data: NDArray[np.float32]
+    error: NDArray[np.float32] | None
+    usable: NDArray[np.bool_]
+    centers: NDArray[np.float64]
+    first_pixel: tuple[int, int] | None
+    star_offset: tuple[float, float] | None
+    as_read: NDArray[np.float32]
+    """The first frame, and its star's x, y, as pyKLIP reads them."""
+    center_read: NDArray[np.float64]
+
+
+def _read(path: str, dataset: Any) -> _File:
+    """Read one file."""
     with open_fits(path) as hdus:
         primary, science = hdus[0].header, hdus["SCI"].header
         data = _cube(hdus["SCI"].data)
         error = _cube(hdus["ERR"].data) if "ERR" in hdus else None
         flags = hdus["DQ"].data if "DQ" in hdus else np.uint32(0)
         header = merged_header(primary, science, path)
+        aligned = "IMSHIFTS" in hdus
     flags = np.broadcast_to(flags, data.shape)
     data[(flags & NON_SCIENCE) != 0] = np.nan
     # As pyKLIP finds the centre: the given keywords, else CRPIX, plus the dither if requested.
@@ -148,9 +194,43 @@ def _read(path: str, dataset: Any) -> tuple[fits.Header, Any, Any, Any, Any]:
     if dataset.center_include_offset:
         offset = np.array([primary["XOFFSET"], primary["YOFFSET"]])
         center += offset / np.sqrt(science["PIXAR_A2"])
-    return header, data, error, (flags & BAD_PIXEL_BITS) == 0, np.tile(center, (len(data), 1))
+    centers = np.tile(center, (len(data), 1))
+    as_read, usable = data[0], (flags & BAD_PIXEL_BITS) == 0
+    if not aligned:
+        moved = "STARCENX" in header
+        origin = None if moved else first_pixel(header, np.zeros(2, dtype=np.int64), path)
+        return _File(header, data, error, usable, centers, origin, None, as_read, center)
+    # The shift of the alignment is undone, so that flat-field errors are in their pixels again.
+    back = Observation.from_fits(path)
+    stated = [
+        header.get(f"STARCEN{axis}", header.get(f"CRPIX{k}")) for k, axis in ((1, "X"), (2, "Y"))
+    ]
+    return _File(
+        header,
+        np.where(np.isfinite(data), back.data, np.nan).astype(np.float32),
+        np.where(back.valid, back.error, 0.0).astype(np.float32),
+        back.valid,
+        centers + back.center - (np.array(stated, dtype=float) - 1),
+        back.first_pixel,
+        back.star_offset,
+        as_read,
+        center,
+    )
 
 
 def _cube(pixels: NDArray[Any]) -> NDArray[np.float32]:
     pixels = np.array(pixels, dtype=np.float32)
     return pixels[np.newaxis] if pixels.ndim == 2 else pixels
+
+
+def keeping_references(readpsflib: Callable[..., None]) -> Callable[..., None]:
+    """Wrap `JWSTData.readpsflib` so that the dataset also knows the paths of the files."""
+
+    def readpsflib_and_paths(self: Any, psflib_filepaths: Any, *args: Any, **kw: Any) -> None:
+        readpsflib(self, psflib_filepaths, *args, **kw)
+        several = [psflib_filepaths] if isinstance(psflib_filepaths, str) else psflib_filepaths
+        setattr(self, REFERENCES, tuple(str(Path(path).resolve()) for path in several))
+
+    readpsflib_and_paths.__name__ = readpsflib.__name__
+    readpsflib_and_paths.__doc__ = readpsflib.__doc__
+    return readpsflib_and_paths

@@ -84,12 +84,14 @@ class Window:
                 "pixels of the star. Check the star centre in the header, or fit a larger field "
                 "with fit_pixels"
             )
+        origin = observation.first_pixel
         return dataclasses.replace(
             observation,
             data=self.cut(observation.data, 0.0),
             error=self.cut(observation.error, 1.0),
             valid=valid,
             center=observation.center - np.array([self.x, self.y]),
+            first_pixel=None if origin is None else (origin[0] + self.x, origin[1] + self.y),
         )
 
 

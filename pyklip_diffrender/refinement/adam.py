@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
+from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
@@ -36,16 +36,18 @@ def adam(problem: Problem, settings: Adam, *, seed: int, progress: bool) -> Refi
     optimiser = torch.optim.Adam([opd], lr=settings.learning_rate)
     history: list[dict[str, Any]] = []
     best_loss, best = math.inf, start
-    for iteration in tqdm(range(settings.iterations), desc="adam", disable=not progress):
-        optimiser.zero_grad()
-        star = flux * problem.model(opd, **values) + background
-        loss = (star - problem.data)[problem.valid].abs().mean()
-        loss.backward()
-        value = float(loss.detach())
-        history.append({"iteration": iteration, "loss": value})
-        if value < best_loss:
-            best_loss, best = value, opd.detach().clone()
-        optimiser.step()
+    with ProgressBar("Adam", settings.iterations, shown=progress) as bar:
+        for iteration in range(settings.iterations):
+            optimiser.zero_grad()
+            star = flux * problem.model(opd, **values) + background
+            loss = (star - problem.data)[problem.valid].abs().mean()
+            loss.backward()
+            value = float(loss.detach())
+            history.append({"iteration": iteration, "loss": value})
+            if value < best_loss:
+                best_loss, best = value, opd.detach().clone()
+            optimiser.step()
+            bar.update(loss=value)
     with torch.no_grad():
         star = flux * problem.model(best, **values).double() + background
     noise = ((problem.data - star) / problem.sigma)[problem.valid]

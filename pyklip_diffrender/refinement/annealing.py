@@ -14,8 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tqdm import tqdm
-
+from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.linear.model import Unknown
 from pyklip_diffrender.refinement.companions import bright_companions
 from pyklip_diffrender.refinement.frame_fit import FrameFit
@@ -103,6 +102,10 @@ class Annealing:
 
     def run(self, seed: int) -> Refinement:
         """Fit the alignment, then alignment and wavefront; return the best iterate."""
+        with ProgressBar("wavefront", shown=self.progress) as bar:
+            return self._run(seed, bar)
+
+    def _run(self, seed: int, bar: ProgressBar) -> Refinement:
         began = time.perf_counter()
         settings, solver, floor = self.settings, self.solver, self.settings.min_model_error
         state = aligned = best = self._begin
@@ -113,7 +116,6 @@ class Annealing:
         if settings.wavefront and (not settings.free or self._is_warm):
             modes = self._modes_for(kappa)
         status = Status.ITERATION_LIMIT
-        bar = tqdm(total=settings.max_iterations, desc="refine", disable=not self.progress)
         remaining = settings.max_iterations
         while remaining:
             remaining -= 1
@@ -122,8 +124,7 @@ class Annealing:
             if (error, chi2) < best_error:
                 best, best_error = state, (error, chi2)
             self._record(kappa, modes, chi2, error, gain)
-            bar.update()
-            bar.set_postfix(chi2=f"{chi2:.3g}", kappa=f"{kappa:.2g}")
+            bar.update(chi2=chi2)
             settled = gain < settings.tolerance
             if not modes:
                 kappa = max(floor, min(kappa, error))
@@ -145,7 +146,6 @@ class Annealing:
                 near = error < _NEAR
                 best = state = self._with_companions(state if near else aligned, bright)
                 best_error, remaining = (math.inf, math.inf), settings.max_iterations
-                bar.reset()
                 if not near:
                     solver.scales, solver.damping, modes = first_scales, 0.0, 0
                     kappa = max(self.objective.model_error(state), floor)
@@ -157,7 +157,6 @@ class Annealing:
             if kappa < max(_NEGLIGIBLE, floor):
                 kappa = floor
             modes = self._modes_for(kappa)
-        bar.close()
         if best.flux <= 0:
             status = Status.DIVERGED
         return self._conclude(best, status, seed, time.perf_counter() - began)
@@ -173,7 +172,7 @@ class Annealing:
             "damping": self.solver.damping,
         }
         self.history.append(record)
-        _log.info("%s, scales %s", record, self.solver.scales.tolist())
+        _log.debug("%s, scales %s", record, self.solver.scales.tolist())
 
     def _modes_for(self, kappa: float) -> int:
         """Number of leading modes to fit while the model error is kappa."""

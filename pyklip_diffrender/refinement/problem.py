@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
+from pyklip_diffrender.io.units import to_number
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement.systematics import Systematics
@@ -63,6 +64,10 @@ class Problem:
             )
         require_same_setup(self.model, self.observation)
         self.require_parameters(self.start, "start")
+        self.start = dict(self.start)
+        for name in {"flux", "background"} & self.start.keys():
+            unit = self.observation.unit
+            self.start[name] = to_number(self.start[name], unit, f"start: {name}")
         combined = self.observation.combined()
         device = self.model.device
         self.data = torch.from_numpy(combined.data[0]).to(device)

@@ -8,8 +8,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from astropy import units as u
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.units import set_numbers, to_unit
+from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import Basis
@@ -36,7 +39,7 @@ class GaussNewton:
         one is fitted; the next one is tried while the data are not explained.
     basis : Basis, optional
         Wavefront modes, in place of the default basis (segment motions and Fourier modes).
-    deviations : mapping of str to float
+    deviations : mapping of str to float or Quantity
         Prior standard deviations of free parameters about their starting values, where they
         differ from those of the parameter table. That of "flux" is relative, and takes a starting
         value: ``deviations={"flux": 0.05}`` with ``start={"flux": ...}`` ties the contrast scale to
@@ -147,6 +150,12 @@ class GaussNewton:
                 raise IncompatibleSetupError(
                     f"{name}: got {getattr(self, name)}, expected 0 or more"
                 )
+        units = {each.name: each.unit for each in OPTICAL_PARAMETERS}
+        deviations = {
+            name: float(to_unit(value, units.get(name, ""), f"deviations: {name}"))
+            for name, value in self.deviations.items()
+        }
+        object.__setattr__(self, "deviations", deviations)
         for name, deviation in self.deviations.items():
             if name not in self.free or not deviation > 0:
                 raise IncompatibleSetupError(
@@ -224,7 +233,7 @@ class Adam:
     Attributes
     ----------
     iterations : int
-    learning_rate : float
+    learning_rate : float or Quantity
         m.
     """
 
@@ -232,7 +241,8 @@ class Adam:
     learning_rate: float = 1e-11
 
     def __post_init__(self) -> None:
-        _require_positive(self, "iterations", "learning_rate")
+        set_numbers(self, learning_rate=(u.m, "positive"))
+        _require_positive(self, "iterations")
 
 
 def _require_positive(settings: GaussNewton | Adam, *names: str) -> None:

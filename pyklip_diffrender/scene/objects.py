@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
-from pyklip_diffrender.io.units import ARCSEC
+from astropy import units as u
+
+from pyklip_diffrender.io.units import ARCSEC, set_numbers, to_arcsec, to_number, to_pair
 
 __all__ = [
     "ALPHA_PICTORIS_W2",
@@ -40,6 +43,8 @@ star, with the Lyot stop but without the occulter, at 4.5 um."""
 @dataclass(frozen=True)
 class Star:
     """A star with an exposure, and the calibration that turns both into photons.
+
+    Every value may be a Quantity.
 
     Attributes
     ----------
@@ -72,6 +77,19 @@ class Star:
     pixel_area: float = (0.062424185 * ARCSEC) ** 2
     peak_fraction: float = 0.0148002
 
+    def __post_init__(self) -> None:
+        set_numbers(
+            self,
+            w2_magnitude=(u.mag, "any"),
+            exposure=(u.s, "positive"),
+            zero_point=(u.Jy, "positive"),
+            mjysr_per_cps=(u.MJy / u.sr, "positive"),
+            gain=(u.electron / u.ct, "positive"),
+            quantum_efficiency=("", "positive"),
+            pixel_area=(u.sr, "positive"),
+            peak_fraction=("", "positive"),
+        )
+
     @property
     def peak_photons(self) -> float:
         """Photons in the brightest pixel of the unocculted star, the paper's contrast of 1."""
@@ -89,6 +107,8 @@ class Star:
 class Planet:
     """A point source beside the star.
 
+    Every value may be a Quantity.
+
     Attributes
     ----------
     contrast : float
@@ -97,20 +117,41 @@ class Planet:
         arcsec.
     position_angle : float
         Degrees, counter-clockwise from +y of the image.
+
+    Raises
+    ------
+    UnitError, NonFiniteError, IncompatibleSetupError
+        For a value with a wrong unit, or a contrast or separation that is negative.
+
+    Examples
+    --------
+    >>> from astropy import units as u
+    >>> from pyklip_diffrender import Planet
+    >>> Planet(1e-6, 600 * u.mas, 54 * u.deg)
+    Planet(contrast=1e-06, separation=0.6, position_angle=54.0)
     """
 
     contrast: float
     separation: float
     position_angle: float = 0.0
 
+    def __post_init__(self) -> None:
+        set_numbers(
+            self,
+            contrast=("", "not negative"),
+            separation=(u.arcsec, "not negative"),
+            position_angle=(u.deg, "any"),
+        )
+
     @classmethod
-    def from_offset(cls, contrast: float, x: float, y: float) -> Planet:
-        """Make a planet at x, y from the star (arcsec, image orientation)."""
+    def from_offset(cls, contrast: float, x: Any, y: Any) -> Planet:
+        """Make a planet at x, y from the star (arcsec or Quantity, image orientation)."""
+        x, y = float(to_arcsec(x, "x")), float(to_arcsec(y, "y"))
         return cls(contrast, math.hypot(x, y), math.degrees(math.atan2(-x, y)))
 
-    def rotated(self, angle: float) -> Planet:
-        """Rotate the planet about the star by `angle` degrees, counter-clockwise."""
-        return replace(self, position_angle=self.position_angle + angle)
+    def rotated(self, angle: Any) -> Planet:
+        """Rotate the planet about the star by `angle` (degrees or Quantity), counter-clockwise."""
+        return replace(self, position_angle=self.position_angle + to_number(angle, u.deg, "angle"))
 
     @property
     def offset(self) -> tuple[float, float]:
@@ -122,6 +163,8 @@ class Planet:
 @dataclass(frozen=True)
 class Scene:
     """A star, its planets, the background and the read noise.
+
+    Every value may be a Quantity.
 
     Attributes
     ----------
@@ -140,3 +183,8 @@ class Scene:
     star_offset: tuple[float, float] = (0.0, 0.0)
     read_noise: float = 42.0
     background: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "planets", tuple(self.planets))
+        object.__setattr__(self, "star_offset", to_pair(self.star_offset, u.arcsec, "star_offset"))
+        set_numbers(self, read_noise=(u.photon, "not negative"), background=(u.photon, "any"))

@@ -29,6 +29,7 @@ from pyklip_diffrender.io.units import (
     require_finite,
     require_shape,
     to_arcsec,
+    to_pair,
     to_unit,
 )
 from pyklip_diffrender.scene.detector_pixels import first_pixel, net_shifts, shift_frames
@@ -172,6 +173,11 @@ class Observation:
                 f"{name}: all {values[0].size} pixels of frame {int(empty[0])} are masked, not "
                 "finite or without an error. Look at its DQ"
             )
+        if details.get("star_offset") is not None:
+            details["star_offset"] = to_pair(details["star_offset"], u.arcsec, "star_offset")
+        if details.get("position_angles") is not None:
+            angles = to_unit(details["position_angles"], u.deg, "position_angles")
+            details["position_angles"] = _spread(angles, (len(values),), f"{name}: position_angles")
         frames, ny, nx = values.shape
         where = native_float64([(nx - 1) / 2, (ny - 1) / 2] if center is None else center)
         require_finite(where, f"{name}: center")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from astropy import units as u
 from astropy.table import QTable
+from astropy.time import Time
 
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.scene.observation import Observation
@@ -127,6 +128,12 @@ class Sequence:
             tuple(sorted(references, key=_time)),
             tuple(excluded),
         )
+
+    @property
+    def date(self) -> Time | None:
+        """Mean date of the target's frames, None if none of them has one."""
+        dates = [each.date for each in self.science if each.date is not None]
+        return Time(dates).mean() if dates else None
 
     @property
     def table(self) -> QTable:

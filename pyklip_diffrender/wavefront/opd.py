@@ -25,9 +25,9 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
-from pyklip_diffrender.io.headers import header_date, header_text, merged_header
+from pyklip_diffrender.io.headers import header_text, merged_header, sensing_date
 from pyklip_diffrender.io.opd_map import OPDMap
-from pyklip_diffrender.io.units import native_float64, to_metres, warn_of_rms
+from pyklip_diffrender.io.units import native_float64, to_metres, to_number, warn_of_rms
 from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import FourierModes, SegmentMotions
 
@@ -82,6 +82,11 @@ def read_opd(
     >>> opd = read_opd("R2022081102-NRCA3_FP1-1.fits")  # doctest: +SKIP
     """
     path = Path(path)
+    if path.is_dir():
+        raise CorruptFileError(
+            f"{path} is a folder, expected a file. choose_map(folder, date) takes the map of a "
+            "folder that is nearest to a date"
+        )
     with open_fits(path) as hdus:
         if extension is None and EXTENSION in hdus:
             return _checked(load_wss_opd(path))
@@ -107,7 +112,7 @@ def read_opd(
             f"the HDU with extension=, out of {[each.name or k for k, each in enumerate(hdus)]}, "
             "or pass an array of zeros where a flat wavefront is meant"
         )
-    date = header_date(header, ("DATE-OBS", "DATE-BEG"), path.name)
+    date = sensing_date(header, path.name)
     return _checked(OPDMap(data, date, path.name, sha256(path)))
 
 
@@ -174,18 +179,19 @@ def drift(before: Any, after: Any, hours: float, interval: float = 86.0) -> NDAr
     ----------
     before, after : OPDMap or ndarray, (npix, npix)
         m.
-    hours : float
-        Time since `before`.
-    interval : float
-        Hours from `before` to `after`.
+    hours : float or Quantity
+        Time since `before`, h.
+    interval : float or Quantity
+        Time from `before` to `after`, h.
 
     Returns
     -------
     ndarray, (npix, npix)
         m.
     """
-    first, second = native_float64(before), native_float64(after)
-    return first + hours / interval * (second - first)
+    first, second = to_metres(before, "before"), to_metres(after, "after")
+    hours = to_number(hours, u.h, "hours")
+    return first + hours / to_number(interval, u.h, "interval", "positive") * (second - first)
 
 
 def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
@@ -200,13 +206,14 @@ def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
     seed : int
     npix : int
         Samples across the pupil. The same seed gives the same wavefront at any sampling.
-    rms : float
+    rms : float or Quantity
         Over the pupil, m.
 
     Returns
     -------
     OPDMap
     """
+    rms = to_number(rms, u.m, "rms", "not negative")
     return _random(seed, npix, rms, 0.24, "random_opd")
 
 
@@ -220,7 +227,8 @@ def random_drift(seed: int, hours: float, npix: int = 1024) -> OPDMap:
     Parameters
     ----------
     seed : int
-    hours : float
+    hours : float or Quantity
+        Time since the wavefront was sensed, h.
     npix : int
         Samples across the pupil.
 
@@ -228,6 +236,7 @@ def random_drift(seed: int, hours: float, npix: int = 1024) -> OPDMap:
     -------
     OPDMap
     """
+    hours = to_number(hours, u.h, "hours")
     unit = _random(seed, npix, 1e-8, 0.62, "random_drift")
     data = unit.data * (9e-9 / 1e-8 * hours / 86.0)
     return OPDMap(data, None, f"random_drift(seed={seed}, hours={hours})", unit.sha256)

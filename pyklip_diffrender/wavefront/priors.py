@@ -12,12 +12,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from astropy import units as u
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 from scipy.optimize import minimize
 from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.io.units import set_numbers, to_metres, to_number
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.opd import resample
@@ -74,6 +76,21 @@ class WavefrontPrior:
     amplitude_cycles: float = 0.0
     amplitude_scale: float = 0.0
     amplitude_slope: float = 1.0
+
+    def __post_init__(self) -> None:
+        scales = {
+            name: to_number(scale, u.nm, f"scales: {name}", "not negative")
+            for name, scale in self.scales.items()
+        }
+        object.__setattr__(self, "scales", scales)
+        set_numbers(
+            self,
+            knee=("", "positive"),
+            slope=("", "not negative"),
+            amplitude_cycles=("", "not negative"),
+            amplitude_scale=(u.nm, "not negative"),
+            amplitude_slope=("", "not negative"),
+        )
 
     def amplitude_modes(self, basis: Basis) -> int:
         """Number of modes, from the first, that may also change the pupil's amplitude."""
@@ -137,7 +154,7 @@ def learn_prior(
     maps : sequence of ndarray, (n, n)
         At least two, m, entrance-pupil orientation; 0 or constant outside the mirror.
     basis : Basis
-    diameter : float
+    diameter : float or Quantity
         Side of the maps, m.
     npix : int
         Samples on which modes are fitted; the maps are averaged onto them.
@@ -156,7 +173,8 @@ def learn_prior(
     ShapeError
         For fewer than two maps, or maps of different shapes.
     """
-    stack = np.asarray([np.asarray(opd, dtype=float) for opd in maps])
+    stack = np.asarray([to_metres(opd, "maps") for opd in maps])
+    diameter = to_number(diameter, u.m, "diameter", "positive")
     if stack.ndim != 3 or len(stack) < 2:
         raise ShapeError(f"maps: got shape {stack.shape}, expected at least two square maps")
     changes = np.diff(stack, axis=0) * 1e9

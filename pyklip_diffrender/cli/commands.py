@@ -1,0 +1,315 @@
+"""The commands that compute something."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import nullcontext, redirect_stdout
+from json import dumps, loads
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pyklip_diffrender.cli.options import (
+    Command,
+    file_type,
+    option,
+    outputs,
+    search,
+    wavefront,
+)
+from pyklip_diffrender.cli.run import Run
+from pyklip_diffrender.errors import IncompatibleSetupError
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.io.opd_map import OPDMap
+    from pyklip_diffrender.scene.sequence import Sequence
+
+__all__ = ["demo", "detect_in_file", "psf", "reduce_frames"]
+
+_DEMO = ("demo.fits", "demo.ecsv", "candidates.ecsv", "demo.png")
+_REDUCTION = (
+    "detection.fits", "candidates.ecsv", "contrast.ecsv", "fit.fits", "systematics.fits",
+    "report.html", "summary.json", "detection.png",
+)  # fmt: skip
+
+
+@click.command(
+    cls=Command,
+    epilog="""\b
+Examples:
+  pyklip-diffrender demo
+  pyklip-diffrender demo --contrast 3e-7 --separation 1 -o faint""",
+)
+@option("--contrast", type=float, default=1e-6, show_default=True, help="Of the planet.")
+@option("--separation", type=float, default=0.6, show_default=True, metavar="ARCSEC",
+        help="Of the planet from the star.")  # fmt: skip
+@option("--hours", type=float, default=40.0, show_default=True, metavar="H",
+        help="Age of the wavefront map.")  # fmt: skip
+@option("--seed", type=int, default=1, show_default=True, metavar="N",
+        help="Random seed of wavefront, drift and noise.")  # fmt: skip
+@outputs("diffrender-demo")
+@click.pass_obj
+def demo(
+    run: Run,
+    contrast: float,
+    separation: float,
+    hours: float,
+    seed: int,
+    output: Path,
+    overwrite: bool,
+) -> None:
+    """Show KLIP and wavefront refinement side by side on a simulated planet.
+
+    Needs no data, half a minute and 2 GB of memory.
+    """
+    run.claim_folder(output, _DEMO, overwrite)
+    from pyklip_diffrender.demo import run_demo, write_demo
+    from pyklip_diffrender.plotting import draw_demo, save
+
+    result = run_demo(
+        contrast=contrast,
+        separation=separation,
+        hours=hours,
+        seed=seed,
+        progress=run.progress,
+        device=run.device,
+    )
+    written = write_demo(result, output)
+    figure = output / "demo.png"
+    save(draw_demo(result), figure)
+    click.echo()
+    click.echo("\n".join(result.table.pformat(max_lines=-1, max_width=-1)))
+    click.echo(
+        f"\nA planet of contrast {contrast:g} at {separation:g} arcsec; the "
+        f"wavefront map is {hours:g} h old.\nSNR: the paper's, in the planet's annulus. "
+        "Throughput: share of the planet's light kept.\nStar error: rms of what is left of the "
+        "star in that annulus, in units of the noise.\n"
+        f"Refinement: {result.fit.status.message}.\n\n"
+        "Point sources with the wavefront integrated out, which loses none of the planet:"
+    )
+    for row in result.detection.table:
+        click.echo(
+            f"  {row['separation'].to_value('arcsec'):.3f} arcsec at "
+            f"{row['position_angle'].to_value('deg'):.1f} deg: contrast {row['contrast']:.2e} +- "
+            f"{row['contrast_error']:.1e}, S/N {row['snr']:.1f}"
+        )
+    if not len(result.detection.table):
+        click.echo(f"  none above {result.detection.threshold:g} sigma")
+    for path in (*written, figure):
+        click.echo(f"wrote {path}")
+
+
+@click.command(
+    "reduce",
+    cls=Command,
+    epilog="""\b
+Examples:
+  pyklip-diffrender reduce frames --opd-folder maps -o products
+  pyklip-diffrender reduce frames --target G-7-34 --filter F444W --opd map.fits -o products
+  pyklip-diffrender reduce frames --opd-folder maps -o products --dry-run""",
+)
+@click.argument("frames", type=file_type(), nargs=-1, required=True)
+@option("--target", metavar="STAR", section="Frames",
+        help="Name of the target; the other stars are references.")  # fmt: skip
+@option("--filter", metavar="NAME", section="Frames", help="Which filter, if there are several.")
+@wavefront
+@search
+@outputs()
+@click.pass_obj
+def reduce_frames(
+    run: Run, /, frames: tuple[Path, ...], target: str | None, filter: str | None, **options: Any
+) -> None:
+    """Search all rolls of a target, with what its reference stars teach.
+
+    FRAMES are calints files, or one folder of them.
+    """
+
+    def read() -> Sequence:
+        from pyklip_diffrender.scene.sequence import Sequence
+
+        files = frames[0] if len(frames) == 1 else frames
+        return Sequence.from_files(files, target=target, filter=filter)
+
+    _reduction(run, read, **options)
+
+
+@click.command(
+    "detect",
+    cls=Command,
+    epilog="""\b
+Examples:
+  pyklip-diffrender detect calints.fits --opd map.fits -o products
+  pyklip-diffrender detect calints.fits --opd-folder maps --opd-date before -o products
+  pyklip-diffrender detect calints.fits --opd-folder maps -o products --json | jq .sentence""",
+)
+@click.argument("frames", type=file_type())
+@wavefront
+@search
+@outputs()
+@click.pass_obj
+def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
+    """Search a single file.
+
+    FRAMES is a calints file.
+    """
+
+    def read() -> Sequence:
+        from pyklip_diffrender.scene.observation import Observation
+        from pyklip_diffrender.scene.sequence import Sequence
+
+        if frames.is_dir():
+            raise IncompatibleSetupError(
+                f"{frames} is a folder, expected a file; the command reduce takes folders"
+            )
+        observation = Observation.from_fits(frames)
+        return Sequence(observation.target, (observation,))
+
+    _reduction(run, read, **options)
+
+
+@click.command(
+    cls=Command,
+    epilog="""\b
+Examples:
+  pyklip-diffrender psf star.fits --filter F356W --offset 0.02 0
+  pyklip-diffrender psf star.fits --monochromatic 4.5e-6 --opd map.fits""",
+)
+@click.argument("output", type=file_type())
+@option("--filter", default="F444W", show_default=True, metavar="NAME", help="Filter of NIRCam.")
+@option("--monochromatic", type=float, metavar="M", help="A single wavelength, m.")
+@option("--opd", type=file_type(), metavar="FILE",
+        help="Wavefront map (FITS); default a flat wavefront.")  # fmt: skip
+@option("--size", type=int, default=80, show_default=True, metavar="N",
+        help="Side of the image, pixels.")  # fmt: skip
+@option("--offset", type=float, nargs=2, default=(0.0, 0.0), show_default=True,
+        metavar="X Y", help="Star from the occulter's centre, arcsec.")  # fmt: skip
+@outputs(folder=False)
+@click.pass_obj
+def psf(
+    run: Run,
+    output: Path,
+    filter: str,
+    monochromatic: float | None,
+    opd: Path | None,
+    size: int,
+    offset: tuple[float, float],
+    overwrite: bool,
+) -> None:
+    """Write the image of a star behind the coronagraph.
+
+    OUTPUT is the FITS file to write.
+    """
+    run.claim_file(output, overwrite)
+    import torch
+    from astropy.io import fits
+
+    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+    from pyklip_diffrender.io.files import write_fits
+    from pyklip_diffrender.wavefront.opd import read_opd, resample
+
+    model = nircam_coronagraph(
+        filter, monochromatic=monochromatic, fov_pixels=size, device=run.device
+    )
+    map_ = None if opd is None else resample(read_opd(opd).data, model.npix)
+    with torch.no_grad():
+        image = model(map_, offset)
+    hdu = fits.PrimaryHDU(image.cpu().numpy())
+    hdu.header["PIXELSCL"] = (model.detector.pixelscale[0], "arcsec")
+    hdu.header["FILTER"] = filter.upper()
+    write_fits(fits.HDUList([hdu]), output)
+    click.echo(f"wrote {output}")
+
+
+def _reduction(
+    run: Run,
+    read: Any,
+    *,
+    output: Path,
+    overwrite: bool,
+    json: bool,
+    dry_run: bool,
+    size: int,
+    threshold: float,
+    systematics: str,
+    opd: Path | None,
+    opd_folder: Path | None,
+    opd_date: str | None,
+) -> None:
+    """Reduce a sequence, write all products and say what they show."""
+    if (opd is not None) == (opd_folder is not None or opd_date is not None):
+        raise click.UsageError("Give either --opd FILE, or --opd-folder FOLDER or --opd-date.")
+    if dry_run and json:
+        raise click.UsageError("A --dry-run has no summary to print with --json.")
+    run.claim_folder(output, _REDUCTION, overwrite)
+    # Libraries may print, too.
+    with redirect_stdout(sys.stderr) if json else nullcontext():
+        sequence = read()
+        _show(sequence)
+        map_ = _map(sequence, opd, opd_folder, opd_date)
+        click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
+        if dry_run:
+            from pyklip_diffrender.cli.estimate import describe_plan
+
+            click.echo(describe_plan(sequence, size, systematics))
+            return
+        from pyklip_diffrender.io.progress import stage
+        from pyklip_diffrender.plotting import draw_detection, save
+        from pyklip_diffrender.reduction import reduce
+        from pyklip_diffrender.refinement import Systematics
+
+        known: Any = systematics
+        if known not in ("auto", "references", "off"):
+            known = Systematics.read(known)
+        reduction = reduce(
+            sequence,
+            map_,
+            size=size,
+            systematics=known,
+            threshold=threshold,
+            device=run.device,
+            progress=run.progress,
+        )
+        with stage("4 of 4: products"):
+            written = reduction.write(output)
+            figure = output / "detection.png"
+            save(draw_detection(reduction.detection), figure)
+        click.echo(f"\n{reduction}")
+        for path in (*written, figure):
+            click.echo(f"wrote {path}")
+    if json:
+        summary = loads((output / "summary.json").read_text(encoding="utf-8"))
+        click.echo(dumps(summary, indent=2))
+
+
+def _show(sequence: Sequence) -> None:
+    click.echo("\n".join(sequence.table.pformat(max_lines=-1, max_width=-1)))
+    for name, reason in sequence.excluded:
+        click.echo(f"left out: {name}: {reason}")
+
+
+def _age(opd: OPDMap, sequence: Sequence) -> str:
+    """When a map was sensed, as an apposition."""
+    days = None if sequence.date is None else opd.days_after(sequence.date)
+    if opd.date is None or days is None:
+        return ""
+    side = "after" if days > 0 else "before"
+    return f", sensed {opd.date.isot[:16]}, {abs(days):.1f} days {side} the frames"
+
+
+def _map(sequence: Sequence, opd: Path | None, folder: Path | None, rule: str | None) -> OPDMap:
+    """The wavefront map that the options ask for."""
+    from pyklip_diffrender.bridges.wss import load_wss_opd_by_date
+    from pyklip_diffrender.wavefront.map_choice import choose_map
+    from pyklip_diffrender.wavefront.opd import read_opd
+
+    if opd is not None:
+        return read_opd(opd)
+    date, rule = sequence.date, rule or "nearest"
+    if date is None:
+        raise IncompatibleSetupError(
+            "the frames have no date (DATE-BEG) to choose a wavefront map by; give one with --opd"
+        )
+    if folder is not None:
+        return choose_map(folder, date, rule)  # type: ignore[arg-type]
+    return load_wss_opd_by_date(date, "closest" if rule == "nearest" else rule)

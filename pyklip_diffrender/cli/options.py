@@ -1,0 +1,233 @@
+"""Options that commands share, help by section, and configuration files."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+from click.core import ParameterSource
+
+from pyklip_diffrender.cli.run import Run
+
+__all__ = [
+    "COMMON",
+    "Command",
+    "common",
+    "file_type",
+    "option",
+    "outputs",
+    "read_config",
+    "search",
+    "wavefront",
+]
+
+Decorator = Callable[[Any], Any]
+
+_GENERAL = "General"
+
+
+class _Option(click.Option):
+    """An option that the help lists in a section."""
+
+    def __init__(self, *declarations: Any, section: str = "Options", **settings: Any) -> None:
+        super().__init__(*declarations, **settings)
+        self.section = section
+
+
+def option(*declarations: str, section: str = "Options", **settings: Any) -> Decorator:
+    """An option, by default in the first section of the help."""
+    return click.option(*declarations, cls=_Option, section=section, **settings)
+
+
+def _all(*decorators: Decorator) -> Decorator:
+    def decorated(function: Any) -> Any:
+        for decorator in reversed(decorators):
+            function = decorator(function)
+        return function
+
+    return decorated
+
+
+def file_type(**settings: Any) -> click.Path:
+    """A path of a file or folder; whether it exists is for the package to say."""
+    return click.Path(path_type=Path, **settings)
+
+
+def _config_callback(ctx: click.Context, _: click.Parameter, path: Path | None) -> None:
+    if path is not None:
+        ctx.default_map = {**(ctx.default_map or {}), **read_config(ctx.command, path)}
+
+
+def read_config(command: click.Command, path: Path) -> dict[str, Any]:
+    """Read the defaults for a command, or for all commands of a group, from a TOML file.
+
+    Raises
+    ------
+    click.UsageError
+        If the file cannot be read, or has an unknown option.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise click.UsageError(f"--config: {path}: {error}") from error
+    general = {key: value for key, value in content.items() if not isinstance(value, Mapping)}
+    tables = {key: value for key, value in content.items() if isinstance(value, Mapping)}
+    general = _known(general, set(COMMON), f"{path}")
+    if not isinstance(command, click.Group):
+        table = tables.get(command.name or "", {})
+        return general | _known(table, _names(command), f"{path}: [{command.name}]")
+    unknown = sorted(set(tables) - set(command.commands))
+    if unknown:
+        raise click.UsageError(
+            f"--config: {path}: [{unknown[0]}] is no command, expected one of "
+            f"{', '.join(command.commands)}"
+        )
+    defaults: dict[str, Any] = dict(general)
+    for name, each in command.commands.items():
+        table = _known(tables.get(name, {}), _names(each), f"{path}: [{name}]")
+        defaults[name] = {key: v for key, v in general.items() if key in _names(each)} | table
+    return defaults
+
+
+def _names(command: click.Command) -> set[str]:
+    """Names of what a configuration file may set."""
+    names = {param.name or "" for param in command.params}
+    return names - {"config", "write_config"}
+
+
+def _known(table: Mapping[str, Any], names: set[str], where: str) -> dict[str, Any]:
+    values = {key.replace("-", "_"): value for key, value in table.items()}
+    unknown = sorted(set(values) - names)
+    if unknown:
+        raise click.UsageError(
+            f"--config: {where} has {unknown[0]!r}, which is no option. Known: "
+            f"{', '.join(sorted(name.replace('_', '-') for name in names))}"
+        )
+    return values
+
+
+def _write_config(path: Path, command: str, values: Mapping[str, Any], overwrite: bool) -> None:
+    import tomli_w
+
+    from pyklip_diffrender.io.files import replacing
+
+    if path.exists() and not overwrite:
+        raise click.UsageError(f"--write-config: {path} exists; replace it with --overwrite")
+    table = {
+        name.replace("_", "-"): _as_toml(value)
+        for name, value in values.items()
+        if value is not None
+    }
+    with replacing(path) as temporary:
+        temporary.write_text(tomli_w.dumps({command: table}), encoding="utf-8")
+
+
+def _as_toml(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return [_as_toml(each) for each in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+class Command(click.Command):
+    """A command with help by section, whose general options may also stand before it."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the sections of the options."""
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            record = param.get_help_record(ctx)
+            # Arguments are explained in the first paragraphs.
+            if record is not None and not isinstance(param, click.Argument):
+                sections.setdefault(getattr(param, "section", _GENERAL), []).append(record)
+        # The same for all commands, so at the end.
+        sections[_GENERAL] = sections.pop(_GENERAL)
+        for name, records in sections.items():
+            with formatter.section(name):
+                formatter.write_dl(records)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Apply the general options, then run the command with its own."""
+        write_config = ctx.params.pop("write_config", None)
+        if ctx.parent is not None:
+            for name in COMMON:
+                before, own = (c.get_parameter_source(name) for c in (ctx.parent, ctx))
+                if before is ParameterSource.COMMANDLINE and own is not before:
+                    ctx.params[name] = ctx.parent.params[name]
+        if write_config is not None:
+            overwrite = ctx.params.get("overwrite", False)
+            _write_config(write_config, ctx.info_name or "", ctx.params, overwrite)
+            click.echo(f"wrote {write_config}")
+            return None
+        general = {name: ctx.params.pop(name) for name in COMMON}
+        ctx.ensure_object(Run).configure(**general)
+        return super().invoke(ctx)
+
+
+COMMON = ("verbose", "quiet", "log_file", "device", "threads")
+"""Options that may stand before the command and after it."""
+
+common = _all(
+    option("-v", "--verbose", is_flag=True, section=_GENERAL, help="Log every step of a fit."),
+    option("-q", "--quiet", is_flag=True, section=_GENERAL, help="Show no progress."),
+    option("--log-file", type=file_type(), metavar="FILE", section=_GENERAL,
+           help="Append the messages to this file, with their times."),
+    option("--device", default="cpu", show_default=True, section=_GENERAL,
+           help="PyTorch device of the optical model, such as cuda."),
+    option("--threads", type=click.IntRange(min=1), metavar="N", section=_GENERAL,
+           help="Number of threads; default: PyTorch's choice."),
+    option("--config", type=file_type(), metavar="FILE", section=_GENERAL, is_eager=True,
+           expose_value=False, callback=_config_callback,
+           help="Take defaults of the options from a TOML file."),
+)  # fmt: skip
+
+_WRITE_CONFIG = option(
+    "--write-config", type=file_type(), metavar="FILE", section=_GENERAL,
+    help="Write the options to a file for --config, and stop.",
+)  # fmt: skip
+
+_OVERWRITE = option(
+    "--overwrite", is_flag=True, section="Output",
+    help="Replace products of an earlier run.",
+)  # fmt: skip
+
+
+def outputs(default: str | None = None, *, folder: bool = True) -> Decorator:
+    """Where to write, and what to do about what is there."""
+    needed: dict[str, Any] = {"required": True}
+    if default is not None:
+        needed = {"default": Path(default), "show_default": True}
+    output = option(
+        "-o", "--output", type=file_type(), metavar="FOLDER", section="Output",
+        help="Folder for the products; made if it does not exist.", **needed,
+    )  # fmt: skip
+    return _all(*([output] if folder else []), _OVERWRITE, common, _WRITE_CONFIG)
+
+
+wavefront = _all(
+    option("--opd", type=file_type(), metavar="FILE", section="Wavefront map",
+           help="Wavefront map to start from (FITS)."),
+    option("--opd-folder", type=file_type(), metavar="FOLDER", section="Wavefront map",
+           help="Folder of wavefront maps, of which one is chosen by its date."),
+    option("--opd-date", type=click.Choice(["nearest", "before", "after", "interpolate"]),
+           section="Wavefront map",
+           help="Which map to choose, with respect to the frames; default: nearest. Without "
+           "--opd-folder, the map comes from MAST through stpsf."),
+)  # fmt: skip
+
+search = _all(
+    option("--size", type=click.IntRange(min=1), default=80, show_default=True, metavar="N",
+           section="Fit and search", help="Side of the fitted square about the star, pixels."),
+    option("--threshold", type=float, default=5.0, show_default=True, metavar="S/N",
+           section="Fit and search", help="S/N of a candidate."),
+    option("--systematics", default="auto", show_default=True, metavar="CHOICE",
+           section="Fit and search",
+           help="Pattern of the model's error: auto (the package's library, else the reference "
+           "stars), references (both), off, or a systematics.fits of an earlier reduction."),
+    option("--dry-run", is_flag=True, section="Output",
+           help="Show frames, wavefront map, steps, time and memory, and stop."),
+    option("--json", is_flag=True, section="Output",
+           help="Print the content of summary.json and nothing else on standard output."),
+)  # fmt: skip

@@ -1,0 +1,176 @@
+"""What all commands need: messages and the log, outputs that may be written, the device."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+
+__all__ = ["PROGRAM", "Run"]
+
+PROGRAM = "pyklip-diffrender"
+
+_log = logging.getLogger(__name__)
+
+
+class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
+    """Messages on standard error that do not break a progress bar."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        from tqdm import tqdm
+
+        tqdm.write(self.format(record), file=sys.stderr)
+
+    def format(self, record: logging.LogRecord) -> str:
+        message = record.getMessage()
+        if record.levelno < logging.WARNING:
+            return message
+        warning = "warning: " if record.levelno == logging.WARNING else ""
+        return f"{PROGRAM}: {warning}{message}"
+
+
+@dataclass
+class Run:
+    """One run of a command."""
+
+    progress: bool = False
+    device: str = "cpu"
+    _output: Path | None = None
+    _before: dict[Path, int] = field(default_factory=dict)
+    _handlers: list[logging.Handler] = field(default_factory=list)
+
+    @contextmanager
+    def messages(self) -> Iterator[None]:
+        """Show warnings as messages, each once, and take down the handlers afterwards."""
+        shown: set[str] = set()
+
+        def show(message: Warning | str, *_: Any, **__: Any) -> None:
+            if str(message) not in shown:
+                shown.add(str(message))
+                _log.warning("%s", message)
+
+        package = logging.getLogger("pyklip_diffrender")
+        level = package.level
+        try:
+            with warnings.catch_warnings():
+                warnings.showwarning = show
+                yield
+        finally:
+            package.setLevel(level)
+            for handler in self._handlers:
+                logging.getLogger().removeHandler(handler)
+                handler.close()
+
+    def configure(
+        self, *, verbose: bool, quiet: bool, log_file: Path | None, device: str, threads: int | None
+    ) -> None:
+        """Take what the options of all commands say."""
+        on_terminal = _OnTerminal()
+        # Away from a terminal a bar is noise: the stages and a line a minute take its place.
+        is_terminal = sys.stderr.isatty()
+        self.progress = is_terminal and not quiet
+        stages = not (quiet or is_terminal)
+        threshold = logging.DEBUG if verbose else logging.WARNING
+        on_terminal.addFilter(
+            lambda record: (
+                record.levelno >= threshold or (stages and record.name.endswith(".progress"))
+            )
+        )
+        self._add(on_terminal)
+        logging.getLogger("pyklip_diffrender").setLevel(logging.DEBUG if verbose else logging.INFO)
+        if log_file is not None:
+            try:
+                log_file.parent.mkdir(parents=True, exist_ok=True)
+                to_file = logging.FileHandler(log_file, encoding="utf-8")
+            except OSError as error:
+                raise IncompatibleSetupError(f"--log-file: {error}") from error
+            to_file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+            self._add(to_file)
+        self.device = device
+        if device != "cpu":
+            _require_device(device)
+        if threads is not None:
+            import torch
+
+            torch.set_num_threads(threads)
+
+    def _add(self, handler: logging.Handler) -> None:
+        logging.getLogger().addHandler(handler)
+        self._handlers.append(handler)
+
+    def claim_folder(self, folder: Path, products: tuple[str, ...], overwrite: bool) -> None:
+        """Refuse, before any work, products that could not be written or would be replaced.
+
+        Raises
+        ------
+        IncompatibleSetupError
+        """
+        if folder.exists() and not folder.is_dir():
+            raise IncompatibleSetupError(f"--output: {folder} is a file, expected a folder")
+        existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+        self._claim(folder, existing, [folder / name for name in products], overwrite)
+
+    def claim_file(self, path: Path, overwrite: bool) -> None:
+        """Refuse, before any work, a file that could not be written or would be replaced.
+
+        Raises
+        ------
+        IncompatibleSetupError
+        """
+        if not path.absolute().parent.is_dir():
+            raise IncompatibleSetupError(f"OUTPUT: there is no folder {path.parent} to write into")
+        if path.is_dir():
+            raise IncompatibleSetupError(f"OUTPUT: {path} is a folder, expected a file")
+        self._claim(path, path.absolute().parent, [path], overwrite)
+
+    def _claim(self, output: Path, folder: Path, products: list[Path], overwrite: bool) -> None:
+        taken = [path for path in products if path.exists()]
+        if taken and not overwrite:
+            verb = "exists" if len(taken) == 1 else "exist"
+            raise IncompatibleSetupError(
+                f"{', '.join(map(str, taken))} {verb}; choose another place, or replace with "
+                "--overwrite"
+            )
+        if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
+            raise IncompatibleSetupError(f"{output} cannot be written: no permission in {folder}")
+        self._output, self._before = output, _files(output)
+
+    def left(self) -> str:
+        """What an interrupted run has left, as a sentence."""
+        output = self._output
+        written = [] if output is None else _files(output).items() - self._before.items()
+        if not written:
+            return "nothing was written"
+        names = sorted(path.name for path, _ in written)
+        return f"these files in {output} are new and complete: {', '.join(names)}"
+
+
+def _files(output: Path) -> dict[Path, int]:
+    """Files and the times at which they were written; temporary ones have a dot."""
+    inside = output.iterdir() if output.is_dir() else [output]
+    return {
+        path: path.stat().st_mtime_ns
+        for path in inside
+        if path.is_file() and not path.name.startswith(".")
+    }
+
+
+def _require_device(name: str) -> None:
+    """Raise an exception unless PyTorch knows a device and has it."""
+    import torch
+
+    try:
+        torch.zeros(1, dtype=torch.float64, device=name)
+    except (RuntimeError, AssertionError, TypeError, NotImplementedError) as error:
+        raise IncompatibleSetupError(
+            f"--device: PyTorch {torch.__version__} cannot use {name!r} here, expected 'cpu', or "
+            f"'cuda' with a GPU and a build for it ({str(error).splitlines()[0]})"
+        ) from error

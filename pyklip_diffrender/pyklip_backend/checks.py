@@ -1,0 +1,91 @@
+"""What can be checked in a second before minutes of fitting."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
+from pyklip_diffrender.pyklip_backend.frames import require_frames
+from pyklip_diffrender.pyklip_backend.references import require_same_setup
+from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE as SOURCE
+
+__all__ = ["check_arguments", "check_dataset", "check_settings"]
+
+
+def check_dataset(dataset: Any) -> None:
+    """Raise for a dataset without frames or without pixels."""
+    if np.ndim(dataset.input) != 3:
+        raise ShapeError(f"dataset.input: got shape {np.shape(dataset.input)}, expected 3-D")
+    require_frames(dataset)
+    if not np.isfinite(dataset.input).any():
+        raise NoValidPixelsError(
+            f"{list(map(str, dataset.filenames))}: every pixel of every frame is NaN, nothing "
+            "is left to fit"
+        )
+
+
+def check_arguments(arguments: Mapping[str, Any], references: tuple[Path, ...]) -> None:
+    """Raise for arguments of `klip_dataset` that do not go together.
+
+    Parameters
+    ----------
+    arguments : mapping
+        All arguments of the call.
+    references : tuple of Path
+        Files of the reference frames that the call gives.
+    """
+    dataset, mode = arguments["dataset"], str(arguments["mode"])
+    if not any(part in mode.upper() for part in ("ADI", "RDI", "SDI")):
+        raise IncompatibleSetupError(
+            f"mode: got {mode!r}, expected ADI, RDI, SDI or a sum of them such as 'ADI+RDI'"
+        )
+    if mode.strip().upper() == "SDI" and len(np.unique(dataset.wvs)) == 1:
+        raise IncompatibleSetupError(
+            "mode: 'SDI' compares wavelengths, and this dataset has one. Use mode='ADI', or "
+            "mode='RDI' with a psf_library: the star is rendered, so neither needs references"
+        )
+    if arguments["calibrate_flux"]:
+        from pyklip.instruments.Instrument import Data
+
+        if type(dataset).calibrate_output is Data.calibrate_output:
+            raise IncompatibleSetupError(
+                f"calibrate_flux: a {type(dataset).__name__} has no flux calibration of its own. "
+                "Pass calibrate_flux=False; the products have the unit of the frames"
+            )
+    source = getattr(dataset, SOURCE, None)
+    if source is not None:
+        require_same_setup(source.headers[0], references)
+
+
+def check_settings(settings: DiffrenderSettings) -> None:
+    """Raise for settings of the default subtractor that it could not use."""
+    if settings.subtractor is not None:
+        return
+    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+    from pyklip_diffrender.refinement import Adam
+    from pyklip_diffrender.refinement.pattern_choice import require_request
+
+    known = set(inspect.signature(nircam_coronagraph).parameters) - {"filter"}
+    wrong = sorted(set(settings.model_options) - known)
+    if wrong:
+        raise IncompatibleSetupError(
+            f"model_options: {', '.join(wrong)}: not known to nircam_coronagraph, which has "
+            f"{', '.join(sorted(known))}"
+        )
+    if settings.systematics is not None:
+        require_request(settings.systematics)
+    if settings.keep_detected and isinstance(settings.fit, Adam):
+        raise IncompatibleSetupError(
+            "keep_detected: a fit by method 'adam' has no linear model with which to detect; use "
+            "fit=GaussNewton()"
+        )
+    if settings.max_chi2 is not None and not settings.max_chi2 > 0:
+        raise IncompatibleSetupError(
+            f"max_chi2: got {settings.max_chi2}, expected a positive number; inf for no limit"
+        )

@@ -1,0 +1,194 @@
+"""Frames of reference stars, and the pattern of the model's error that a reduction uses."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy.io import fits
+
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.pyklip_backend.pointings import may_be_one_star
+from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.source import REFERENCES
+from pyklip_diffrender.pyklip_backend.windows import Window
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import OPDMap
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.optics.system import OpticalSystem
+    from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
+
+__all__ = ["ChosenPattern", "References", "library_files", "pattern_for", "require_same_setup"]
+
+logger = logging.getLogger(__name__)
+
+_SETUP = ("FILTER", "CORONMSK", "PUPIL", "DETECTOR")
+"""Header keywords in which reference frames must agree with those of the target."""
+
+
+@dataclass(frozen=True, eq=False)
+class References:
+    """Frames of reference stars that a reduction may use.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        Files of the psf_library; they are read only where they are needed.
+    frames : tuple of Observation
+        Frames of the dataset itself.
+    """
+
+    files: tuple[Path, ...] = ()
+    frames: tuple[Observation, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.files or self.frames)
+
+    def cut(self, shape: tuple[int, int], target: Observation) -> list[Observation]:
+        """Read all frames and cut the pixels about the star out of them.
+
+        A file that cannot be used is left out, and so are frames of the target itself: its planets
+        would become part of the pattern.
+        """
+        observations = list(self.frames)
+        for path in self.files:
+            try:
+                frames = Observation.from_fits(path)
+            except DiffrenderError as error:
+                logger.warning("reference frames are left out: %s", error)
+                continue
+            if may_be_one_star(frames.header, target.header):
+                logger.warning("%s is left out: it does not show another star", path.name)
+                continue
+            observations.append(replace(frames, reference=True))
+        return [Window.about(each.center[0], shape).of(each) for each in observations]
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenPattern:
+    """The pattern of the model's error for a fit, see `PatternChoice`.
+
+    Attributes
+    ----------
+    science : tuple of Observation
+    systematics : Systematics or None
+    settings : GaussNewton, Adam or None
+    label : str
+        What the pattern is, in a few words.
+    reference_frames : int
+        Number of frames of reference stars that it was learned from.
+    """
+
+    science: tuple[Observation, ...]
+    systematics: Systematics | None
+    settings: GaussNewton | Adam | None
+    label: str = "none"
+    reference_frames: int = 0
+
+
+def library_files(dataset: Any, psf_library: Any) -> tuple[Path, ...]:
+    """Files of the frames in a PSF library, as far as they are known.
+
+    Only a library that `JWSTData` read while the backend was registered has files.
+    """
+    paths = [Path(path) for path in getattr(dataset, REFERENCES, ())]
+    chosen = np.asarray(psf_library.master_filenames)
+    if psf_library.isgoodpsf is not None:
+        chosen = chosen[psf_library.isgoodpsf]
+    # pyKLIP appends the number of the integration to the name of the file.
+    names = {str(name).rpartition("_INT")[0] for name in chosen}
+    return tuple(path for path in paths if path.name in names)
+
+
+def require_same_setup(header: fits.Header, files: Sequence[Path]) -> None:
+    """Refuse reference files of another filter, mask or detector than the target's.
+
+    Raises
+    ------
+    IncompatibleSetupError
+    CorruptFileError
+        If a file is gone.
+    """
+    for path in files:
+        with open_fits(path) as hdus:
+            theirs = hdus[0].header
+            for key in _SETUP:
+                ours, other = header.get(key), theirs.get(key)
+                if None not in (ours, other) and str(ours).strip() != str(other).strip():
+                    raise IncompatibleSetupError(
+                        f"psf_library: {path.name} was taken with {key} {other}, the target with "
+                        f"{ours}. Give only reference frames of the same set-up"
+                    )
+
+
+def pattern_for(
+    science: Sequence[Observation],
+    references: References,
+    model: OpticalSystem,
+    opd: OPDMap,
+    settings: DiffrenderSettings,
+    tell: Callable[[str], None],
+) -> ChosenPattern:
+    """Choose the pattern of the model's error as `reduce` does.
+
+    Parameters
+    ----------
+    science : sequence of Observation
+        Frames of the target, as they will be fitted.
+    references : References
+    model : OpticalSystem
+    opd : OPDMap
+    settings : DiffrenderSettings
+        Without `systematics`, real NIRCam frames get "auto", others "off".
+    tell : callable
+        Called with a line of text before reference stars are fitted.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If "references" is asked for without any.
+    """
+    from pyklip_diffrender.refinement import Adam, Systematics
+    from pyklip_diffrender.refinement.pattern_choice import choose_systematics
+
+    requested = settings.systematics
+    if requested is None:
+        real = science[0].is_nircam and not isinstance(settings.fit, Adam)
+        requested = "auto" if real else "off"
+    if requested == "references" and not references:
+        raise IncompatibleSetupError(
+            "systematics='references' needs frames of reference stars: give them to JWSTData as "
+            "psflib_filepaths after register(), and RDI in the mode and psf_library= to "
+            "klip_dataset"
+        )
+
+    def choose(request: Any, others: Sequence[Observation]) -> Any:
+        return choose_systematics(
+            science, others, model, opd, systematics=request, settings=settings.fit
+        )
+
+    first = "off" if requested == "references" else requested
+    choice = choose(first, [])
+    needed = requested == "references" or (requested == "auto" and choice.systematics is None)
+    if needed and references:
+        tell("fitting the reference stars")
+        choice = choose("references", references.cut(model.detector.shape, science[0]))
+    elif references:
+        tell("the reference frames are not needed")
+    learned = [frame.observation for fit in choice.references for frame in fit.frames]
+    stars = list(dict.fromkeys(each.target for each in learned))
+    label = "none"
+    if isinstance(requested, Systematics):
+        label = f"given ({requested.name})"
+    elif choice.systematics is not None:
+        library = [n for n in choice.systematics.provenance.get("stars", []) if n not in stars]
+        parts = [("references", stars), ("library", library)]
+        label = ", ".join(f"{origin} ({', '.join(names)})" for origin, names in parts if names)
+    used = sum(map(len, learned)) if choice.systematics is not None else 0
+    return ChosenPattern(choice.science, choice.systematics, choice.settings, label, used)

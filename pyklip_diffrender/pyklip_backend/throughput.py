@@ -1,0 +1,142 @@
+"""How much of a faint point source's light the subtraction leaves, from the linear model of a fit.
+
+A source adds its image p to the data. Most of it is unlike anything that the wavefront can do to
+the star, but some is fitted as starlight, and subtracted. To first order the unknowns of the fit
+change by H^-1 G p, where G is the whitened Jacobian and H the curvature of the penalised
+chi-squared (see `linear.model`), and the star by the image of that change. What is left, measured
+as a fit of p to the subtracted frame does, is 1 - p . change / p . p.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import map_coordinates
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.refinement import Refinement
+
+__all__ = ["on_product", "throughput_map", "write_throughput"]
+
+SPACING = 2
+"""Pixels between the positions at which the throughput is computed; between them it is
+interpolated."""
+
+_DENSE = 5
+"""Pixels about a companion of the fit within which every pixel is computed."""
+
+_BATCH = 256
+
+
+def throughput_map(fit: Refinement, spacing: int = SPACING) -> NDArray[np.float64]:
+    """Fraction of a faint source's light that is left, on the pixels of the fit's first frame.
+
+    Companions of the fit are part of its model, so that no light at their places becomes star.
+
+    Parameters
+    ----------
+    fit : Refinement
+        With a linear model.
+    spacing : int
+        Pixels between the computed positions.
+
+    Returns
+    -------
+    ndarray, (ny, nx)
+        For sources at the pixel centres; the mean of all frames of the fit.
+    """
+    from pyklip_diffrender.detection.templates import Templates
+
+    templates = Templates(fit, fit.frames[0])
+    ny, nx = fit.frames[0].model.detector.shape
+    rows, columns = (np.unique(np.append(np.arange(0, n, spacing), n - 1)) for n in (ny, nx))
+    y, x = np.meshgrid(rows, columns, indexing="ij")
+    coarse = _at(fit, templates, y.ravel(), x.ravel()).reshape(y.shape)
+    every = np.moveaxis(np.indices((ny, nx)), 0, -1)
+    filled = np.asarray(RegularGridInterpolator((rows, columns), coarse)(every))
+    for _, *offset in fit.companions:
+        distance = np.hypot(*(templates.grid - offset).transpose(2, 0, 1))
+        pixel = math.sqrt(math.prod(fit.model.detector.pixelscale))
+        near = np.nonzero(distance <= _DENSE * pixel)
+        filled[near] = _at(fit, templates, *near)
+    return filled
+
+
+def _at(
+    fit: Refinement, templates: Any, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """The throughput of sources at pixels of the first frame."""
+    assert fit.linear is not None
+    star = np.array([unknown.name != "companions" for unknown in fit.linear.unknowns])
+    left = np.empty(len(rows))
+    for start in range(0, len(rows), _BATCH):
+        part = slice(start, start + _BATCH)
+        images = templates.at_pixels(rows[part], columns[part])
+        change = fit.linear.response(images)
+        change[~star] = 0.0
+        taken, total = np.zeros(len(rows[part])), 0.0
+        for k, image in images.items():
+            frame = fit.linear.frames[k]
+            seen = image.double() * (frame.weight > 0)
+            # Where a frame does not show the source, nothing of it is taken.
+            whole = (seen**2).sum(dim=(1, 2)).clamp(min=1e-300)
+            share = (seen * frame.image(change)).sum(dim=(1, 2)) / whole
+            count = len(fit.frames[k].observation)
+            taken += count * np.where(whole.numpy() > 1e-300, share.numpy(), 0.0)
+            total += count
+        left[part] = 1 - taken / total
+    return left
+
+
+def on_product(
+    image: NDArray[np.float64],
+    center: NDArray[np.float64],
+    shape: tuple[int, int],
+    product_center: NDArray[np.float64],
+    angle: float,
+    flipx: bool = False,
+) -> NDArray[np.float64]:
+    """Turn a map the way pyKLIP turns frames; NaN beyond its edges.
+
+    Parameters
+    ----------
+    image : ndarray, (ny, nx)
+        Map on the pixels of the first frame.
+    center, product_center : ndarray, (2,)
+        x, y of the star there and in the product.
+    shape : tuple of int
+        Of the product.
+    angle : float
+        Degrees counter-clockwise by which pyKLIP turns the first frame.
+    flipx : bool
+        See `pyklip.klip.rotate`.
+    """
+    y, x = np.indices(shape)
+    x, y = x - product_center[0], y - product_center[1]
+    x = -x if flipx else x
+    cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+    places = [-x * sine + y * cosine + center[1], x * cosine + y * sine + center[0]]
+    return np.asarray(map_coordinates(image, places, order=1, cval=np.nan))
+
+
+def write_throughput(path: Path, maps: NDArray[np.float64], center: NDArray[np.float64]) -> None:
+    """Write maps (wavelengths, ny, nx), on the pixels of the products, to a FITS file."""
+    cube = maps[0] if len(maps) == 1 else maps
+    hdu = fits.PrimaryHDU(cube.astype(np.float32))
+    hdu.header["BUNIT"] = ("", "fraction of a faint point source's light")
+    hdu.header["PSFCENTX"], hdu.header["PSFCENTY"] = center
+    hdu.header["STARCENX"], hdu.header["STARCENY"] = center[0] + 1, center[1] + 1
+    hdu.header["DRTHSTEP"] = (SPACING, "pixels between computed positions")
+    hdu.header.add_comment(
+        "Fraction of a faint point source's light that the subtraction leaves, to first order in "
+        "its light, before any high-pass filter. Computed at every DRTHSTEP pixels and next to "
+        "companions of the fit, interpolated elsewhere; 1 outside the fitted square. Detected "
+        "companions that are in the model (DRKEPT) keep their light."
+    )
+    hdu.writeto(path)

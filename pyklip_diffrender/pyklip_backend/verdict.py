@@ -1,0 +1,99 @@
+"""Whether a fit may be subtracted, and what to say about one that has not converged."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from pyklip_diffrender.errors import DiffrenderWarning, RefinementError
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.refinement import Refinement
+
+__all__ = ["MAX_CHI2", "breakdown_explained", "require_plausible", "warn_of_status"]
+
+MAX_CHI2 = 100.0
+"""Default of the largest reduced chi-squared of a plausible fit. Fits of real frames have 0.5 to 6,
+12 with a bright disk; with a star in the wrong place it is in the thousands."""
+
+WHAT_TO_CHECK = (
+    "Check the star's position in the header (STARCENX/Y, else CRPIX1/2), the filter, the masks "
+    "and the errors, and the unit, the orientation and the date of the wavefront map."
+)
+
+_ADVICE = {
+    "MODEL_MISMATCH": (
+        "usual for real frames whose flat-field pattern is not known. Check the filter, the masks "
+        "and the date of the wavefront map; reference frames and systematics='references' help"
+    ),
+    "PRIOR_MISMATCH": (
+        "take a wavefront map nearer in time, or let the scales of the prior be fitted "
+        "(WavefrontPrior(fit_scales=True))"
+    ),
+    "ITERATION_LIMIT": (
+        "the best iterate was subtracted. Raise max_iterations, for example "
+        "fit=GaussNewton.nircam(max_iterations=80)"
+    ),
+    "COMPLETED": "this method has no test of convergence; compare chi-squared per pixel with 1",
+}
+
+
+@contextmanager
+def breakdown_explained(name: str) -> Iterator[None]:
+    """Turn a breakdown of the linear algebra of a fit into a `RefinementError`."""
+    import torch
+
+    try:
+        yield
+    except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+        raise RefinementError(
+            f"{name}: the fit broke down, as it does where the frames show something else than the "
+            f"star that the model renders. {WHAT_TO_CHECK} ({error})"
+        ) from error
+
+
+def require_plausible(name: str, result: Refinement, limit: float | None) -> None:
+    """Refuse a fit that failed, or that has nothing to do with the frames.
+
+    Raises
+    ------
+    RefinementError
+    """
+    if not result.status.usable:
+        raise RefinementError(f"{name}: {result.status.message}", result)
+    chi2, limit = reduced_chi2(result), MAX_CHI2 if limit is None else limit
+    if chi2 > limit:
+        raise RefinementError(
+            f"{name}: reduced chi-squared is {chi2:.3g}, above max_chi2={limit:g}: the rendered "
+            f"star is not the star in these frames. {WHAT_TO_CHECK} For a companion as bright as "
+            "the star's halo, give fit=GaussNewton.nircam(companions=...). max_chi2=inf subtracts "
+            "whatever was fitted",
+            result,
+        )
+
+
+def reduced_chi2(result: Refinement) -> float:
+    """Chi-squared per degree of freedom, or per pixel where that is not known."""
+    reduced = float(result.reduced_chi2)
+    return reduced if math.isfinite(reduced) else float(result.chi2_per_pixel)
+
+
+def warn_of_status(name: str, result: Refinement) -> None:
+    """Say what to do about a fit that is usable but has not converged.
+
+    Warns
+    -----
+    DiffrenderWarning
+    """
+    advice = _ADVICE.get(result.status.name)
+    if advice is not None:
+        warnings.warn(
+            f"{name}: the fit ended as {result.status.name} (chi-squared per pixel "
+            f"{result.chi2_per_pixel:.3g}): {result.status.message}. What to do: {advice}. See "
+            "'Reading a status' in the documentation",
+            DiffrenderWarning,
+            stacklevel=2,
+        )

@@ -1,0 +1,172 @@
+"""The choice of the pattern of the model's error: of the library, of reference stars, or none."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.progress import stage
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.refinement.fitting import refine
+from pyklip_diffrender.refinement.library import known_systematics
+from pyklip_diffrender.refinement.registration import register
+from pyklip_diffrender.refinement.result import Refinement
+from pyklip_diffrender.refinement.settings import Adam, GaussNewton
+from pyklip_diffrender.refinement.systematics import Systematics
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.opd import OPDMap
+
+__all__ = ["PatternChoice", "PatternRequest", "choose_systematics", "require_request"]
+
+PatternRequest: TypeAlias = Systematics | Literal["auto", "references", "off"]
+
+_log = logging.getLogger(__name__)
+
+_KNOWN_MODEL_ERROR = 0.002
+"""Smallest model error, as a fraction of the star, where the pattern of the model's error is known
+from other stars: the pattern's own error is counted apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class PatternChoice:
+    """The pattern that a fit of the target uses, and what goes with it.
+
+    Attributes
+    ----------
+    science : tuple of Observation
+        Frames of the target, moved onto the pixels of the pattern where their files do not say
+        which pixels they have.
+    systematics : Systematics or None
+        The pattern.
+    settings : GaussNewton, Adam or None
+        Settings of the target's fit.
+    references : tuple of Refinement
+        One for each reference star that was fitted.
+    failed : tuple of (str, str)
+        Reference stars that could not be fitted, and why.
+    """
+
+    science: tuple[Observation, ...]
+    systematics: Systematics | None
+    settings: GaussNewton | Adam | None
+    references: tuple[Refinement, ...] = ()
+    failed: tuple[tuple[str, str], ...] = ()
+
+
+def require_request(systematics: object) -> None:
+    """Raise `IncompatibleSetupError` for what is no request for a pattern."""
+    if systematics not in ("auto", "references", "off") and not isinstance(
+        systematics, Systematics
+    ):
+        raise IncompatibleSetupError(
+            f"systematics: got {systematics!r}, expected 'auto', 'references', 'off' or a "
+            "Systematics"
+        )
+
+
+def choose_systematics(
+    science: Sequence[Observation],
+    references: Sequence[Observation],
+    model: OpticalSystem,
+    opd: OPDMap,
+    *,
+    systematics: PatternRequest = "auto",
+    settings: GaussNewton | Adam | None = None,
+    progress: bool = False,
+) -> PatternChoice:
+    """Choose the pattern of the model's error for a target.
+
+    Parameters
+    ----------
+    science : sequence of Observation
+        Frames of the target, as they will be fitted.
+    references : sequence of Observation
+        Frames of other stars.
+    model : OpticalSystem
+    opd : OPDMap
+        The wavefront to start from.
+    systematics : Systematics, "auto", "references" or "off"
+        "auto" takes the pattern of the library, and fits the references only where it has none;
+        "references" fits them in any case and uses both.
+    settings : GaussNewton or Adam, optional
+        Of the fits; default those of `refine`.
+    progress : bool
+        Show progress bars.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For another value of `systematics`.
+    DiffrenderError
+        If frames that must be moved cannot be fitted. A reference star that cannot be is left out.
+    """
+    require_request(systematics)
+    common: dict[str, Any] = {"settings": settings, "progress": progress}
+    fits: list[Refinement] = []
+    failed: list[tuple[str, str]] = []
+    pattern = systematics if isinstance(systematics, Systematics) else None
+    if systematics in ("auto", "references"):
+        first = science[0]
+        if systematics == "auto":
+            pattern = known_systematics(first)
+            if pattern is not None:
+                science, pattern = _registered(science, pattern, model, opd, common)
+        if pattern is None and references:
+            fits, failed = _fit_references(references, model, opd, common)
+            pattern = known_systematics(first, fits)
+        _log.info("pattern of the model's error: %s", pattern)
+    if pattern is not None and settings is None and science[0].is_nircam:
+        settings = GaussNewton.nircam(min_model_error=_KNOWN_MODEL_ERROR)
+    return PatternChoice(tuple(science), pattern, settings, tuple(fits), tuple(failed))
+
+
+def _fit_references(
+    references: Sequence[Observation],
+    model: OpticalSystem,
+    opd: OPDMap,
+    common: dict[str, Any],
+) -> tuple[list[Refinement], list[tuple[str, str]]]:
+    """One fit for every reference star; names of those that fail, and why."""
+    fits, failed = [], []
+    for star, frames in _by_star(references).items():
+        try:
+            with stage(f"1 of 4: reference star {star}"):
+                fits.append(refine(model, frames, opd, **common))
+        except DiffrenderError as error:
+            _log.warning("reference star %s is left out: %s", star, error)
+            failed.append((star, str(error)))
+    return fits, failed
+
+
+def _registered(
+    science: Sequence[Observation],
+    pattern: Systematics,
+    model: OpticalSystem,
+    opd: OPDMap,
+    common: dict[str, Any],
+) -> tuple[Sequence[Observation], Systematics | None]:
+    """The frames on the pixels of the library's pattern; no pattern if one frame is not."""
+    moved = []
+    for each in science:
+        frame: Observation | None = each
+        if each.first_pixel is None:
+            with stage(f"1 of 4: place of {each.name} on the detector"):
+                frame = register(refine(model, each, opd, **common), pattern)
+        if frame is None:
+            _log.warning(
+                "%s: the file does not say which pixels of the detector its frames show, and the "
+                "known pattern of the flat field is not seen in them; it is not used", each.name
+            )  # fmt: skip
+            return science, None
+        moved.append(frame)
+    return moved, pattern
+
+
+def _by_star(observations: Iterable[Observation]) -> dict[str, list[Observation]]:
+    stars: dict[str, list[Observation]] = {}
+    for each in observations:
+        stars.setdefault(each.target, []).append(each)
+    return stars

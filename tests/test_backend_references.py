@@ -1,0 +1,357 @@
+"""``algo="diffrender"`` with reference stars: which pattern is used, and from which frames."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from backend_scene import OPD, RIPPLE, calints, psf, render
+from pyklip.instruments import JWST
+from pyklip.instruments.JWST import JWSTData
+from pyklip.parallelized import klip_dataset
+
+from pyklip_diffrender.errors import (
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    MissingOPDError,
+)
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.pyklip_backend import (
+    DiffrenderSettings,
+    observation_from_dataset,
+    register,
+    unregister,
+)
+from pyklip_diffrender.pyklip_backend.frames import frames_of
+from pyklip_diffrender.pyklip_backend.references import References, pattern_for
+from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
+from pyklip_diffrender.scene.observation import Observation
+
+CARDS = {"SUBSTRT1": 492, "SUBSTRT2": 1502, "DETECTOR": "NRCALONG"}
+TARGET = {"TARGPROP": "TARGET", "IS_PSF": False, **CARDS}
+REFERENCE = {"TARGPROP": "REF", "IS_PSF": True, **CARDS}
+
+pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
+
+
+@pytest.fixture(autouse=True)
+def _registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    def refuse(**kw: Any) -> None:
+        raise OSError("offline")
+
+    monkeypatch.setattr(JWST.SvoFps, "get_filter_list", refuse)
+    register(opd=OPD, subtractor=render)
+    yield
+    unregister()
+
+
+@pytest.fixture
+def files(tmp_path: Path, rng: np.random.Generator) -> list[str]:
+    """Two rolls of the target and a reference star."""
+    paths = []
+    for k, (roll, cards) in enumerate(((0.0, TARGET), (10.0, TARGET), (0.0, REFERENCE))):
+        path = tmp_path / f"jw0118400{k}_calints.fits"
+        calints(path, rng, roll, **cards)
+        paths.append(str(path))
+    return paths
+
+
+def reduce(dataset: Any, folder: Path, **kw: Any) -> fits.Header:
+    folder.mkdir(exist_ok=True)
+    options = {
+        "mode": "ADI+RDI", "annuli": 1, "subsections": 1, "numbasis": [1], "movement": 0,
+        "numthreads": 1, "verbose": False, "algo": "diffrender", "psf_library": dataset.psflib,
+        **kw,
+    }  # fmt: skip
+    klip_dataset(dataset, outputdir=str(folder), fileprefix="x", **options)
+    return fits.getheader(folder / "x-KLmodes-all.fits")
+
+
+def gathered(dataset: Any) -> Any:
+    every = np.arange(len(dataset.input))
+    return frames_of(dataset, every, np.asarray(dataset.input), DiffrenderSettings())
+
+
+# Which frames are which
+
+
+def test_rolls_are_pointings_with_the_headers_of_their_files(files: list[str]) -> None:
+    frames = gathered(JWSTData(files[:2]))
+    assert [each.frames.tolist() for each in frames.pointings] == [[0, 1], [2, 3]]
+    assert [each.observation.position_angle for each in frames.pointings] == [0.0, 10.0]
+    for pointing, path in zip(frames.pointings, files, strict=False):
+        expected = Observation.from_fits(path)
+        observation = pointing.observation
+        assert (observation.target, observation.is_nircam) == ("TARGET", True)
+        assert observation.first_pixel == expected.first_pixel == (491, 1501)
+        assert observation.name.startswith(Path(path).name)
+        np.testing.assert_array_equal(observation.data[observation.valid],
+                                      expected.data[expected.valid])  # fmt: skip
+
+
+def test_reference_frames_in_the_dataset_stay_out_of_the_products(
+    files: list[str], tmp_path: Path
+) -> None:
+    dataset = JWSTData([files[2], files[0], files[1]])
+    with pytest.warns(DiffrenderWarning, match=r"2 of 6 frames .* reference star"):
+        frames = gathered(dataset)
+    assert [each.target for each in frames.references] == ["REF"]
+    assert frames.references[0].reference
+    assert [len(each) for each in frames.references] == [2]
+    np.testing.assert_array_equal(frames.usable, [False, False, True, True, True, True])
+    with pytest.warns(DiffrenderWarning, match="reference star"):
+        reduce(dataset, tmp_path / "out", mode="ADI")
+    shown = np.isfinite(dataset.output[0, :, 0]).any(axis=(1, 2))
+    np.testing.assert_array_equal(shown, frames.usable)
+
+
+def test_a_reference_star_may_be_the_target(files: list[str]) -> None:
+    frames = gathered(JWSTData(files[2:]))
+    assert frames.usable.all()
+    assert frames.references == ()
+
+
+def test_frames_that_spaceklip_shifted_are_put_back(
+    files: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = files[0]
+    with fits.open(path) as hdus:
+        # As spaceKLIP does, bad pixels are repaired before the frames are shifted.
+        hdus["SCI"].data[:, 30, 30] = hdus["SCI"].data[:, 30, 31]
+        shifts = np.array([[0.3, -0.4], [0.3, -0.4]])
+        hdus.append(fits.ImageHDU(shifts, name="IMSHIFTS"))
+        hdus.append(fits.ImageHDU(np.array([[0.1, 0.2], [0.1, 0.2]]), name="MASKOFFS"))
+        hdus.writeto(tmp_path / "aligned_calints.fits")
+    expected = Observation.from_fits(tmp_path / "aligned_calints.fits")
+    dataset = JWSTData([str(tmp_path / "aligned_calints.fits")])
+    assert caplog.text == ""
+    observation = observation_from_dataset(dataset)
+    np.testing.assert_allclose(observation.data, expected.data, rtol=1e-6, atol=1e-5)
+    np.testing.assert_array_equal(observation.valid, expected.valid)
+    np.testing.assert_allclose(observation.center, expected.center)
+    assert np.abs(observation.center - (20.7, 25.2)).max() > 0.2
+    (pointing,) = gathered(dataset).pointings
+    assert pointing.observation.first_pixel == expected.first_pixel
+    assert pointing.observation.star_offset == expected.star_offset
+    # The star is where the unshifted frame has it, so that none is left after the subtraction.
+    reduce(dataset, tmp_path, mode="ADI", psf_library=None, skip_derot=True)
+    assert np.nanmax(np.abs(dataset.output)) < 0.02 * 1000
+
+
+@pytest.mark.parametrize(
+    ("cards", "message"),
+    [
+        ({"FILTER": "F356W"}, "with FILTER F356W, the target with F444W"),
+        ({"CORONMSK": "MASKA430R"}, "with CORONMSK MASKA430R"),
+    ],
+)
+def test_references_of_another_set_up_are_refused(
+    cards: dict[str, Any], message: str, files: list[str], tmp_path: Path, rng: Any
+) -> None:
+    other = tmp_path / "other_calints.fits"
+    calints(other, rng, **{**REFERENCE, **cards})
+    dataset = JWSTData(files[:2], [files[2], str(other)])
+    with pytest.raises(IncompatibleSetupError, match=f"other_calints.fits was taken {message}"):
+        reduce(dataset, tmp_path / "out")
+    # A library that the call does not use does not matter.
+    reduce(dataset, tmp_path / "out", mode="ADI")
+    badfile = np.array([str(name).startswith("other") for name in dataset.psflib.master_filenames])
+    dataset.psflib.prepare_library(dataset, badfiles=badfile)
+    reduce(dataset, tmp_path / "out")
+
+
+def test_the_files_of_the_library_reach_the_fit(
+    files: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    seen: list[References] = []
+
+    def subtract(observation: Any, opd: Any, settings: Any, **context: Any) -> Any:
+        seen.append(context["references"])
+        context["tell"]("at work")
+        subtraction = render(observation, opd, settings)
+        return replace(subtraction, systematics="references (REF)", references=2)
+
+    monkeypatch.setattr(
+        "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
+    )
+    unregister()
+    register(opd=OPD)
+    dataset = copy.deepcopy(JWSTData(files[:2], files[2:]))
+    header = reduce(dataset, tmp_path / "out")
+    assert [path.name for path in seen[0].files] == [Path(files[2]).name]
+    (cut,) = seen[0].cut((20, 20), frame("TARGET"))
+    assert (cut.target, cut.shape, cut.reference) == ("REF", (20, 20), True)
+    # A star's own planets would become part of the pattern.
+    assert seen[0].cut((20, 20), frame("ref")) == []
+    assert (header["DRSYST"], header["DRREFS"]) == ("references (REF)", 2)
+    assert "at work" not in capsys.readouterr().out
+    reduce(dataset, tmp_path / "out", mode="ADI", verbose=True)
+    assert seen[1] is None
+    assert "diffrender: at work\n" in capsys.readouterr().out
+
+
+# Which pattern is used
+
+
+def frame(target: str, **details: Any) -> Observation:
+    header = fits.Header({"TARGPROP": target, "INSTRUME": "NIRCAM"})
+    light = 1000 * psf(15.5, 15.5, (32, 32))
+    return Observation.from_arrays(
+        [light, light], np.ones((2, 32, 32)), pixelscale=0.0624, filter="F444W", name=target,
+        header=header, first_pixel=(0, 0), **details,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("requested", "library", "fitted", "label", "used"),
+    [
+        (None, True, [], "library (OTHER)", 0),
+        ("auto", True, [], "library (OTHER)", 0),
+        ("auto", False, ["REF"], "references (REF)", 4),
+        ("references", True, ["REF"], "references (REF), library (OTHER)", 4),
+        ("off", True, [], "none", 0),
+        ("mine", True, [], "given (mine)", 0),
+    ],
+)
+def test_which_pattern_is_used(
+    requested: Any, library: bool, fitted: list[str], label: str, used: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    stars: list[str] = []
+
+    def refine(model: Any, frames: Any, opd: Any, **options: Any) -> Any:
+        stars.append(frames[0].target)
+        return SimpleNamespace(frames=[SimpleNamespace(observation=each) for each in frames])
+
+    def known(observation: Observation, references: Any = ()) -> Systematics | None:
+        names = ["REF"] * bool(references) + ["OTHER"] * library
+        flat = np.zeros(observation.shape)
+        made = Systematics(flat, flat + 0.1, (15.5, 15.5), 0.1, provenance={"stars": names})
+        return made if names else None
+
+    choosing = "pyklip_diffrender.refinement.pattern_choice"
+    monkeypatch.setattr(f"{choosing}.refine", refine)
+    monkeypatch.setattr(f"{choosing}.known_systematics", known)
+    zeros = np.zeros((32, 32))
+    mine = Systematics(zeros, zeros, (15.5, 15.5), 0.1, name="mine")
+    settings = DiffrenderSettings(systematics=mine if requested == "mine" else requested)
+    references = References(frames=(frame("REF"), frame("REF")))
+    model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
+    told: list[str] = []
+    chosen = pattern_for([frame("TARGET")], references, model, OPD, settings, told.append)
+    assert stars == fitted
+    assert (chosen.label, chosen.reference_frames) == (label, used)
+    assert (chosen.systematics is None) == (label == "none")
+    assert told == [
+        "fitting the reference stars" if fitted else "the reference frames are not needed"
+    ]
+    if label != "none":
+        # The pattern's own error takes the place of most of the model's.
+        assert chosen.settings == GaussNewton.nircam(min_model_error=0.002)
+
+
+def test_references_that_are_asked_for_must_be_there() -> None:
+    model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
+    settings = DiffrenderSettings(systematics="references")
+    with pytest.raises(IncompatibleSetupError, match=r"psflib_filepaths after register\(\)"):
+        pattern_for([frame("TARGET")], References(), model, OPD, settings, print)
+
+
+def test_simulations_and_the_adam_recipe_use_no_pattern_by_default() -> None:
+    model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
+    simulated = replace(frame("TARGET"), header=fits.Header())
+    for science, fit in ((simulated, None), (frame("TARGET"), Adam())):
+        settings = DiffrenderSettings(fit=fit)
+        chosen = pattern_for([science], References(), model, OPD, settings, print)
+        assert (chosen.systematics, chosen.settings, chosen.label) == (None, fit, "none")
+
+
+# Which wavefront map is used
+
+
+@pytest.fixture
+def maps(tmp_path: Path) -> Path:
+    """Two dated maps, 49 hours before and 47 hours after the frames."""
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    for date in ("2022-07-28", "2022-08-01"):
+        cards = fits.Header({"BUNIT": "m", "DATE-OBS": f"{date}T00:00:00"})
+        fits.PrimaryHDU(RIPPLE, cards).writeto(folder / f"map_{date}.fits")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("opd", "date", "hours"),
+    [
+        ("folder", "2022-08-01", 46.966),
+        (None, "2022-08-01", 46.966),
+        ("closest", "2022-08-01", 46.966),
+        ("after", "2022-08-01", 46.966),
+        ("before", "2022-07-28", -49.034),
+    ],
+)
+def test_the_map_of_a_folder_is_chosen_by_the_date(
+    opd: str | None, date: str, hours: float, maps: Path, files: list[str], tmp_path: Path
+) -> None:
+    unregister()
+    options: dict[str, Any] = {"opd": maps} if opd == "folder" else {"opd": opd, "opd_folder": maps}
+    register(subtractor=render, **options)
+    header = reduce(JWSTData(files[:2]), tmp_path / "out", mode="ADI")
+    assert header["DROPD"] == header["DROPDNAM"] == f"map_{date}.fits"
+    assert header["DROPDDAT"].startswith(date)
+    assert header["DROPDHRS"] == pytest.approx(hours, abs=0.001)
+
+
+def test_a_map_needs_a_folder_and_the_frames_a_date(
+    maps: Path, files: list[str], tmp_path: Path
+) -> None:
+    unregister()
+    undated = JWSTData(files[:2])
+    register(opd="closest", subtractor=render)
+    with pytest.raises(MissingOPDError, match="as opd_folder"):
+        reduce(undated, tmp_path / "out", mode="ADI")
+    register(opd_folder=maps)
+    with pytest.raises(IncompatibleSetupError, match=r"after register\(\).*DATE-BEG"):
+        reduce(undated, tmp_path / "out", mode="ADI")
+
+
+# What is checked before a fit
+
+
+@pytest.mark.parametrize(
+    ("settings", "call", "message"),
+    [
+        ({}, {"calibrate_flux": True}, "JWSTData has no flux calibration"),
+        ({"model_options": {"npx": 64}}, {}, "npx: not known to nircam_coronagraph"),
+        ({"systematics": "maybe"}, {}, "'maybe', expected 'auto', 'references'"),
+        ({"max_chi2": -1.0}, {}, "max_chi2: got -1.0"),
+        ({"keep_detected": True, "fit": Adam()}, {}, "no linear model"),
+        ({"model": {4.0: "a"}}, {}, "none for wavelength"),
+    ],
+)
+def test_mistakes_are_found_before_the_fit(
+    settings: dict[str, Any], call: dict[str, Any], message: str, files: list[str],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    def subtract(*args: Any, **kw: Any) -> None:
+        raise AssertionError("fitted for nothing")
+
+    monkeypatch.setattr(
+        "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
+    )
+    unregister()
+    register(opd=OPD, **settings)
+    dataset = JWSTData(files[:2])
+    before = dict(vars(dataset))
+    with pytest.raises(IncompatibleSetupError, match=message):
+        reduce(dataset, tmp_path / "out", mode="ADI", **call)
+    assert vars(dataset) == before
+    assert list((tmp_path / "out").iterdir()) == []

@@ -1,0 +1,198 @@
+"""Choosing a wavefront map by its date."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.time import Time
+from stpsf_data import wss_file
+
+from pyklip_diffrender import reduction
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    MissingOPDError,
+    RefinementError,
+)
+from pyklip_diffrender.io.headers import sensing_date
+from pyklip_diffrender.optics.grid import resample
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.wavefront.map_choice import choose_map, wavefront_for
+from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, read_opd
+
+NPIX = 64
+
+# Kept without stpsf's data, which is not the subject here.
+pytestmark = pytest.mark.filterwarnings("ignore:.*what the sensing camera saw")
+
+
+def write_map(path: Path, seed: int, npix: int = NPIX, **cards: str | bool) -> Path:
+    hdu = fits.PrimaryHDU(random_opd(seed, npix=npix).data * 1e9)
+    hdu.header["BUNIT"] = "nm"
+    hdu.header.update({key.replace("_", "-"): value for key, value in cards.items()})
+    hdu.writeto(path)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def without_stpsf_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("STPSF_PATH", raising=False)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Maps of 1 August (header), 11 August (a file of MAST) and 21 August (file name)."""
+    maps = tmp_path_factory.mktemp("maps")
+    write_map(maps / "first.fits.gz", 1, DATE_OBS="2022-08-01", TIME_OBS="12:00:00")
+    wss_file(maps / "R2022081102-NRCA3_FP1-1.fits", date="2022-08-11T12:00:00")
+    write_map(maps / "opd_2022-08-21.fits", 3)
+    return maps
+
+
+@pytest.mark.parametrize(
+    ("date", "rule", "name", "note"),
+    [
+        ("2022-08-05", "nearest", "first.fits.gz", "3.5 days before"),
+        ("2022-08-07", "nearest", "R2022081102-NRCA3_FP1-1.fits", "4.5 days after"),
+        ("2022-08-10T12:00", "before", "first.fits.gz", "9.0 days before"),
+        ("2022-08-12", "after", "opd_2022-08-21.fits", "9.0 days after"),
+        ("2022-08-21", "before", "opd_2022-08-21.fits", "0.0 days"),
+        ("2022-08-21", "interpolate", "opd_2022-08-21.fits", "0.0 days"),
+        ("2022-10-21", "nearest", "opd_2022-08-21.fits", "61.0 days before"),
+    ],
+)
+def test_the_rule_decides(folder: Path, date: str, rule: str, name: str, note: str) -> None:
+    opd = choose_map(folder, date, rule)  # type: ignore[arg-type]
+    assert opd.name == name
+    assert np.array_equal(opd.data, read_opd(folder / name).data)
+    assert note in opd.history[-1]
+    assert "of 3 maps" in opd.history[-1]
+    assert opd.days_after(date) == pytest.approx((opd.date - Time(date)).to_value("day"))
+
+
+def test_interpolation_is_linear_in_time_at_the_finer_sampling(tmp_path: Path) -> None:
+    ends = [
+        write_map(tmp_path / "a_2022-08-01.fits", 1, npix=32),
+        write_map(tmp_path / "b_2022-08-11.fits", 2, npix=64),
+    ]
+    with pytest.warns(DiffrenderWarning, match=r"interpolation, 80% of a_2022-08-01\.fits"):
+        opd = choose_map(tmp_path, "2022-08-03", "interpolate")
+    first, second = (read_opd(path).data for path in ends)
+    np.testing.assert_allclose(opd.data, 0.8 * resample(first, 64) + 0.2 * second, atol=1e-18)
+    assert opd.date == Time("2022-08-03")
+    assert "2.0 days before" in opd.history[-1]
+    assert "8.0 days after" in opd.history[-1]
+
+
+@pytest.mark.parametrize(
+    ("date", "rule", "side"),
+    [
+        ("2022-07-01", "before", "before"),
+        ("2022-09-01", "after", "after"),
+        ("2022-09-01", "interpolate", "after"),
+    ],
+)
+def test_no_map_on_that_side(folder: Path, date: str, rule: str, side: str) -> None:
+    with pytest.raises(MissingOPDError, match=rf"{side} {date}.*2022-08-01 to 2022-08-21"):
+        choose_map(folder, date, rule)  # type: ignore[arg-type]
+
+
+def test_other_files_are_skipped_and_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path
+    write_map(folder / "first.fits", 1, DATE_OBS="2022-08-01", TIME_OBS="12:00:00")
+    write_map(folder / "undated.fits", 4)
+    write_map(folder / "frames_2022-08-05.fits", 5, BUNIT="MJy/sr")
+    fits.PrimaryHDU(np.ones((3, 8, 8))).writeto(folder / "cube_2022-08-05.fits")
+    (folder / "cut_2022-08-05.fits").write_bytes((folder / "first.fits").read_bytes()[:3000])
+    (folder / "notes_2022-08-05.txt").write_text("nothing")
+    with caplog.at_level(logging.INFO):
+        assert choose_map(folder, "2022-08-05").name == "first.fits"
+    for name, reason in {
+        "undated.fits": "no date",
+        "frames_2022-08-05.fits": "BUNIT is 'MJy/sr'",
+        "cube_2022-08-05.fits": "no square image",
+        "cut_2022-08-05.fits": "not a complete FITS file",
+    }.items():
+        line = next(record for record in caplog.records if record.args[0] == name)  # type: ignore[index]
+        assert reason in line.getMessage()
+    assert "notes" not in caplog.text
+
+
+def test_without_any_map_it_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(MissingOPDError, match=r"none of its 0 FITS files"):
+        choose_map(tmp_path, "2022-08-05")
+    write_map(tmp_path / "undated.fits", 4)
+    with pytest.raises(MissingOPDError, match=r"none of its 1 FITS files.*DATE-OBS"):
+        choose_map(tmp_path, "2022-08-05")
+    with pytest.raises(MissingOPDError, match="no such folder"):
+        choose_map(tmp_path / "nowhere", "2022-08-05")
+    with pytest.raises(IncompatibleSetupError, match=r"'closest', expected one of nearest"):
+        choose_map(tmp_path, "2022-08-05", "closest")  # type: ignore[arg-type]
+
+
+def test_a_map_of_another_epoch_is_a_warning_with_the_days(folder: Path) -> None:
+    with pytest.warns(DiffrenderWarning, match=r"opd_2022-08-21\.fits.* 223 days before the frame"):
+        choose_map(folder, "2023-04-01")
+    path = folder / "opd_2022-08-21.fits"
+    with pytest.warns(DiffrenderWarning, match=r" 232 days after the frames of 2022-01-01"):
+        wavefront_for(path, Time("2022-01-01"))
+    assert wavefront_for(path, Time("2022-08-01")).name == path.name
+
+
+def test_a_folder_needs_the_date_of_the_frames(folder: Path) -> None:
+    assert wavefront_for(folder, Time("2022-08-01")).name == "first.fits.gz"
+    with pytest.raises(IncompatibleSetupError, match="the frames have no date"):
+        wavefront_for(folder, None)
+    with pytest.raises(CorruptFileError, match=r"is a folder.*choose_map"):
+        read_opd(folder)
+
+
+def test_reduce_takes_the_nearest_map_of_a_folder(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen: list[str] = []
+
+    def stop(model: None, frames: object, opd: OPDMap, **_: object) -> None:
+        chosen.append(opd.name)
+        raise RefinementError("that is all")
+
+    monkeypatch.setattr(reduction, "model_for", lambda *_, **__: None)
+    monkeypatch.setattr(reduction, "refine", stop)
+    frames = tuple(
+        Observation.from_arrays(
+            np.ones((8, 8)), np.ones((8, 8)), pixelscale=0.06, date=Time(f"2022-08-{day}")
+        )
+        for day in ("10", "18")
+    )
+    sequence = Sequence("star", frames)
+    assert sequence.date == Time("2022-08-14")
+    with pytest.raises(RefinementError, match="that is all"):
+        reduction.reduce(sequence, folder, size=8, systematics="off")
+    assert chosen == ["R2022081102-NRCA3_FP1-1.fits"]
+
+
+@pytest.mark.parametrize(
+    ("cards", "name", "expected"),
+    [
+        ({"DATE-OBS": "2022-08-11", "TIME-OBS": "02:00:00"}, "x", "2022-08-11T02:00:00"),
+        ({"DATE-OBS": "2022-08-11T03:00:00", "TIME-OBS": "02:00"}, "x", "2022-08-11T03:00:00"),
+        ({"DATE-BEG": "2022-08-11T04:00:00"}, "opd_2022-08-14", "2022-08-11T04:00:00"),
+        ({}, "opd_2022-08-14.fits.gz", "2022-08-14T00:00:00"),
+        ({}, "R2022081402-NRCA3_FP1-1.fits", "2022-08-14T00:00:00"),
+        ({}, "opd_20220814.fits", "2022-08-14T00:00:00"),
+        ({}, "jw0120220814.fits", None),
+        ({}, "opd_2022-19-39.fits", None),
+        ({}, "opd.fits", None),
+    ],
+)
+def test_dates_of_maps(cards: dict[str, str], name: str, expected: str | None) -> None:
+    date = sensing_date(fits.Header(cards), name)
+    assert (date and date.isot[:19]) == expected

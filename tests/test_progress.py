@@ -1,0 +1,70 @@
+"""Progress: what a terminal shows, and what goes to the log."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from pyklip_diffrender.io import progress
+from pyklip_diffrender.io.progress import ProgressBar, stage
+
+
+def last_shown(text: str) -> str:
+    return [line for line in text.replace("\n", "\r").split("\r") if line.strip()][-1]
+
+
+def test_a_bar_shows_the_stage_and_what_the_fit_has_reached(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with stage("2 of 4: wavefront"), ProgressBar("wavefront", shown=True) as bar:
+        bar.update(chi2=4.123)
+        bar._bar.refresh()
+        shown = last_shown(capsys.readouterr().err)
+        assert shown.startswith("2 of 4: wavefront, chi2 4.12, step 1 [00:0")
+        # A bar inside takes no line of its own.
+        with ProgressBar("response", 10, shown=True) as inner:
+            inner.update(10)
+        assert "response" not in capsys.readouterr().err
+    with ProgressBar("S/N map", 10, shown=True) as bar:
+        bar.update(5)
+        bar._bar.refresh()
+        assert last_shown(capsys.readouterr().err).startswith("S/N map:  50 % [00:0")
+
+
+def test_a_hidden_bar_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with ProgressBar("S/N map", 10, shown=False) as bar:
+        bar.update(10)
+    shown = capsys.readouterr()
+    assert (shown.out, shown.err) == ("", "")
+
+
+def test_the_log_gets_stages_and_at_most_a_line_a_minute(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 1000.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    with (
+        caplog.at_level(logging.INFO),
+        stage("2 of 4: wavefront"),
+        ProgressBar("x", shown=False) as bar,
+    ):
+        for _ in range(9):
+            now += 20.0
+            bar.update(chi2=3.0)
+            with ProgressBar("inside", 3, shown=False) as inner:
+                now += 1e-3
+                inner.update()
+    assert [record.getMessage() for record in caplog.records] == [
+        "2 of 4: wavefront",
+        "2 of 4: wavefront, chi2 3, step 3",
+        "2 of 4: wavefront, chi2 3, step 6",
+        "2 of 4: wavefront, chi2 3, step 9",
+    ]
+
+
+def test_a_stage_ends_with_its_block_even_when_it_fails() -> None:
+    with pytest.raises(ValueError, match="no"), stage("1 of 4: frames"):
+        raise ValueError("no")
+    with ProgressBar("S/N map", shown=False) as bar:
+        assert bar._name == "S/N map"

@@ -1,0 +1,287 @@
+"""Quantities: every length, angle, time, flux and temperature takes one in any unit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.errors import (
+    DiffrenderError,
+    IncompatibleSetupError,
+    NonFiniteError,
+    ShapeError,
+    UnitError,
+)
+from pyklip_diffrender.io.units import to_number, to_pair
+from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.wavefront.bases import SegmentMotions
+from pyklip_diffrender.wavefront.opd import as_opd_map, random_drift
+
+OPD = dr.random_opd(1, npix=64).data
+
+
+def coronagraph(**arguments: Any) -> Any:
+    """Image of the model, and what it is made of."""
+    small = {"npix": 64, "fov_pixels": 6, "nlambda": 2, "filter": "F444W"}
+    if "fov_arcsec" in arguments:
+        del small["fov_pixels"]
+    model = dr.nircam_coronagraph(**small | arguments)  # type: ignore[arg-type]
+    with torch.no_grad():
+        return model(star_offset=(0.05, 0.02)).numpy()
+
+
+def observation(**details: Any) -> Any:
+    made = dr.Observation.from_arrays(
+        np.ones((2, 4, 4)), np.ones((2, 4, 4)), **{"pixelscale": 0.06} | details
+    )
+    return [made.pixelscale, made.star_offset, made.position_angles]
+
+
+def problem(**start: Any) -> Any:
+    """Starting values of a fit."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=64, fov_pixels=6)
+    ones = np.ones((6, 6))
+    frames = dr.Observation.from_arrays(
+        ones, ones, unit="MJy/sr", pixelscale=model.detector.pixelscale
+    )
+    made = Problem(model, frames, as_opd_map(OPD), start)
+    optical = [value.tolist() for value in made.optical_start(()).values()]
+    return [optical, made.start.get("flux"), made.start.get("background")]
+
+
+def prior(**arguments: Any) -> Any:
+    learned = dr.learn_prior(
+        arguments["maps"], SegmentMotions(), npix=32, diameter=arguments["diameter"]
+    )
+    return sorted(learned.scales.values())
+
+
+@dataclass
+class Case:
+    """A call with Quantities, and the numbers that they are in the units of the interface."""
+
+    call: Callable[..., Any]
+    quantities: dict[str, Any]
+    numbers: dict[str, Any]
+
+
+CASES = {
+    "Planet": Case(
+        dr.Planet,
+        {"contrast": 1e-4 * u.percent, "separation": 600 * u.mas, "position_angle": 0.5 * u.rad},
+        {"contrast": 1e-6, "separation": 0.6, "position_angle": math.degrees(0.5)},
+    ),
+    "Planet.from_offset": Case(
+        lambda **given: dr.Planet.from_offset(1e-6, **given),
+        {"x": -300 * u.mas, "y": 0.01 * u.arcmin},
+        {"x": -0.3, "y": 0.6},
+    ),
+    "Planet.rotated": Case(dr.Planet(1e-6, 0.6).rotated, {"angle": 6 * u.arcmin}, {"angle": 0.1}),
+    "Star": Case(
+        dr.Star,
+        {
+            "w2_magnitude": 4 * u.mag,
+            "exposure": 2 * u.h,
+            "zero_point": 184100 * u.mJy,
+            "pixel_area": 0.004 * u.arcsec**2,
+            "gain": 1.8 * u.electron / u.ct,
+        },
+        {
+            "w2_magnitude": 4,
+            "exposure": 7200.0,
+            "zero_point": 184.1,
+            "pixel_area": 0.004 * (math.pi / 648000) ** 2,
+            "gain": 1.8,
+        },
+    ),
+    "Scene": Case(
+        dr.Scene,
+        {"star_offset": [5, -20] * u.mas, "read_noise": 9 * u.photon, "background": 2 * u.photon},
+        {"star_offset": (0.005, -0.02), "read_noise": 9, "background": 2},
+    ),
+    "nircam_coronagraph, one wavelength": Case(
+        coronagraph,
+        {
+            "monochromatic": 4.5 * u.um,
+            "pixelscale": 63 * u.mas,
+            "segment_gap": 7 * u.mm,
+            "chromatic_reference": 3350 * u.nm,
+            "si_wfe": np.linspace(-9, 9, 36) * u.nm,
+        },
+        {
+            "monochromatic": 4.5e-6,
+            "pixelscale": 0.063,
+            "segment_gap": 0.007,
+            "chromatic_reference": 3.35e-6,
+            "si_wfe": np.linspace(-9e-9, 9e-9, 36),
+        },
+    ),
+    "nircam_coronagraph, field and source": Case(
+        coronagraph,
+        {"fov_arcsec": 400 * u.mas, "pixelscale": [62, 63] * u.mas, "source": 4 * u.kK},
+        {"fov_arcsec": 0.4, "pixelscale": (0.062, 0.063), "source": 4000},
+    ),
+    "nircam_coronagraph, spectrum": Case(
+        coronagraph,
+        {"source": ([3, 4, 6] * u.um, [1e4, 3e4, 2e4] * u.photon / u.s / u.cm**2 / u.m)},
+        {"source": ([3e-6, 4e-6, 6e-6], [1, 3, 2])},
+    ),
+    "drift": Case(
+        lambda **given: dr.drift(OPD, 2 * OPD, **given),
+        {"hours": 1 * u.day, "interval": 1 * u.week},
+        {"hours": 24, "interval": 168},
+    ),
+    "drift, maps": Case(
+        lambda **given: dr.drift(**given, hours=3),
+        {"before": OPD * 1e9 * u.nm, "after": OPD * 2e6 * u.um},
+        {"before": OPD, "after": 2 * OPD},
+    ),
+    "random_opd": Case(
+        lambda rms: dr.random_opd(1, npix=32, rms=rms).data, {"rms": 50 * u.nm}, {"rms": 5e-8}
+    ),
+    "random_drift": Case(
+        lambda hours: random_drift(1, hours, npix=32).data,
+        {"hours": 90 * u.min},
+        {"hours": 1.5},
+    ),
+    "learn_prior": Case(
+        prior,
+        {"maps": [OPD * 0 * u.m, OPD * 1e9 * u.nm], "diameter": 660 * u.cm},
+        {"maps": [OPD * 0, OPD], "diameter": 6.6},
+    ),
+    "WavefrontPrior": Case(
+        dr.WavefrontPrior,
+        {"scales": {"segment": 4e-9 * u.m, "texture": 1e-4 * u.um}, "amplitude_scale": 2 * u.nm},
+        {"scales": {"segment": 4.0, "texture": 0.1}, "amplitude_scale": 2.0},
+    ),
+    "GaussNewton": Case(
+        lambda **given: dr.GaussNewton(deviations=given).deviations,
+        {"star_offset": 3 * u.mas, "lyot_rotation": 12 * u.arcmin, "flux": 5 * u.percent},
+        {"star_offset": 0.003, "lyot_rotation": 0.2, "flux": 0.05},
+    ),
+    "Adam": Case(dr.Adam, {"learning_rate": 10 * u.pm}, {"learning_rate": 1e-11}),
+    "Observation": Case(
+        observation,
+        {
+            "pixelscale": [62, 63] * u.mas,
+            "star_offset": [10, -20] * u.mas,
+            "position_angles": [0.5, 0.6] * u.rad,
+        },
+        {
+            "pixelscale": (0.062, 0.063),
+            "star_offset": (0.01, -0.02),
+            "position_angles": np.degrees([0.5, 0.6]),
+        },
+    ),
+    "refine, start": Case(
+        problem,
+        {
+            "star_offset": [10, -20] * u.mas,
+            "lyot_rotation": 6 * u.arcmin,
+            "flux": 2e6 * u.Jy / u.sr,
+            "background": 3e3 * u.Jy / u.sr,
+        },
+        {"star_offset": (0.01, -0.02), "lyot_rotation": 0.1, "flux": 2.0, "background": 0.003},
+    ),
+}
+
+
+def plain(value: Any) -> Any:
+    """Numbers inside dataclasses and lists, for a comparison."""
+    if hasattr(value, "__dataclass_fields__"):
+        return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__}
+    if isinstance(value, dict):
+        return {key: plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    return value
+
+
+def assert_same(got: Any, expected: Any) -> None:
+    if isinstance(expected, dict):
+        assert got.keys() == expected.keys()
+        for key in expected:
+            assert_same(got[key], expected[key])
+    elif isinstance(expected, list):
+        assert len(got) == len(expected)
+        for one, other in zip(got, expected, strict=True):
+            assert_same(one, other)
+    elif isinstance(expected, float | int | np.ndarray) and not isinstance(expected, bool):
+        assert not isinstance(got, u.Quantity)
+        np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-30)
+    else:
+        assert got == expected
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_quantity_is_the_number_in_the_unit_of_the_interface(name: str) -> None:
+    case = CASES[name]
+    assert_same(plain(case.call(**case.quantities)), plain(case.call(**case.numbers)))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_another_dimension_is_refused_by_name(name: str) -> None:
+    """One argument after the other in a unit that no argument has."""
+    case = CASES[name]
+    for key, value in case.quantities.items():
+        wrong: Any = 1 * u.K if key != "source" else 1 * u.m
+        if key == "maps":
+            wrong = [OPD * u.K, OPD * u.K]
+        elif isinstance(value, dict):
+            wrong = dict.fromkeys(value, wrong)
+        elif isinstance(value, tuple):
+            wrong = (value[0], value[0])
+        elif isinstance(value, u.Quantity) and value.shape:
+            wrong = value.value * u.K
+        with pytest.raises(UnitError, match=key):
+            case.call(**{**case.numbers, key: wrong})
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: dr.Planet(-1e-6, 0.6), r"contrast: got -1e-06, expected 0 or more"),
+        (lambda: dr.Planet(1e-6, -600 * u.mas), r"separation: got -0.6 arcsec, expected 0 or"),
+        (lambda: dr.Planet(math.nan, 0.6), r"contrast: got nan, expected a finite number"),
+        (lambda: dr.Star(exposure=0), r"exposure: got 0 s, expected a positive number"),
+        (lambda: dr.Scene(read_noise=-1), r"read_noise: got -1 ph, expected 0 or more"),
+        (lambda: dr.nircam_coronagraph(pixelscale=-0.06), r"pixelscale: got -0.06 arcsec"),
+        (lambda: dr.nircam_coronagraph(fov_arcsec=0), r"fov_arcsec: got 0 arcsec"),
+        (lambda: dr.nircam_coronagraph(source=-5 * u.K), r"source: got -5 K"),
+        (lambda: dr.reduce("nowhere", OPD, threshold=-5), r"threshold: got -5, expected a pos"),
+        (lambda: dr.reduce("nowhere", OPD, threshold=0), r"threshold: got 0, expected a pos"),
+        (lambda: dr.WavefrontPrior({"segment": -4}), r"scales: segment: got -4 nm"),
+        (lambda: dr.Adam(learning_rate=-1e-11), r"learning_rate: got -1e-11 m"),
+        (lambda: dr.drift(OPD, OPD, 3, interval=0), r"interval: got 0 h"),
+    ],
+)
+def test_values_out_of_bounds_say_what_was_got_and_expected(
+    call: Callable[[], Any], words: str
+) -> None:
+    with pytest.raises(DiffrenderError, match=words) as caught:
+        call()
+    assert isinstance(caught.value, ValueError)
+
+
+def test_single_numbers_and_pairs() -> None:
+    assert to_number(np.array([3.0]), u.m, "x") == 3.0
+    assert to_pair(3 * u.mas, u.arcsec, "x") == (0.003, 0.003)
+    assert to_pair([3 * u.mas, 1 * u.arcsec], u.mas, "x") == pytest.approx((3.0, 1000.0))
+    with pytest.raises(ShapeError, match=r"x: got shape \(2,\), expected a single number"):
+        to_number([1, 2], u.m, "x")
+    with pytest.raises(ShapeError, match=r"x: got 'far', expected a number"):
+        to_number("far", u.m, "x")
+    with pytest.raises(ShapeError, match=r"x: got shape \(3,\), expected one number or two"):
+        to_pair([1, 2, 3], u.m, "x")
+    with pytest.raises(NonFiniteError, match="inf"):
+        to_number(math.inf, u.m, "x")
+    with pytest.raises(IncompatibleSetupError, match="x: got 0 m, expected a positive number"):
+        to_number(0, u.m, "x", "positive")
