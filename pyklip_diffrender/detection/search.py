@@ -21,8 +21,9 @@ from pyklip_diffrender.detection.field import (
 )
 from pyklip_diffrender.detection.groups import Group, groups_of, weigh
 from pyklip_diffrender.detection.maps import Maps
+from pyklip_diffrender.detection.measurement import contrasts_at
 from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
-from pyklip_diffrender.detection.result import Detection, contrasts_at
+from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, to_arcsec
 from pyklip_diffrender.refinement import Refinement

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.instrument.jwst import maskrnd_openings
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
-from pyklip_diffrender.plotting.panels import INK, draw_image
+from pyklip_diffrender.plotting.panels import INK, draw_image, extent_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -144,11 +144,8 @@ def draw_detection(found: Detection) -> Figure:
 
     figure = Figure(figsize=(18.5, 4.4), layout="constrained")
     frame, left, middle, right = figure.subplots(1, 4)
-    noise = found.fits[0].frames[0].observation.combined().error[0]
-    (x0, y0), (x1, y1) = found.grid[0, 0], found.grid[-1, -1]
-    pixel = found.fits[0].model.detector.pixelscale
-    extent = (x0 - pixel[0] / 2, x1 + pixel[0] / 2, y0 - pixel[1] / 2, y1 + pixel[1] / 2)
-    table = found.table
+    noise = found.observation.combined().error[0]
+    extent, table = extent_of(found.grid[0, :, 0], found.grid[:, 0, 1]), found.table
     above = f"{len(table)} above {found.threshold:g}"
     for ax, image, title, label in (
         (frame, found.subtracted[0] / noise, "First frame less the star", "light / noise"),

@@ -148,7 +148,7 @@ def plot_detection(found: Detection, ax: Any = None) -> NDArray[Any]:
     label_sky(left)
     places = np.stack([table["x"].value, table["y"].value], axis=1)
     mark(left, places, [f"S/N {snr:.1f}" for snr in table["snr"]])
-    if found.fits[0].frames[0].observation.position_angles is not None:
+    if found.observation.position_angles is not None:
         draw_compass(left, found.north)
 
     curve = found.contrast_curve
