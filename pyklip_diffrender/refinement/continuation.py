@@ -95,8 +95,9 @@ def fit_with_growing_basis(
     progress : bool
         Show progress bars.
     """
+    pupil = problems[0].model.entrance
     if settings.basis is not None or not settings.cycles:
-        basis = settings.basis or default_basis()
+        basis = settings.basis or default_basis(pupil=pupil)
         return Annealing(problems, settings, basis, warm, progress).run(seed)
     # With an assumed model error the residual need not be missing modes. The number of modes that
     # drift is fixed.
@@ -109,7 +110,7 @@ def fit_with_growing_basis(
             _log.info("residuals have structure: adding modes up to %g cycles per pupil", cycles)
             chosen, warm = continue_from(fit, cycles=settings.cycles[k:])
         earlier = fit
-        fit = Annealing(problems, chosen, default_basis(cycles), warm, progress).run(seed)
+        fit = Annealing(problems, chosen, default_basis(cycles, pupil), warm, progress).run(seed)
         if earlier is not None:
             fit = replace(
                 fit,

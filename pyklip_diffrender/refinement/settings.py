@@ -35,7 +35,8 @@ class GaussNewton:
         Highest spatial frequencies of the default basis, in cycles across the pupil. The first
         one is fitted; the next one is tried while the data are not explained.
     basis : Basis, optional
-        Wavefront modes, in place of the default basis (segment motions and Fourier modes).
+        Wavefront modes, in place of the default basis: Fourier modes and, for JWST, the motions of
+        its segments.
     deviations : mapping of str to float
         Prior standard deviations of free parameters about their starting values, where they
         differ from those of the parameter table. That of "flux" is relative, and takes a starting
