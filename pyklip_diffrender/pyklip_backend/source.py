@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import merged_header
-from pyklip_diffrender.scene.observation import BAD_PIXEL_BITS
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
 
 __all__ = ["ATTRIBUTE", "SourceFrames", "keeping_source", "read_source"]
 
