@@ -78,8 +78,8 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
         arguments["first_pixel"] = first_pixel(header, np.zeros(2, dtype=np.int64), path.name)
     if mask is not None:
         # Position of the mask from the star, in pixels, for every integration.
-        away = -native_float64(mask).reshape(-1, 2).mean(axis=0) * arguments["pixelscale"]
-        arguments["star_offset"] = (float(away[0]), float(away[1]))
+        offset = -native_float64(mask).reshape(-1, 2).mean(axis=0) * arguments["pixelscale"]
+        arguments["star_offset"] = (float(offset[0]), float(offset[1]))
     return arguments, shifts
 
 
@@ -145,18 +145,18 @@ def on_detector_pixels(
         )
     require_finite(native_float64(shifts), f"{name}: IMSHIFTS")
     net = net_shifts(shifts, center, header, name)
-    whole = np.round(net.mean(axis=0)).astype(np.int64)
+    pixels = np.round(net.mean(axis=0)).astype(np.int64)
     data, error, usable = (
         arguments[key].reshape(frames, *arguments[key].shape[-2:])
         for key in ("data", "error", "valid")
     )
-    back = [shift_frames(np.nan_to_num(each), whole - net) for each in (data, error)]
-    usable = np.roll(usable, (whole[1], whole[0]), axis=(1, 2))
-    good = np.isfinite(data) & np.isfinite(error) & usable & (back[1] > 0)
+    shifted = [shift_frames(np.nan_to_num(each), pixels - net) for each in (data, error)]
+    usable = np.roll(usable, (pixels[1], pixels[0]), axis=(1, 2))
+    good = np.isfinite(data) & np.isfinite(error) & usable & (shifted[1] > 0)
     return {
-        "data": np.where(good, back[0], 0.0),
-        "error": np.where(good, back[1], 1.0),
+        "data": np.where(good, shifted[0], 0.0),
+        "error": np.where(good, shifted[1], 1.0),
         "valid": good,
-        "center": center + whole - net,
-        "first_pixel": first_pixel(header, whole, name),
+        "center": center + pixels - net,
+        "first_pixel": first_pixel(header, pixels, name),
     }

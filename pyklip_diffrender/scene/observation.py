@@ -145,10 +145,10 @@ class Observation:
         require_shape(sigma, values.shape, f"{name}: error", "Give one error for every pixel")
         good = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
         if valid is not None:
-            given = np.asarray(valid, dtype=bool)
-            given = given[None] if given.ndim == 2 else given
-            require_shape(given, values.shape, f"{name}: valid", "Say it for every pixel")
-            good &= given
+            mask = np.asarray(valid, dtype=bool)
+            mask = mask[None] if mask.ndim == 2 else mask
+            require_shape(mask, values.shape, f"{name}: valid", "Say it for every pixel")
+            good &= mask
         empty = np.flatnonzero(~good.any(axis=(1, 2)))
         if len(empty):
             raise NoValidPixelsError(
@@ -156,8 +156,8 @@ class Observation:
                 "finite or without an error. Look at its DQ"
             )
         frames, ny, nx = values.shape
-        where = native_float64([(nx - 1) / 2, (ny - 1) / 2] if center is None else center)
-        require_finite(where, f"{name}: center")
+        position = native_float64([(nx - 1) / 2, (ny - 1) / 2] if center is None else center)
+        require_finite(position, f"{name}: center")
         scale = _spread(to_arcsec(pixelscale, "pixelscale"), (2,), f"{name}: pixelscale")
         if not (np.isfinite(scale) & (scale > 0)).all():
             raise IncompatibleSetupError(
@@ -170,7 +170,7 @@ class Observation:
             good,
             unit,
             (float(scale[0]), float(scale[1])),
-            _spread(where, (frames, 2), f"{name}: center"),
+            _spread(position, (frames, 2), f"{name}: center"),
             **details,
         )
 
@@ -296,14 +296,14 @@ class Observation:
         # What is masked may be anything where somebody has replaced data, NaN too.
         weight = np.where(self.valid, np.where(self.valid, self.error, 1.0) ** -2, 0.0)
         total = weight.sum(axis=0)
-        seen = total > 0
-        safe = np.where(seen, total, 1.0)
+        covered = total > 0
+        safe = np.where(covered, total, 1.0)
         light = np.where(self.valid, self.data, 0.0)
         return replace(
             self,
             data=((weight * light).sum(axis=0) / safe)[None],
-            error=np.where(seen, safe**-0.5, 1.0)[None],
-            valid=seen[None],
+            error=np.where(covered, safe**-0.5, 1.0)[None],
+            valid=covered[None],
             center=self.center.mean(axis=0, keepdims=True),
             position_angles=None if self.position_angles is None else self.position_angles[:1],
         )

@@ -168,9 +168,9 @@ class FourierModes:
             waves.append(math.sqrt(2) ** 0.5 * torch.complex(torch.cos(angle), torch.sin(angle)))
         # A plane wave is a product of waves in x and y, which saves trigonometry on the full grid.
         product = waves[1][:, :, None] * waves[0][:, None, :]
-        both = torch.stack([product.real, product.imag], dim=1)
+        stacked = torch.stack([product.real, product.imag], dim=1)
         first = 2 * (start // 2)
-        return both.flatten(0, 1)[start - first : stop - first]
+        return stacked.flatten(0, 1)[start - first : stop - first]
 
     def opd(self, coefficients: Tensor, grid: PupilGrid) -> Tensor:
         # sum c cos + s sin = Re sum (c - i s) exp(i ...): two small matrix products.
