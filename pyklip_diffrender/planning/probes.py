@@ -68,7 +68,8 @@ def _measured(
     options = _allowed([] if fixed else candidates, full, trial)
     pinned = not trial.pins.keys().isdisjoint(fields)
     if options == [full]:
-        return Economy(name, (Option(full),), "kept as asked" if pinned else fixed or "no choice")
+        reason = "kept as requested" if pinned else fixed or "no choice"
+        return Economy(name, (Option(full),), reason)
     seconds = [trial.seconds(replace(trial.likely, **option)) for option in options]
     now = trial.seconds(trial.likely)
     if not pinned and now - min(seconds) < _PAYS * now:

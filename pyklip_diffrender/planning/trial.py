@@ -95,9 +95,9 @@ class Trial:
         # The grid of the derivatives resolves the field; a fixed model keeps its own grid.
         self.grids = [npix for npix in halves if npix >= self.response_npix]
         waves = self.finest.wavelengths
-        few = min(_ROUGH_WAVELENGTHS, waves) if "bandpass" in model.adjustable else waves
+        wavelengths = min(_ROUGH_WAVELENGTHS, waves) if "bandpass" in model.adjustable else waves
         npix = next((npix for npix in self.grids if npix >= _ROUGH_NPIX), model.npix)
-        self.rough = replace(self.finest, npix=npix, wavelengths=few)
+        self.rough = replace(self.finest, npix=npix, wavelengths=wavelengths)
         self._systems: dict[Choice, OpticalSystem] = {self.finest.system: model}
         self._images: dict[tuple[Choice, int], Tensor] = {}
         self._fields: dict[int, list[Tensor]] = {}

@@ -99,18 +99,18 @@ def linearise(
         first = point.unknowns.where("modes").start
         rows = joint.rows(k)[: len(rendered)]
         drift = joint.drift_rows(k) if modes else torch.zeros(0, dtype=torch.int64)
-        left = torch.where(weight > 0, residual / weight.clamp(min=1e-300), 0.0).cpu()
-        frames.append(LinearFrame(left, weight.cpu(), rendered, rows, drift, first))
+        misfit = torch.where(weight > 0, residual / weight.clamp(min=1e-300), 0.0).cpu()
+        frames.append(LinearFrame(misfit, weight.cpu(), rendered, rows, drift, first))
         product, pulled = _accumulate(
             rendered.flatten(1), weight.flatten().cpu(), residual.flatten().cpu()
         )
         if len(state.points) == 1:
             curvature, gradient = product, pulled
             continue
-        own = slice(first, first + len(drift))
-        for to, which in ((rows, slice(None)), (drift, own)):
+        leading = slice(first, first + len(drift))
+        for to, which in ((rows, slice(None)), (drift, leading)):
             gradient.index_add_(0, to, pulled[which])
-            for onto, other in ((rows, slice(None)), (drift, own)):
-                curvature[to[:, None], onto] += product[which, other]
+            for onto, selection in ((rows, slice(None)), (drift, leading)):
+                curvature[to[:, None], onto] += product[which, selection]
     gradient = gradient + curvature @ current
     return NormalEquations(state, kappa, robust, curvature, gradient, current, tuple(frames))

@@ -212,8 +212,8 @@ class GaussNewton:
         )
         # What is said to be held needs no prior.
         free = changes.get("free", preset.free)
-        known = {name: value for name, value in preset.deviations.items() if name in free}
-        return replace(preset, **{"deviations": known, **changes})
+        deviations = {name: value for name, value in preset.deviations.items() if name in free}
+        return replace(preset, **{"deviations": deviations, **changes})
 
 
 @dataclass(frozen=True)
