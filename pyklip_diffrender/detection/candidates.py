@@ -155,7 +155,7 @@ def refine_candidates(groups: Sequence[Group], candidates: Candidates, reach: fl
 
 
 def strongest_peak(
-    snr: Image, grid: Image, known: Tensor, *, threshold: float, inner: float, apart: float
+    snr: Image, grid: Image, sources: Tensor, *, threshold: float, inner: float, distance: float
 ) -> tuple[int, int] | None:
     """Pixel of the highest local maximum above the threshold that belongs to no known source.
 
@@ -164,15 +164,15 @@ def strongest_peak(
     snr : ndarray, (ny, nx)
     grid : ndarray, (ny, nx, 2)
         x, y from the star, arcsec.
-    known : Tensor, (k, 2)
+    sources : Tensor, (k, 2)
         x, y of known sources.
     threshold : float
     inner : float
         Smallest separation from the star, arcsec.
-    apart : float
+    distance : float
         Smallest distance from known sources, arcsec.
     """
-    allowed = (separation_of(grid) >= inner) & far_from(grid, known, apart)
+    allowed = (separation_of(grid) >= inner) & far_from(grid, sources, distance)
     peaks = local_maxima(snr, allowed, threshold, size=3)
     return peaks[0] if peaks else None
 

@@ -74,13 +74,15 @@ def contrast_table(
     """
     rows = []
     factor = small_sample_factor(separations, resolution, sigmas)
-    for separation, error, known, few in zip(separations, errors, photon, factor, strict=True):
+    for separation, error, photon_error, correction in zip(
+        separations, errors, photon, factor, strict=True
+    ):
         if not len(error):
             continue
         limit = sigmas * np.asarray(error)
         middle = float(np.median(limit))
-        bound = sigmas * float(np.median(known))
-        rows.append((separation, middle, limit.min(), limit.max(), bound, middle * few))
+        bound = sigmas * float(np.median(photon_error))
+        rows.append((separation, middle, limit.min(), limit.max(), bound, middle * correction))
     names = ("separation", "contrast", "lowest", "highest", "known_star", "small_sample")
     table = QTable(rows=rows, names=names, dtype=(float,) * len(names))
     table["separation"].unit = u.arcsec

@@ -62,9 +62,9 @@ def measured_shape(
     shape = torch.as_tensor(image)
     amplitude, error = _amplitude(groups[0][0], shape)
     total, bright = amplitude, amplitude > relinearise * error
-    alone = len(fits) == 1 and len(fits[0].frames) == 1
+    single_frame = len(fits) == 1 and len(fits[0].frames) == 1
     factor = scatter
-    for _ in range(_ROUNDS if bright and alone else 0):
+    for _ in range(_ROUNDS if bright and single_frame else 0):
         fit = without_light(fits[0], total * image)
         amplitude, error = _amplitude(fit.star_only, shape)
         total += amplitude

@@ -116,8 +116,8 @@ class Detection:
             for row in self.table
         ]
         title = "    separation             position angle     contrast               S/N"
-        none = [f"no candidate above S/N {self.threshold:g}"]
-        return "\n".join([title, *lines] if lines else none)
+        no_candidates = [f"no candidate above S/N {self.threshold:g}"]
+        return "\n".join([title, *lines] if lines else no_candidates)
 
     @cached_property
     def observation(self) -> Observation:
@@ -362,7 +362,7 @@ class Detection:
                 },
                 "_digests": facts["fits"],
             }
-            found = cls(
+            detection = cls(
                 fits=fits,
                 groups=groups_of_searched(fits, facts["fits"], path) if fits else (),
                 scatter=facts["scatter"],
@@ -372,5 +372,5 @@ class Detection:
                 path=path,
                 **maps_of(hdus),
             )
-        vars(found).update(computed)
-        return found
+        vars(detection).update(computed)
+        return detection

@@ -153,8 +153,10 @@ class Templates:
         inside = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)
         images = torch.zeros(len(offsets), ny, nx, dtype=torch.float32)
         for up, right in torch.unique(part[:, inside], dim=1).T.tolist():
-            chosen = torch.nonzero(inside & (part[0] == up) & (part[1] == right)).flatten()
-            images[chosen] = self._points(k, right, up).images(row[chosen], column[chosen]).cpu()
+            selected = torch.nonzero(inside & (part[0] == up) & (part[1] == right)).flatten()
+            images[selected] = (
+                self._points(k, right, up).images(row[selected], column[selected]).cpu()
+            )
         return images
 
     def at(self, offsets: Tensor, slopes: bool = False) -> dict[int, Tensor]:
@@ -197,9 +199,9 @@ class Templates:
         """
         frame = self.frames[k]
         star = self._star(frame) + self._turned(k, offset)
-        there = {**frame.optical_values, "star_offset": star}
+        values = {**frame.optical_values, "star_offset": star}
         opd = _as_tensor(frame.opd)
-        return frame.model(opd if change is None else opd + change, **there).double()
+        return frame.model(opd if change is None else opd + change, **values).double()
 
 
 def _as_tensor(opd: NDArray[np.float64]) -> Tensor:

@@ -273,12 +273,12 @@ def _provenance(summary: Mapping[str, Any], files: Sequence[str]) -> str:
         [name, "none" if value is None else str(value)]
         for name, value in summary["settings"].items()
     ]
-    known = [[name, _PRODUCTS.get(name, "")] for name in files]
+    products = [[name, _PRODUCTS.get(name, "")] for name in files]
     parts = [_facts(facts), _facts(long, "facts long")]
-    if known:
+    if products:
         parts += [
             "<h3>Files written with this page</h3>",
-            _table(["Name", "Content"], known, wrap=1),
+            _table(["Name", "Content"], products, wrap=1),
         ]
     parts += [
         "<details><summary>Settings of the fit</summary>",
