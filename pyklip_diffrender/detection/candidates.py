@@ -63,11 +63,6 @@ class Candidates:
         )
 
     @classmethod
-    def none(cls) -> Candidates:
-        """Return no candidates."""
-        return cls.at([], [])
-
-    @classmethod
     def of_fit(cls, fit: Refinement) -> Candidates:
         """Return the companions that were part of a refinement."""
         return cls.at(fit.companions[:, 1:], fit.companions[:, 0])

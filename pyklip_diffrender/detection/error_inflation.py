@@ -26,9 +26,9 @@ _WINGS = 0.4
 def error_inflation(fits: Sequence[Refinement], groups: Sequence[Group], offsets: Tensor) -> float:
     """Square root of the reduced chi-squared with the light of sources removed, at least 1.
 
-    Unmodelled structure in the residuals biases planet fluxes, so it inflates their errors. The
-    light of planets is no such structure. A planet of S/N 20 that was not removed would increase
-    all errors by 3 %, so the sources are fitted together and removed first.
+    Unmodelled structure in the residuals biases planet fluxes, so it inflates their errors. Planets
+    are not part of it: one of S/N 20 that is not removed would increase all errors by 3 %.
+    Therefore the sources are fitted together and removed first.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def snr_scatter(snr: Image, grid: Image, offsets: Tensor, inner: float) -> float
     clear = (separation_of(grid) >= inner) & np.isfinite(snr) & far_from(grid, offsets, _WINGS)
     values = snr[clear]
     deviation = 1.4826 * float(np.median(np.abs(values - np.median(values))))
-    # Sources that are not yet candidates must not raise the threshold above themselves.
+    # Clipped, so that sources that are not yet candidates do not raise their own threshold.
     return max(1.0, float(np.clip(values, -5 * deviation, 5 * deviation).std()))
 
 

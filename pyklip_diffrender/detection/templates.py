@@ -1,4 +1,4 @@
-"""What a planet of contrast 1 looks like in the frames of a fit, wherever it is."""
+"""Images of planets of contrast 1 at any position in the frames of a fit."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ _ALIGNED = 1e-6
 class Templates:
     """Images of planets in frames that were refined together, in the data's unit.
 
-    Positions are x, y from the star in arcsec, as the first frame has them: the others may be
-    rolled, and have their stars elsewhere.
+    Positions are x, y from the star in arcsec, in the first frame. The other frames may be rolled
+    and have their stars at other positions.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Tell tensors that are being differentiated from constants, whose results may be cached."""
+"""Distinguish differentiated tensors from constants, whose results may be cached."""
 
 from __future__ import annotations
 

@@ -267,7 +267,7 @@ class FourierMask:
         self._latest: tuple[float, torch.dtype, Tensor] | None = None
 
     def window(self, values: Values) -> PupilGrid:
-        """The padded pupil, because light beside the pupil reaches the next mask."""
+        """The padded pupil, because light outside the pupil reaches the next mask."""
         return self.grid
 
     def _lattice_transmission(self, wavefront: Wavefront) -> Tensor:

@@ -144,7 +144,7 @@ class Drift:
 
     def opd(self, which: int, cycles: float, grid: PupilGrid) -> Tensor:
         """Draw number `which`, with its modes up to a spatial frequency, (npix, npix), m."""
-        # Plans with different seeds must not share draws.
+        # Plans with different seeds need independent draws.
         generator = torch.Generator().manual_seed(1000 * self.seed + which)
         unit = torch.randn(len(self.basis), generator=generator, dtype=torch.float64)
         drawn = torch.where(self.basis.frequencies <= cycles, self.deviation * unit, 0.0)

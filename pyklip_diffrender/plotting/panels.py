@@ -47,7 +47,7 @@ __all__ = [
 
 INK = "#1b1f24"
 ACCENT = "#0b6e4f"
-"""A green dark enough to be told from both ends of the red and blue maps by everybody."""
+"""A dark green, distinct from both ends of the red and blue maps."""
 
 _COMPASS = 30.0
 """From the tail of an arrow to its letter, points."""

@@ -1,6 +1,6 @@
-"""What the `plot` methods of observations, systems, refinements and detections draw.
+"""Implementations of the `plot` methods of observations, systems, refinements and detections.
 
-Red and blue, and the maps for light, are told apart by readers with colour vision deficiencies.
+The colour maps can be distinguished by readers with colour vision deficiencies.
 """
 
 from __future__ import annotations

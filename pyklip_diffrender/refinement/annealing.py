@@ -131,7 +131,7 @@ class Annealing:
                 if bright:
                     state = self._with_companions(state, bright)
                 elif gain < _ALIGNED and settings.wavefront:
-                    # Damping of the alignment is no guide to that of the wavefront.
+                    # The damping of the alignment does not apply to the wavefront.
                     aligned, modes, solver.damping = state, self._modes_for(kappa), 0.0
                 elif settled:
                     status = _status_of(chi2)

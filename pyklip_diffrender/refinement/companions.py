@@ -1,7 +1,7 @@
 """Bright companions in the residual of a fit.
 
 A companion as bright as the speckles of the star biases the fitted wavefront. A companion that
-stands out of the residual therefore gets parameters of its own. Faint planets are left to the
+is significant in the residual therefore gets its own parameters. Faint planets are found by the
 detection, which marginalises the wavefront.
 """
 

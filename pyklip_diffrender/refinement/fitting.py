@@ -137,7 +137,7 @@ def refine(
             )
         if systematics is not None:
             raise IncompatibleSetupError(
-                "systematics: the Adam recipe has no place for them; use GaussNewton"
+                "systematics: the Adam recipe does not support them; use GaussNewton"
             )
         return adam(problems[0], adapted, seed=seed, progress=progress)
     planned = choose_plan(plan, problems, adapted, seed)

@@ -109,8 +109,8 @@ class Forward:
             full = opd if model.npix == self.model.npix else self.opd(unknowns, vector, model)
             for source in unknowns.sources(vector):
                 source_values = self._towards(values, unknowns.turn @ source[1:])
-                # Neither the plan's model nor the coarse copy will do: an error of a percent shows
-                # for a companion of S/N 1000.
+                # The full model is needed: an error of a percent is significant for a companion of
+                # S/N 1000.
                 with torch.no_grad():
                     total = total + flux * source[0] * model(full, **source_values).double()
         return Point(unknowns, vector, opd, fields, image, light, star, total)
@@ -165,6 +165,6 @@ class Forward:
         return rows
 
     def _response_at(self, point: Point) -> WavefrontResponse:
-        """The field's response to the wavefront, from where the wavefront was much the same."""
+        """The response of the field, computed at nearly the same wavefront."""
         values = point.unknowns.values(point.vector)
         return self.responses.near(point.opd, values, point.unknowns.optical)

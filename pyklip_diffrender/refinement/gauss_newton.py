@@ -183,7 +183,7 @@ class Solver:
         self.scales = update.scales
         expected = self._predicted_gain(layout, equations, update.step)
         if expected < self.settings.tolerance * objective.pixels:
-            # The gain is not worth another linearisation.
+            # The gain is too small for another linearisation.
             return state, expected / objective.pixels
         before = self._cost(state, sigmas)
         for _ in range(_TRIES):

@@ -1,6 +1,6 @@
 """Find which pixels of the detector frames show, from the pattern of the flat field itself.
 
-Frames that were moved without a record of it do not say where their pixels are on the detector.
+The detector pixels of frames that were shifted without a record are unknown.
 The residual of a fit does: it correlates with the known pattern at only one position.
 """
 
@@ -32,8 +32,8 @@ _COARSE, _FINE = 0.25, 0.05
 _SIGNIFICANT = 6.0
 """Height of the peak in units of the correlation's scatter elsewhere."""
 
-_BESIDE = 1.5
-"""Pixels from the peak beyond which the correlation is elsewhere."""
+_SEPARATE = 1.5
+"""Distance from the peak beyond which the correlation measures its scatter, pixels."""
 
 _MODEL_ERROR = 0.05
 """Error of the ratio of residual and star that the pattern does not explain."""
@@ -72,7 +72,7 @@ def register(fit: Refinement, pattern: Systematics) -> Observation | None:
     coarse = _correlation(measured.value, expected, weight, steps, steps)
     row, column = np.unravel_index(int(coarse.argmax()), coarse.shape)
     best = np.array([steps[column], steps[row]])
-    elsewhere = np.hypot(*np.meshgrid(steps - best[0], steps - best[1])) > _BESIDE
+    elsewhere = np.hypot(*np.meshgrid(steps - best[0], steps - best[1])) > _SEPARATE
     scatter = float(coarse[elsewhere].std())
     _log.info("pattern seen at %s pixels, correlation %.2f, elsewhere %.3f",
               best, coarse.max(), scatter)  # fmt: skip

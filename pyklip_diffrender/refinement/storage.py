@@ -48,7 +48,7 @@ _DTYPES = {"torch.float64": torch.float64, "torch.float32": torch.float32}
 
 
 def encoded(value: Any) -> Any:
-    """Convert settings to types that JSON knows.
+    """Convert settings to JSON types.
 
     Raises
     ------
@@ -173,8 +173,8 @@ def model_of(facts: dict[str, Any] | None, name: str) -> OpticalSystem:
     """
     if facts is None:
         raise IncompatibleSetupError(
-            f"{name}: the model of this fit was not made by nircam_coronagraph, so the file does "
-            "not say how to make it. Pass the model: Refinement.read(path, model=model)"
+            f"{name}: the model of this fit was not made by nircam_coronagraph, so it "
+            "cannot be made from the file. Pass the model: Refinement.read(path, model=model)"
         )
     return nircam_coronagraph(**facts)
 

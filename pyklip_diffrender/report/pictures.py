@@ -1,4 +1,4 @@
-"""The pictures of the report, with what they show in words."""
+"""The pictures of the report, with descriptions."""
 
 from __future__ import annotations
 
@@ -101,10 +101,10 @@ def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
         ),
         (
             f"Modelled image of {observation.target}, in {unit}.",
-            "What the fit says the star and the background look like, on the same scale.",
+            "The fitted star and background, on the same scale.",
         ),
         (
-            f"What is left of the image of {observation.target} without the star, in standard "
+            f"The residual image of {observation.target} without the star, in standard "
             "deviations of the noise.",
             f"Data without the star, over the noise of each pixel.{subtracted}",
         ),

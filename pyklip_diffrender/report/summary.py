@@ -1,4 +1,4 @@
-"""Everything worth saying about a reduction, as plain values that go into JSON."""
+"""Summary of a reduction, as plain values for JSON."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def _candidates(detection: Detection) -> list[dict[str, Any]]:
         values = {}
         for name in table.colnames:
             unit = table[name].unit
-            # The names of magnitudes say what they are.
+            # The names of magnitudes include their unit.
             label = name if unit in (None, u.mag) else f"{name}_{unit}"
             values[label] = getattr(row[name], "value", row[name])
         chance = _false_alarm(detection, float(row["snr"]), row["separation"].to_value("arcsec"))

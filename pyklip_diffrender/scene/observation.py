@@ -1,4 +1,4 @@
-"""Frames to be explained: pixel values, their errors, what is masked, where the star is."""
+"""Observed frames: pixel values, errors, masks, and the position of the star."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ class Observation:
     position_angles : ndarray, (frames,)
         Degrees.
     star_offset : tuple of float or None
-        x, y of the star relative to the occulter as the file says, arcsec; a fit starts there.
+        x, y of the star relative to the occulter from the file, arcsec; the start of a fit.
     reference : bool
-        Another star, whose frames show the wavefront but none of the target's companions.
+        Whether this is a reference star, whose frames have no companions of the target.
     first_pixel : tuple of int or None
         Column and row of the array's first pixel on the full detector, 0-indexed; None where it is
         not known, or where the array's pixels are not the detector's.
@@ -117,22 +117,22 @@ class Observation:
         Raises
         ------
         ShapeError
-            Shapes that do not go together, or no frames.
+            Inconsistent shapes, or no frames.
         UnitError
-            A unit that is not known, or does not convert.
+            A unit that is unknown or does not convert.
         NonFiniteError
             A star position that is not a number.
         IncompatibleSetupError
             A pixel scale that is not a positive number.
         NoValidPixelsError
-            A frame in which nothing is left.
+            A frame without valid pixels.
         """
         name = details.get("name", "observation")
         try:
             unit = u.Unit(unit)
         except (ValueError, TypeError) as reason:
             raise UnitError(
-                f"{name}: got the unit {unit!r}, expected one that astropy knows, such as 'MJy/sr'"
+                f"{name}: got the unit {unit!r}, expected an astropy unit such as 'MJy/sr'"
             ) from reason
         values = to_unit(data, unit, f"{name}: data")
         values = values[None] if values.ndim == 2 else values
@@ -147,7 +147,7 @@ class Observation:
         if valid is not None:
             mask = np.asarray(valid, dtype=bool)
             mask = mask[None] if mask.ndim == 2 else mask
-            require_shape(mask, values.shape, f"{name}: valid", "Say it for every pixel")
+            require_shape(mask, values.shape, f"{name}: valid", "Give one value for every pixel")
             good &= mask
         empty = np.flatnonzero(~good.any(axis=(1, 2)))
         if len(empty):
@@ -235,19 +235,19 @@ class Observation:
         return other.position_angle - self.position_angle
 
     def cutout(self, size: int) -> Observation:
-        """The `size` x `size` pixels about the star (whole pixels, so nothing is resampled).
+        """The `size` x `size` pixels about the star (whole pixels, without resampling).
 
         Raises
         ------
         ShapeError
-            If that sticks out of the frame.
+            If the square is not inside the frame.
         """
         corners = np.round(self.center - (size - 1) / 2).astype(int)
         ny, nx = self.shape
         if corners.min() < 0 or (corners + size > (nx, ny)).any():
             raise ShapeError(
                 f"{self.name}: {size} x {size} pixels about {tuple(self.center[0])} do not fit "
-                f"into {nx} x {ny}. Ask for fewer"
+                f"into {nx} x {ny}. Choose a smaller size"
             )
 
         def cut(stack: NDArray[Any]) -> NDArray[Any]:
@@ -293,7 +293,7 @@ class Observation:
 
         Only for frames that see the star at the same place under the same wavefront.
         """
-        # What is masked may be anything where somebody has replaced data, NaN too.
+        # Masked pixels may have any value if the data were replaced, also NaN.
         weight = np.where(self.valid, np.where(self.valid, self.error, 1.0) ** -2, 0.0)
         total = weight.sum(axis=0)
         covered = total > 0

@@ -316,7 +316,7 @@ class _ReverseMode(torch.autograd.Function):
             along_x = torch.autograd.grad(field, products, slope, retain_graph=True)
             by_opd, by_offset = ctx.star.slopes(opd, offset, along_x)
             return by_opd.to(opd.dtype), by_offset, None, None
-        # For second derivatives, use operations that autograd knows.
+        # Second derivatives need the differentiable operations.
         inputs = opd, offset
         differentiated = [t for t in inputs if t is not None and t.requires_grad]
         by_each = iter(
