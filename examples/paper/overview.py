@@ -141,9 +141,9 @@ def where_others_lead(results: Path) -> Lines:
         "",
         *(f"- {words}" for words in lines),
         "",
-        "The annulus SNR of a bright planet saturates, and faint residuals of the star may increase it "
-        "above that of the true star. If that of the true star is small, all are noise. See the "
-        "limits.",
+        "The annulus SNR of a bright planet saturates, and faint residuals of the star may "
+        "increase it above that of the true star. If that of the true star is small, all are "
+        "noise. See the limits.",
         "",
     ]
 
