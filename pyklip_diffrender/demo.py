@@ -1,4 +1,4 @@
-"""The demo: a simulated planet beside a star whose wavefront map is 40 hours old.
+"""The demo: a simulated planet near a star, with a wavefront map that is 40 hours old.
 
 The scene is that of Feng et al. 2025 with a seeded wavefront in place of the measured one: 4.5 um,
 beta Pictoris for two hours, 80 x 80 pixels; KLIP has nine dithered images of alpha Pictoris, taken
@@ -47,7 +47,7 @@ DITHERS = (
 """The 9-POINT-CIRCLE small-grid dither, mas."""
 
 _REFERENCE_SHIFT = 10
-"""How far the pattern's centre misses the target star's position in x, mas (appendix C)."""
+"""Offset in x of the pattern's centre from the position of the target star, mas (appendix C)."""
 
 
 @dataclass
@@ -62,7 +62,7 @@ class DemoResult:
     table : Table
         One row per image: annulus SNR, planet throughput, star-model error, seconds.
     detection : Detection
-        Point sources with the wavefront integrated out instead of subtracted.
+        Point sources with the wavefront marginalised.
     """
 
     model: OpticalSystem
@@ -183,7 +183,7 @@ def run_demo(
 
 
 def write_demo(result: DemoResult, folder: Path) -> list[Path]:
-    """Write images, wavefronts and the table; returns what was written."""
+    """Write images, wavefronts and the table; returns the paths."""
     primary = fits.PrimaryHDU()
     for key, value in result.fit.summary().items():
         primary.header[f"HIERARCH {key}"] = value

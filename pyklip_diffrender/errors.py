@@ -1,8 +1,8 @@
-"""Every error that this package raises on purpose, in one tree.
+"""Exceptions and warnings of this package.
 
-A message says what was got, what was expected and the likely fix. Errors about a value
-are also `ValueError`, errors about a file are also `OSError`, so that callers who do not
-know this package still catch them.
+Messages state the value, what was expected, and the likely fix. Errors about a value
+are also `ValueError`, errors about a file are also `OSError`, so that generic
+handlers catch them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class UnitError(DiffrenderError, ValueError):
 
 
 class ShapeError(DiffrenderError, ValueError):
-    """An array has a shape that does not fit."""
+    """An array has the wrong shape."""
 
 
 class NonFiniteError(DiffrenderError, ValueError):
@@ -40,28 +40,28 @@ class NonFiniteError(DiffrenderError, ValueError):
 
 
 class NoValidPixelsError(DiffrenderError, ValueError):
-    """Nothing is left to fit once the masked pixels are taken out."""
+    """There are no unmasked pixels to fit."""
 
 
 class IncompatibleSetupError(DiffrenderError, ValueError):
-    """Parts that do not go together, such as a filter that a mask does not take."""
+    """Settings are incompatible, such as a filter and a mask of different channels."""
 
 
 class MissingOPDError(DiffrenderError, ValueError):
-    """A reduction was asked for without a wavefront map to start from."""
+    """A reduction was requested without a starting wavefront map."""
 
 
 class CorruptFileError(DiffrenderError, OSError):
-    """A file is missing, truncated, or not what its name says."""
+    """A file is missing, truncated, or not of the expected type."""
 
 
 class RefinementError(DiffrenderError, RuntimeError):
-    """A refinement did not end in a usable result.
+    """A refinement failed.
 
     Attributes
     ----------
     result : Refinement or None
-        The best iterate, for a look at what went wrong.
+        The best iterate, for diagnosis.
     """
 
     def __init__(self, message: str, result: Any = None) -> None:
@@ -70,4 +70,4 @@ class RefinementError(DiffrenderError, RuntimeError):
 
 
 class DiffrenderWarning(UserWarning):
-    """Something is suspicious but not certainly wrong."""
+    """Input is suspicious, but not certainly wrong."""

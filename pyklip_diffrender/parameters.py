@@ -1,6 +1,6 @@
-"""The free-parameter table: what a model or a fit may leave free, in which unit and range.
+"""Table of the free parameters of models and fits, with their units and ranges.
 
-The same table drives the forward model's keywords, the fit, the FITS columns and the docs.
+It defines the keywords of the forward model, the parameters of the fit, and the FITS columns.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ class Parameter:
     lower, upper : float
         Bounds of every component.
     prior : float
-        Standard deviation, about the start, that a fit assumes: generous, what a user does not
-        know before looking.
+        Prior standard deviation about the start, generous as without any earlier measurement.
     description : str
         One line.
     """
@@ -75,7 +74,7 @@ OPTICAL_PARAMETERS = (
         "standard deviation of a Gaussian blur on the detector (jitter, charge diffusion)",
     ),
 )  # fmt: skip
-"""What the optics of a coronagraph may leave free, besides the OPD."""
+"""Free parameters of the optics of a coronagraph, besides the OPD."""
 
 FLUX_AND_BACKGROUND = (
     Parameter(
@@ -87,18 +86,18 @@ FLUX_AND_BACKGROUND = (
         "uniform background per pixel, in units of the image",
     ),
 )  # fmt: skip
-"""What an observation leaves free on top of the optics."""
+"""Free parameters of an observation, besides those of the optics."""
 
 
 def parameter(name: str) -> Parameter:
-    """Look a parameter up by name.
+    """Look up a parameter by name.
 
     Raises
     ------
     KeyError
-        For a name that is not in the table, with the names that are.
+        If the table has no such name.
     """
-    known = {p.name: p for p in (*OPTICAL_PARAMETERS, *FLUX_AND_BACKGROUND)}
-    if name not in known:
-        raise KeyError(f"{name!r} is not a parameter; those are {', '.join(known)}")
-    return known[name]
+    entries = {p.name: p for p in (*OPTICAL_PARAMETERS, *FLUX_AND_BACKGROUND)}
+    if name not in entries:
+        raise KeyError(f"{name!r} is not a parameter; expected one of {', '.join(entries)}")
+    return entries[name]

@@ -62,7 +62,9 @@ class Reduction:
 
         folder = Path(folder)
         written = self.detection.write(folder)
-        written.append(self.fit.write(folder / "fit.fits"))
+        # With the candidates in the model if the star was refined again, so that `Detection.read`
+        # measures in the same linear model.
+        written.append(self.detection.fits[0].write(folder / "fit.fits"))
         if self.systematics is not None:
             written.append(self.systematics.write(folder / "systematics.fits"))
         return written + report.write_report(self, folder, written)

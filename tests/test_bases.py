@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from pyklip_diffrender.instrument.jwst import TABULATED_GAP, jwst_pupil, jwst_segments
-from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
+from pyklip_diffrender.instrument.jwst import (
+    TABULATED_GAP,
+    is_jwst_pupil,
+    jwst_pupil,
+    jwst_segments,
+)
+from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, polygon_coverage, widen_polygon
 from pyklip_diffrender.wavefront.bases import (
     Basis,
     FourierModes,
@@ -201,6 +206,21 @@ def test_the_joint_basis_keeps_kinds_apart() -> None:
     assert basis.group_index.tolist() == [0] * 54 + [1] * len(parts[1])
     assert not basis.frequencies[:54].any()
     torch.testing.assert_close(basis.frequencies[54:], parts[1].frequencies)
+
+
+@pytest.mark.parametrize("npix", [64, 256])
+def test_the_aperture_tells_jwst_from_other_telescopes(npix: int) -> None:
+    for options in ({}, {"pupil": "flight"}, {"segment_gap": 0.03}):
+        assert is_jwst_pupil(jwst_pupil(npix, **options) > 0, JWST_DIAMETER)
+    padded = torch.nn.functional.pad(jwst_pupil(npix) > 0, (npix // 4,) * 4)
+    assert is_jwst_pupil(padded, 1.5 * JWST_DIAMETER)
+    for side in (2.4, JWST_DIAMETER, 8.0):
+        grid = PupilGrid.full(npix, side)
+        radius = torch.hypot(grid.x, grid.y[:, None])
+        for outer in np.arange(1.2, side / 2, 0.2):
+            for inner in (0.0, 0.2, 0.3):
+                disc = (radius < outer) & (radius >= inner * outer)
+                assert not is_jwst_pupil(disc, side)
 
 
 def test_the_default_basis_has_about_1850_modes() -> None:

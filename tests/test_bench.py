@@ -28,7 +28,7 @@ from tests.benchmarks.speed.memory import memory_of, peak_memory
 from tests.benchmarks.speed.page import page, targets
 from tests.benchmarks.speed.plain import plain_stpsf
 from tests.benchmarks.speed.rivals import load, paper_recipe
-from tests.benchmarks.speed.rows import ROWS, chosen_rows
+from tests.benchmarks.speed.rows import ROWS, select_rows
 from tests.benchmarks.speed.timing import exponent, interleaved
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -156,10 +156,10 @@ def test_refinement_and_detection_run(here: Setting) -> None:
 
 
 def test_rows_are_chosen_by_how_they_begin() -> None:
-    assert [row.name for row in chosen_rows(["Jac", "S/N"])] == ["Jacobian", "S/N map"]
-    assert chosen_rows([]) == list(ROWS)
+    assert [row.name for row in select_rows(["Jac", "S/N"])] == ["Jacobian", "S/N map"]
+    assert select_rows([]) == list(ROWS)
     with pytest.raises(IncompatibleSetupError, match="rows: got 'backward'"):
-        chosen_rows(["backward"])
+        select_rows(["backward"])
 
 
 def test_durations_are_the_shortest_and_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:

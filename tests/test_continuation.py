@@ -274,7 +274,7 @@ def test_a_plan_for_something_else_is_refused() -> None:
     other = model().with_fidelity(npix=NPIX // 2)
     with pytest.raises(IncompatibleSetupError, match="plan: it was made for"):
         dr.refine(other, shot(), before(), plan=coarse_plan())
-    with pytest.raises(IncompatibleSetupError, match="the model as given"):
+    with pytest.raises(IncompatibleSetupError, match="the full model"):
         dr.refine(model(), shot(), before(), settings=Adam(), plan=coarse_plan())
     with pytest.raises(IncompatibleSetupError, match="order of the arguments"):
         dr.refine(before(), shot(), model())  # type: ignore[arg-type]

@@ -15,7 +15,9 @@ import torch
 from astropy import units as u
 from astropy.io import fits as astropy_fits
 from astropy.table import QTable
+from astropy.time import Time
 from astropy.units import Unit
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -24,6 +26,7 @@ from pyklip_diffrender.detection import Detection, small_sample_factor
 from pyklip_diffrender.detection.calibration import calibration_errors
 from pyklip_diffrender.detection.relinearise import with_companions
 from pyklip_diffrender.errors import (
+    CorruptFileError,
     IncompatibleSetupError,
     NonFiniteError,
     ShapeError,
@@ -669,6 +672,103 @@ def test_products_can_be_read_by_others(one: Detection, tmp_path: Path) -> None:
     assert table.meta["scatter"] == one.scatter
     curve = QTable.read(paths[2], format="ascii.ecsv")
     assert len(curve) == len(one.contrast_curve)
+
+
+def oriented(found: Detection) -> Detection:
+    """The same detection, as if it had been made in a frame of known date and orientation."""
+    (fit,) = found.fits
+    (frame,) = fit.frames
+    known = {"position_angles": np.array([33.0]), "date": Time("2023-01-02T03:04:05.678")}
+    header = astropy_fits.Header({"TARGPROP": "HD 1"})
+    observation = replace(frame.observation, filter="F444W", header=header, **known)
+    return replace(found, fits=(replace(fit, frames=(replace(frame, observation=observation),)),))
+
+
+def test_a_detection_survives_the_file(one: Detection, tmp_path: Path) -> None:
+    first = oriented(one)
+    again = Detection.read(first.write(tmp_path / "first")[0].parent)
+    for name in ("snr", "residual_snr", "contrast", "error", "photon_error", "grid"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
+    for ours, theirs in zip(
+        (*again.subtracted, *again.left_out), (*first.subtracted, *first.left_out), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    assert [repr(again), str(again), again.scatter] == [repr(first), str(first), first.scatter]
+    for ours, theirs in (
+        (again.table, first.table),
+        (again.contrast_curve, first.contrast_curve),
+    ):
+        assert ours.meta == theirs.meta
+        assert ours.colnames == theirs.colnames
+        for name in ours.colnames:
+            np.testing.assert_array_equal(ours[name], theirs[name])
+            assert ours[name].unit == theirs[name].unit
+    assert again.north == 33.0
+    assert again.observation.date == first.observation.date
+    assert again.observation.target == "HD 1"
+    left, right = again.plot(Figure().subplots(1, 2))
+    assert left.get_title(loc="left").startswith("1 candidate above")
+    assert len(right.lines) == len(first.plot(Figure().subplots(1, 2))[1].lines)
+    # A copy of a copy is the same file.
+    again.write(tmp_path / "again")
+    for name in ("detection.fits", "candidates.ecsv", "contrast.ecsv"):
+        copy = (tmp_path / "again" / name).read_bytes()
+        assert copy == (tmp_path / "first" / name).read_bytes()
+
+
+def test_a_detection_from_a_file_measures_with_its_fit(
+    world: World, one: Detection, tmp_path: Path
+) -> None:
+    folder = one.write(tmp_path)[0].parent
+    places = [[0.3, 0.6], *one.candidates.offsets.tolist()]
+    expected = one.measure(places)
+    with pytest.raises(IncompatibleSetupError, match=r"no fit\.fits.*read\(path, fit=fit\)"):
+        Detection.read(folder).measure(places)
+    with pytest.raises(IncompatibleSetupError, match="not the one that was searched"):
+        Detection.read(folder, fit=world.fitted(0))
+    one.fits[0].write(folder / "fit.fits")
+    for again in (Detection.read(folder), Detection.read(folder, fit=one.fits)):
+        table = again.measure(places)
+        for name in table.colnames:
+            np.testing.assert_array_equal(table[name], expected[name])
+
+
+@pytest.mark.parametrize("percent", [25, 50, 99])
+def test_part_of_a_file_is_no_detection(
+    empty: list[Detection], percent: int, tmp_path: Path
+) -> None:
+    path = empty[0].write(tmp_path)[0]
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) * percent // 100])
+    with pytest.raises(CorruptFileError, match=r"detection\.fits"):
+        Detection.read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("FACTS", "no FACTS"), ("PHOTON_ERROR", "PHOTON_ERROR"), ("SNR", "shapes"), ("none", "such")],
+)
+def test_a_file_without_a_part_is_no_detection(
+    empty: list[Detection], name: str, message: str, tmp_path: Path
+) -> None:
+    path = empty[0].write(tmp_path)[0]
+    if name == "none":
+        path.unlink()
+    else:
+        with astropy_fits.open(path) as hdus:
+            if name == "SNR":
+                hdus[name].data = hdus[name].data[1:]
+            else:
+                del hdus[name]
+            hdus.writeto(path, overwrite=True)
+    with pytest.raises(CorruptFileError, match=message):
+        Detection.read(path)
+
+
+def test_a_refinement_is_no_detection(one: Detection, tmp_path: Path) -> None:
+    path = one.fits[0].write(tmp_path / "fit.fits", linear=False)
+    with pytest.raises(CorruptFileError, match="not a complete Detection"):
+        Detection.read(path)
 
 
 def kept(image: Image, star: Image, light: Image, error: Image) -> float:

@@ -304,7 +304,7 @@ def test_small_version(name: str, tmp_path: Path) -> None:
         return
     study = next(study for study in experiments.STUDIES if study.name == name)
     pictures = importlib.import_module("pictures")
-    path = pictures.beside(tmp_path / f"{name}_generator.ecsv")
+    path = pictures.image_path(tmp_path / f"{name}_generator.ecsv")
     images = (pictures.read_images(path),) if study.pictures else ()
     figure = study.module.draw(table, *images)
     for column in DRAWN[name]:

@@ -16,7 +16,8 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.scene.observation import BAD_PIXEL_BITS, Observation
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
+from pyklip_diffrender.scene.observation import Observation
 
 AREA = 0.00396
 """arcsec^2 of a pixel."""

@@ -346,7 +346,7 @@ def test_settings_can_be_kept() -> None:
             model(), BRIGHT, before(), keep={"npix": 128, "multifidelity": False}, **SETTINGS
         )
     assert coarse.model.npix == 128
-    assert set(coarse.table["why"]) >= {"kept as asked"}
+    assert set(coarse.table["why"]) >= {"kept as requested"}
 
 
 @pytest.mark.parametrize(
@@ -434,7 +434,7 @@ def test_a_probe_that_claims_too_much_is_caught(
     assert found.verified_error.inside(found.budget)
     assert found.choice.cycles == CYCLES[0]
     assert (found.choice.npix, found.choice.multifidelity) != (128, False)
-    assert "made finer by the verification" in str(found)
+    assert "refined by the verification" in str(found)
 
 
 # -- in a fit ------------------------------------------------------------------------------------
@@ -492,7 +492,7 @@ def test_a_plan_that_fails_at_the_solution_is_abandoned(caplog: pytest.LogCaptur
     assert fit.plan is not None
     assert fit.plan.abandoned
     assert "continues with the full model" in caplog.text
-    assert "as given" in str(fit.plan)
+    assert "continued with the full model" in str(fit.plan)
     assert fit.wavefront.shape == (NPIX, NPIX)
     np.testing.assert_allclose(fit.frames[0].render(), fit.frames[0].star, rtol=1e-6)
 
@@ -502,7 +502,7 @@ def test_bad_plans_are_refused() -> None:
         refine(model(), frame(), before(), plan="cheap")
     with pytest.raises(IncompatibleSetupError, match="made for"):
         refine(model(npix=128), frame(), before(), plan=faint_plan())
-    with pytest.raises(IncompatibleSetupError, match="as given"):
+    with pytest.raises(IncompatibleSetupError, match="uses the full model"):
         refine(model(), frame(), before(), settings=Adam(), plan=faint_plan())
 
 

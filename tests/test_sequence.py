@@ -139,7 +139,7 @@ def test_a_target_that_cannot_be_decided_is_an_error(folder: Path, tmp_path: Pat
     with pytest.raises(IncompatibleSetupError, match="VEGA"):
         Sequence.from_files(folder, target="VEGA")
     calints(folder / "g.fits", "HIP2", 20.0, "2022-10-03T08:00:00")
-    with pytest.raises(IncompatibleSetupError, match="say which one"):
+    with pytest.raises(IncompatibleSetupError, match="choose one with"):
         Sequence.from_files(folder)
     empty = tmp_path / "empty"
     empty.mkdir()

@@ -1,10 +1,10 @@
-"""Beyond the paper: what it did not try, one thing wrong or new at a time.
+"""Beyond the paper: cases that it did not study, with one complication at a time.
 
     python examples/paper/beyond.py --opd BEFORE AFTER --seeds 10
 
-A planet of 1e-6 at 0.6 arcsec, the wavefront map 40 h old unless said otherwise. Cases that cost
+A planet of 1e-6 at 0.6 arcsec, the wavefront map 40 h old unless stated otherwise. Cases that cost
 more than a single fit (nine wavelengths, KLIP on refined residuals), and Adam, take a fifth of
-the seeds. "null" is the standard deviation of S/N with what was detected taken out: 1 if errors are
+the seeds. "null" is the standard deviation of S/N with the candidates removed: 1 if errors are
 right. Where the ring's shape is given, the star is refined once more on the frame less the ring, as
 bright as `Detection.measure_shape` finds it.
 """
@@ -28,7 +28,7 @@ from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 sys.path.insert(0, str(Path(__file__).parent))
 from failures import MEASURED_SCALES
-from judging import COLOURS, chosen, photon_snr, pixel, spread, star_error
+from judging import COLOURS, photon_snr, pixel, select, spread, star_error
 from methods import QUICK, STEPS, Subtracted, all_of, klip, references
 from ring import ring_photons
 from scene import Frame, Image, Planet, Scene, Setting, frame, mapped, options, setting, timed_table
@@ -53,7 +53,7 @@ def _held(factor: float) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Case:
-    """What differs.
+    """A case, by its differences from the standard scene.
 
     Attributes
     ----------
@@ -104,81 +104,85 @@ CASES = (
 )
 
 
-def makers(here: Setting, case: Case, seed: int) -> tuple[Setting, Setting]:
-    """What makes the frames, and what is known of it."""
-    known = replace(here, model=here.model.with_fidelity(**case.both)) if case.both else here
+def makers(setup: Setting, case: Case, seed: int) -> tuple[Setting, Setting]:
+    """Return the setting that simulates the frames, and the one that the methods assume."""
+    assumed = replace(setup, model=setup.model.with_fidelity(**case.both)) if case.both else setup
     settings = {**case.both, **case.truth}
     if case.internal:
         table = 1e-9 * np.asarray(embedded_table("nircam_si_zernikes")["MASK335R"], dtype=float)
         wrong = np.random.default_rng([seed, 99]).normal(0, NON_COMMON_PATH / 12**0.5, 12)
         table[3:15] += wrong
         settings["si_wfe"] = table
-    true = replace(here, model=here.model.with_fidelity(**settings)) if settings else here
+    truth = replace(setup, model=setup.model.with_fidelity(**settings)) if settings else setup
     if case.later:
-        known = replace(known, measured=here.drifted(HOURS))
-    return true, known
+        assumed = replace(assumed, measured=setup.drifted(HOURS))
+    return truth, assumed
 
 
-def with_ring(here: Setting, shot: Frame, seed: int) -> Frame:
+def with_ring(setup: Setting, shot: Frame, seed: int) -> Frame:
     """The frame, and a ring from 0.9 to 1.2 arcsec."""
-    light = np.random.default_rng([seed, 88]).poisson(ring_photons(here, shot.opd))
+    light = np.random.default_rng([seed, 88]).poisson(ring_photons(setup, shot.opd))
     counts = shot.observation.data[0] + light
-    return replace(shot, observation=seen(here, counts))
+    return replace(shot, observation=observed(setup, counts))
 
 
-def without_ring(known: Setting, shot: Frame, bent: Subtracted) -> tuple[Subtracted, Image]:
-    """The star refined once more, on the frame less a ring of known shape; and the ring."""
+def without_ring(assumed: Setting, shot: Frame, bent: Subtracted) -> tuple[Subtracted, Image]:
+    """Refine the star again after subtracting a ring of known shape; also return the ring."""
     assert bent.fit is not None
-    shape = ring_photons(known, bent.fit.wavefront)
+    shape = ring_photons(assumed, bent.fit.wavefront)
     amplitude, _ = dr.detect(bent.fit, threshold=math.inf).measure_shape(shape)
     ring = amplitude * shape
     less = replace(shot.observation, data=shot.observation.data - ring)
-    fit = dr.refine(known.model, less, known.measured)
+    fit = dr.refine(assumed.model, less, assumed.measured)
     return Subtracted(fit.frames[0].residual[0] + ring, bent.seconds + fit.seconds, fit), ring
 
 
-def seen(here: Setting, counts: Image) -> dr.Observation:
+def observed(setup: Setting, counts: Image) -> dr.Observation:
     """Counts as an observer has them."""
     error = np.sqrt(np.maximum(counts, 0) + Scene().read_noise ** 2)
-    scale = here.model.detector.pixelscale
+    scale = setup.model.detector.pixelscale
     return dr.Observation.from_arrays(counts, error, unit="photon", pixelscale=scale)
 
 
-def klip_on_residuals(known: Setting, left: Subtracted, frames: Image) -> Subtracted:
-    """KLIP on what refinement leaves of the target and of each of the nine references."""
-    fits = [dr.refine(known.model, seen(known, counts), known.measured) for counts in frames]
-    blank = np.zeros_like(left.image)
-    target = Frame(seen(known, left.image), blank, blank, (), blank)
+def klip_on_residuals(assumed: Setting, subtracted: Subtracted, frames: Image) -> Subtracted:
+    """Apply KLIP to the refined residuals of the target and of each of the nine references."""
+    fits = [
+        dr.refine(assumed.model, observed(assumed, counts), assumed.measured) for counts in frames
+    ]
+    blank = np.zeros_like(subtracted.image)
+    target = Frame(observed(assumed, subtracted.image), blank, blank, (), blank)
     return klip(target, np.stack([fit.frames[0].residual[0] for fit in fits]))
 
 
-def one_frame(here: Setting, number: int, steps: int, seed: int) -> Table:
-    """One row a method of the case with this number."""
+def one_frame(setup: Setting, number: int, steps: int, seed: int) -> Table:
+    """One row for each method, for the case with this number."""
     case = CASES[number]
-    true, known = makers(here, case, seed)
+    truth, assumed = makers(setup, case, seed)
     hours = 0.0 if case.later else HOURS
-    shot = frame(true, hours, seed, [PLANET], star_offset=case.offset)
+    shot = frame(truth, hours, seed, [PLANET], star_offset=case.offset)
     if case.disk:
-        shot = with_ring(true, shot, seed)
-    frames = references(true, hours, seed)
-    left = all_of(known, shot, frames, steps, **case.fit)
+        shot = with_ring(truth, shot, seed)
+    frames = references(truth, hours, seed)
+    subtracted = all_of(assumed, shot, frames, steps, **case.fit)
     ring = np.zeros_like(shot.star)
     if case.shape:
-        left["Gauss-Newton"], ring = without_ring(known, shot, left["Gauss-Newton"])
+        subtracted["Gauss-Newton"], ring = without_ring(assumed, shot, subtracted["Gauss-Newton"])
     if case.combined:
-        left["KLIP on residuals"] = klip_on_residuals(known, left["Gauss-Newton"], frames)
-    fit = left["Gauss-Newton"].fit
+        subtracted["KLIP on residuals"] = klip_on_residuals(
+            assumed, subtracted["Gauss-Newton"], frames
+        )
+    fit = subtracted["Gauss-Newton"].fit
     assert fit is not None
     # The ring is no point source: nothing there is to be taken for one.
-    found = dr.detect(fit, threshold=math.inf if case.disk and not case.shape else 5.0)
-    left["marginalised"] = Subtracted(found.subtracted[0] + ring, fit.seconds)
-    planet = found.measure([PLANET.offset])[0]
-    x, y = found.grid[..., 0], found.grid[..., 1]
+    detection = dr.detect(fit, threshold=math.inf if case.disk and not case.shape else 5.0)
+    subtracted["marginalised"] = Subtracted(detection.subtracted[0] + ring, fit.seconds)
+    planet = detection.measure([PLANET.offset])[0]
+    x, y = detection.grid[..., 0], detection.grid[..., 1]
     radius = np.hypot(x, y)
-    away = np.hypot(x - PLANET.offset[0], y - PLANET.offset[1]) > 0.4
-    null = found.residual_snr[away & (radius > 0.3) & (radius < 2.3)]
-    star = pixel(here, case.offset)
-    place = pixel(here, (PLANET.offset[0] + case.offset[0], PLANET.offset[1] + case.offset[1]))
+    distant = np.hypot(x - PLANET.offset[0], y - PLANET.offset[1]) > 0.4
+    null = detection.residual_snr[distant & (radius > 0.3) & (radius < 2.3)]
+    star = pixel(setup, case.offset)
+    place = pixel(setup, (PLANET.offset[0] + case.offset[0], PLANET.offset[1] + case.offset[1]))
     facts = {
         "case": case.name,
         "seed": seed,
@@ -195,9 +199,9 @@ def one_frame(here: Setting, number: int, steps: int, seed: int) -> Table:
             **facts,
             "method": name,
             "annulus_snr": annulus_snr(result.image, place, star),
-            "star_error": star_error(here, shot, result.image),
+            "star_error": star_error(setup, shot, result.image),
         }
-        for name, result in left.items()
+        for name, result in subtracted.items()
     ]
     return Table(rows=rows)
 
@@ -208,7 +212,7 @@ def draw(table: Table) -> Figure:
     figure = Figure(figsize=(14, 1.4 + 0.36 * len(names)), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
     place = np.arange(len(names))
-    one = [chosen(table, case=name, method="Gauss-Newton") for name in names]
+    marginalised_rows = [select(table, case=name, method="Gauss-Newton") for name in names]
     for ax, title, column in (
         (panels[0], "Marginalised S/N / photon limit", "share"),
         (panels[1], "Measured / true contrast", "marginalised_throughput"),
@@ -217,7 +221,7 @@ def draw(table: Table) -> Figure:
             spread(
                 part["marginalised_snr"] / part["photon_snr"] if column == "share" else part[column]
             )
-            for part in one
+            for part in marginalised_rows
         ]
         middle, low, high = np.transpose(spreads)
         ax.errorbar(middle, place, xerr=np.stack([middle - low, high - middle]), fmt="o", ms=4,
@@ -231,7 +235,7 @@ def draw(table: Table) -> Figure:
                 side = "left" if value < SHOWN[0] else "right"
                 ax.text(edge, y, f" {value:.2g} ", ha=side, va="center", fontsize=8)
     for name in ("initial", "KLIP", "Adam", "Gauss-Newton"):
-        spreads = [spread(chosen(table, case=c, method=name)["star_error"]) for c in names]
+        spreads = [spread(select(table, case=c, method=name)["star_error"]) for c in names]
         panels[2].plot(np.transpose(spreads)[0], place, "o", ms=4, color=COLOURS[name], label=name)
     panels[2].set_xscale("log")
     panels[2].set_title("Star error, sigma", fontsize=10, loc="left")
@@ -246,25 +250,27 @@ def main() -> None:
     parser = options(__doc__.splitlines()[0])
     parser.set_defaults(seeds=10)
     parser.add_argument("--cases", type=int, nargs="+", help="numbers, from 0; default all")
-    given = parser.parse_args()
-    here = setting(tuple(given.opd) if given.opd else None, **(QUICK if given.quick else {}))
-    numbers = given.cases or range(len(CASES))
-    if given.quick:
-        jobs = [(here, number, 200, 0) for number in given.cases or (1,)]
+    arguments = parser.parse_args()
+    setup = setting(
+        tuple(arguments.opd) if arguments.opd else None, **(QUICK if arguments.quick else {})
+    )
+    numbers = arguments.cases or range(len(CASES))
+    if arguments.quick:
+        jobs = [(setup, number, 200, 0) for number in arguments.cases or (1,)]
     else:
-        few = (given.seeds + 4) // 5
+        adam_seeds = (arguments.seeds + 4) // 5
         jobs = [
-            (here, number, STEPS if seed < few else 0, seed)
-            for seed in range(given.seeds)
+            (setup, number, STEPS if seed < adam_seeds else 0, seed)
+            for seed in range(arguments.seeds)
             for number in numbers
-            if seed < few or not CASES[number].few
+            if seed < adam_seeds or not CASES[number].few
         ]
-    name = "beyond_measured" if given.opd else "beyond_generator"
+    name = "beyond_measured" if arguments.opd else "beyond_generator"
     table = timed_table(
-        lambda: mapped(one_frame, jobs, given.processes), given.output / f"{name}.ecsv"
+        lambda: mapped(one_frame, jobs, arguments.processes), arguments.output / f"{name}.ecsv"
     )
     for case in dict.fromkeys(table["case"]):
-        part = chosen(table, case=case)
+        part = select(table, case=case)
         share = spread(part["marginalised_snr"] / part["photon_snr"])[0]
         print(
             f"{case}: {', '.join(sorted(set(part['status'])))}, chi2 {np.mean(part['chi2']):.2f}, "
@@ -273,11 +279,11 @@ def main() -> None:
             f"{spread(part['null'])[0]:.2f}"
         )
         for method in METHODS:
-            mine = chosen(part, method=method)
-            if len(mine):
+            subset = select(part, method=method)
+            if len(subset):
                 print(
-                    f"  {method:17s} annulus SNR {spread(mine['annulus_snr'])[0]:6.2f}, star error "
-                    f"{spread(mine['star_error'])[0]:7.2f}"
+                    f"  {method:17s} annulus SNR {spread(subset['annulus_snr'])[0]:6.2f}, "
+                    f"star error {spread(subset['star_error'])[0]:7.2f}"
                 )
 
 

@@ -2,15 +2,15 @@
 
     python examples/paper/contrast_boundary.py --opd BEFORE AFTER --seeds 10
 
-The wavefront map is 40 h old. For a method that leaves an image, the contrast is 5 times the noise
-over the light of a planet of contrast 1, both as the paper's annulus SNR takes them. The noise is
-the scatter of the pixels of the planet's annulus (3 pixels wide) over the root of the pixels in the
-aperture (radius 1.5 pixels), in a frame without planets. The light is the mean over the aperture,
-times the share that the method keeps of planets of photon-limited S/N 5: their light in the
-subtracted frame with them less that without them, over the same with the true star. A second column
-has the same by matched filters: the scatter of the amplitudes on the ring, not below the photon
-noise, over the share of the planet that was kept. For the marginalised estimate it is the closed
-form, the median of the ring. The noise limit is the paper's: 5 times the mean photon noise of the
+The wavefront map is 40 h old. For methods that return a subtracted image, the contrast is 5 times
+the noise over the light of a planet of contrast 1, both as defined for the paper's annulus SNR. The
+noise is the scatter of the pixels of the planet's annulus (3 pixels wide) over the square root of
+the number of pixels in the aperture (radius 1.5 pixels), in a frame without planets. The light is
+the mean over the aperture, times the throughput of the method for planets of photon-limited S/N 5:
+the difference of the subtracted frames with and without them, over that with the true star. A
+second column has the same by matched filters: the scatter of the amplitudes on the ring, at least
+the photon noise, over the throughput. For the marginalised estimate it is the closed form, the
+median of the ring. The noise limit is the paper's: 5 times the mean photon noise of the
 annulus, over the star's peak photons and the occulter's transmission; the photon limit is that of a
 matched filter that knows the star. No small-sample correction, for no method. Adam takes half the
 seeds.
@@ -37,7 +37,7 @@ from pyklip_diffrender.refinement import Refinement
 
 sys.path.insert(0, str(Path(__file__).parent))
 import published
-from judging import COLOURS, Ring, chosen, kept, pixel, separations, spread
+from judging import COLOURS, Ring, pixel, select, separations, spread, throughput_of
 from methods import QUICK, STEPS, all_of, references, with_planets
 from scene import (
     Frame,
@@ -63,49 +63,53 @@ LIMITS = ("noise limit", "photon limit")
 SUBTRACTIONS = ("initial", "KLIP", "Adam", "Gauss-Newton", "optimal")
 
 
-def at_limit(here: Setting, shot: Frame, separation: float, angle: float) -> Planet:
+def at_limit(setup: Setting, shot: Frame, separation: float, angle: float) -> Planet:
     """A planet of the photon-limited S/N `INJECTED`."""
     unit = Planet(1.0, separation, angle)
-    light = planet_photons(here.model, Scene(), unit, shot.opd)
+    light = planet_photons(setup.model, Scene(), unit, shot.opd)
     return Planet(INJECTED / float(np.linalg.norm(light / shot.noise)), separation, angle)
 
 
-def paper_noise(here: Setting, image: Image, separation: float) -> float:
+def paper_noise(setup: Setting, image: Image, separation: float) -> float:
     """Scatter of an annulus, for the mean of an aperture."""
-    pixelscale = here.model.detector.pixelscale[0]
-    ring = np.abs(separations(here) - separation) <= HALF_WIDTH * pixelscale
+    pixelscale = setup.model.detector.pixelscale[0]
+    ring = np.abs(separations(setup) - separation) <= HALF_WIDTH * pixelscale
     return float(np.nanstd(image[ring]))
 
 
-def noise_limit(here: Setting, shot: Frame, separation: float) -> float:
+def noise_limit(setup: Setting, shot: Frame, separation: float) -> float:
     """The paper's fundamental limit (its appendix A)."""
-    ring = np.abs(separations(here) - separation) <= HALF_WIDTH * here.model.detector.pixelscale[0]
-    where = torch.tensor(separation, dtype=torch.float64)
-    passed = (1 - float(ROUND_MASKS["MASK335R"].complement(where, torch.zeros_like(where)))) ** 2
+    ring = (
+        np.abs(separations(setup) - separation) <= HALF_WIDTH * setup.model.detector.pixelscale[0]
+    )
+    position = torch.tensor(separation, dtype=torch.float64)
+    passed = (
+        1 - float(ROUND_MASKS["MASK335R"].complement(position, torch.zeros_like(position)))
+    ) ** 2
     return 5 * float(shot.noise[ring].mean()) / Star().peak_photons / passed
 
 
-def one_seed(here: Setting, places: tuple[float, ...], steps: int, seed: int) -> Table:
-    """One row a separation and method."""
-    shot = frame(here, HOURS, seed)
-    frames = references(here, HOURS, seed)
-    empty = all_of(here, shot, frames, steps)
+def one_seed(setup: Setting, places: tuple[float, ...], steps: int, seed: int) -> Table:
+    """One row for each separation and method."""
+    shot = frame(setup, HOURS, seed)
+    frames = references(setup, HOURS, seed)
+    empty = all_of(setup, shot, frames, steps)
     curve = dr.contrast_curve(empty["Gauss-Newton"].fit, places, angles=60)
     closed = {round(float(row["separation"].value), 3): row for row in curve}
     rows = []
     # Neighbours in separation are in different frames, and on other sides of the star.
     for group in filter(None, (places[::2], places[1::2])):
-        planets = [at_limit(here, shot, s, (54 + 150 * places.index(s)) % 360) for s in group]
-        seen = with_planets(here, shot, planets, seed)
-        full = all_of(here, seen, frames, steps)
+        planets = [at_limit(setup, shot, s, (54 + 150 * places.index(s)) % 360) for s in group]
+        with_sources = with_planets(setup, shot, planets, seed)
+        full = all_of(setup, with_sources, frames, steps)
         measured = together(full["Gauss-Newton"].fit, planets)
         for k, planet in enumerate(planets):
             row = closed[round(planet.separation, 3)]
             facts = {"separation": planet.separation, "seed": seed, "injected": planet.contrast}
-            for values in one_place(here, seen, k, empty, full):
+            for values in one_place(setup, with_sources, k, empty, full):
                 rows.append({**facts, **values})
             for name, limit in (
-                ("noise limit", noise_limit(here, shot, planet.separation)),
+                ("noise limit", noise_limit(setup, shot, planet.separation)),
                 ("photon limit", float(row["known_star"])),
                 ("marginalised", float(row["contrast"])),
             ):
@@ -124,20 +128,22 @@ def together(fit: Refinement, planets: list[Planet]) -> Image:
 
 
 def one_place(
-    here: Setting, seen: Frame, which: int, empty: dict[str, Any], full: dict[str, Any]
+    setup: Setting, with_sources: Frame, which: int, empty: dict[str, Any], full: dict[str, Any]
 ) -> Iterator[dict[str, Any]]:
     """The 5-sigma contrasts of the methods that leave an image."""
-    planet = seen.planets[which][0]
-    where = pixel(here, planet.offset)
-    ring = Ring(here, seen, which)
-    count = aperture_sum(np.ones_like(seen.star), where, APERTURE)
-    unit = aperture_sum(seen.planets[which][1], where, APERTURE) / count / planet.contrast
+    planet = with_sources.planets[which][0]
+    position = pixel(setup, planet.offset)
+    ring = Ring(setup, with_sources, which)
+    count = aperture_sum(np.ones_like(with_sources.star), position, APERTURE)
+    unit = (
+        aperture_sum(with_sources.planets[which][1], position, APERTURE) / count / planet.contrast
+    )
     # With the true star: 1, but for the planet's own noise and the wings of the other planets.
-    true = full["optimal"].image - empty["optimal"].image
-    whole = kept(here, seen, true, np.zeros_like(true), which)
+    difference = full["optimal"].image - empty["optimal"].image
+    total = throughput_of(setup, with_sources, difference, np.zeros_like(difference), which)
     for name, without in empty.items():
-        share = kept(here, seen, full[name].image, without.image, which) / whole
-        noise = paper_noise(here, without.image, planet.separation) / math.sqrt(count)
+        share = throughput_of(setup, with_sources, full[name].image, without.image, which) / total
+        noise = paper_noise(setup, without.image, planet.separation) / math.sqrt(count)
         yield {
             "method": name,
             # Where a method removed the planet altogether there is no contrast to be seen.
@@ -148,14 +154,14 @@ def one_place(
 
 
 def medians(table: Table, method: str, column: str = "contrast") -> tuple[Image, Image]:
-    """Separations, and the median, 16 and 84 percentile there, (3, k)."""
-    part = chosen(table, method=method)
+    """Separations, and median, 16 and 84 percentile at each of them, (3, k)."""
+    part = select(table, method=method)
     places = np.unique(part["separation"])
-    return places, np.transpose([spread(chosen(part, separation=s)[column]) for s in places])
+    return places, np.transpose([spread(select(part, separation=s)[column]) for s in places])
 
 
 def draw(table: Table) -> Figure:
-    """The curves, the paper's beside them; and how much of the planets was kept."""
+    """Draw the contrast curves with those of the paper, and the throughput of the planets."""
     figure = Figure(figsize=(15, 5), layout="constrained")
     panels = figure.subplots(1, 3)
     styles = {"noise limit": ("#b03030", ":"), "photon limit": ("#1b1f24", "--")}
@@ -190,18 +196,20 @@ def main() -> None:
     """Run the study."""
     parser = options(__doc__.splitlines()[0])
     parser.set_defaults(seeds=10)
-    given = parser.parse_args()
-    here = setting(tuple(given.opd) if given.opd else None, **(QUICK if given.quick else {}))
-    if given.quick:
-        jobs = [(here, published.SEPARATIONS[2:3], 200, 0)]
+    arguments = parser.parse_args()
+    setup = setting(
+        tuple(arguments.opd) if arguments.opd else None, **(QUICK if arguments.quick else {})
+    )
+    if arguments.quick:
+        jobs = [(setup, published.SEPARATIONS[2:3], 200, 0)]
     else:
         jobs = [
-            (here, published.SEPARATIONS, STEPS if seed < (given.seeds + 1) // 2 else 0, seed)
-            for seed in range(given.seeds)
+            (setup, published.SEPARATIONS, STEPS if seed < (arguments.seeds + 1) // 2 else 0, seed)
+            for seed in range(arguments.seeds)
         ]
-    name = "contrast_boundary_measured" if given.opd else "contrast_boundary_generator"
+    name = "contrast_boundary_measured" if arguments.opd else "contrast_boundary_generator"
     table = timed_table(
-        lambda: mapped(one_seed, jobs, given.processes), given.output / f"{name}.ecsv"
+        lambda: mapped(one_seed, jobs, arguments.processes), arguments.output / f"{name}.ecsv"
     )
     for method in (*LIMITS, *SUBTRACTIONS, "marginalised"):
         for column in ("contrast", "matched", "throughput"):

@@ -17,9 +17,18 @@ from astropy.table import Table
 from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).parent))
-from judging import chosen, marginalised, methods_in, paper_snr, pixel, shown, spread, star_error
+from judging import (
+    marginalised,
+    median_and_spread,
+    methods_in,
+    paper_snr,
+    pixel,
+    select,
+    spread,
+    star_error,
+)
 from methods import QUICK, STEPS, Subtracted, all_of, references
-from pictures import beside, show, write_images
+from pictures import image_path, show, write_images
 from scene import Image, Planet, Setting, frame, mapped, options, setting, timed_table
 
 CONTRASTS = (8e-7, 2e-6, 4e-6)
@@ -31,19 +40,19 @@ LIMIT = 6.0
 SHOWN = ("initial", "KLIP", "Adam", "Gauss-Newton", "marginalised", "optimal")
 
 
-def one_frame(here: Setting, contrast: float, hours: float, steps: int, seed: int) -> Table:
-    """One row a method, with its image (residual over noise) for the first seed."""
+def one_frame(setup: Setting, contrast: float, hours: float, steps: int, seed: int) -> Table:
+    """One row for each method, with its image (residual over noise) for the first seed."""
     planet = Planet(contrast, *PLACE)
-    shot = frame(here, hours, round(1e8 * contrast) + round(hours) + 1000 * seed, [planet])
-    left = all_of(here, shot, references(here, hours, seed), steps)
-    fit = left["Gauss-Newton"].fit
+    shot = frame(setup, hours, round(1e8 * contrast) + round(hours) + 1000 * seed, [planet])
+    subtracted = all_of(setup, shot, references(setup, hours, seed), steps)
+    fit = subtracted["Gauss-Newton"].fit
     assert fit is not None
-    found, image = marginalised(here, shot, fit)
-    left["marginalised"] = Subtracted(image, found["seconds"])
-    x, y = (round(c) for c in pixel(here, (0.0, 0.0)))
+    row_of_planet, image = marginalised(setup, shot, fit)
+    subtracted["marginalised"] = Subtracted(image, row_of_planet["seconds"])
+    x, y = (round(c) for c in pixel(setup, (0.0, 0.0)))
     window = (slice(y - HALF, y + HALF), slice(x - HALF, x + HALF))
     rows: list[dict[str, Any]] = []
-    for name, result in left.items():
+    for name, result in subtracted.items():
         image = (result.image / shot.noise)[window]
         rows.append(
             {
@@ -51,10 +60,10 @@ def one_frame(here: Setting, contrast: float, hours: float, steps: int, seed: in
                 "hours": hours,
                 "seed": seed,
                 "method": name,
-                "annulus_snr": paper_snr(here, result.image, planet),
-                "star_error": star_error(here, shot, result.image),
-                "marginalised_snr": found["matched_snr"],
-                "marginalised_throughput": found["throughput"],
+                "annulus_snr": paper_snr(setup, result.image, planet),
+                "star_error": star_error(setup, shot, result.image),
+                "marginalised_snr": row_of_planet["matched_snr"],
+                "marginalised_throughput": row_of_planet["throughput"],
                 "image": np.nan_to_num(image) if seed == 0 else np.zeros_like(image),
             }
         )
@@ -63,7 +72,7 @@ def one_frame(here: Setting, contrast: float, hours: float, steps: int, seed: in
 
 def pictures(table: Table) -> dict[str, Image]:
     """Images of the first seed, by name."""
-    first = chosen(table, seed=0)
+    first = select(table, seed=0)
     return {f"{r['contrast']:g} {r['hours']:g} {r['method']}": r["image"] for r in first}
 
 
@@ -77,14 +86,14 @@ def draw(table: Table, images: dict[str, Image]) -> Figure:
     panels = figure.subplots(len(contrasts), count * len(hours), squeeze=False)
     for i, contrast in enumerate(contrasts):
         for j, hour in enumerate(hours):
-            part = chosen(table, contrast=contrast, hours=hour)
+            part = select(table, contrast=contrast, hours=hour)
             for k, name in enumerate(SHOWN):
                 ax = panels[i, j * count + k]
-                mine = chosen(part, method=name)
-                if not len(mine):
+                subset = select(part, method=name)
+                if not len(subset):
                     ax.set_axis_off()
                     continue
-                text = f"{name}\nSNR {spread(mine['annulus_snr'])[0]:.1f}"
+                text = f"{name}\nSNR {spread(subset['annulus_snr'])[0]:.1f}"
                 show(ax, images[f"{contrast:g} {hour:g} {name}"], text, LIMIT)
                 if k == 0:
                     ax.set_ylabel(f"{contrast:.0e}, {hour:g} h", fontsize=8)
@@ -95,34 +104,37 @@ def main() -> None:
     """Run the study."""
     parser = options(__doc__.splitlines()[0])
     parser.set_defaults(seeds=10)
-    given = parser.parse_args()
-    here = setting(tuple(given.opd) if given.opd else None, **(QUICK if given.quick else {}))
-    if given.quick:
-        jobs = [(here, 2e-6, 40.0, 200, 0)]
+    arguments = parser.parse_args()
+    setup = setting(
+        tuple(arguments.opd) if arguments.opd else None, **(QUICK if arguments.quick else {})
+    )
+    if arguments.quick:
+        jobs = [(setup, 2e-6, 40.0, 200, 0)]
     else:
         jobs = [
-            (here, contrast, hours, STEPS if seed < (given.seeds + 4) // 5 else 0, seed)
-            for seed in range(given.seeds)
+            (setup, contrast, hours, STEPS if seed < (arguments.seeds + 4) // 5 else 0, seed)
+            for seed in range(arguments.seeds)
             for contrast in CONTRASTS
             for hours in HOURS
         ]
-    name = "contrast_drift_measured" if given.opd else "contrast_drift_generator"
-    path = given.output / f"{name}.ecsv"
+    name = "contrast_drift_measured" if arguments.opd else "contrast_drift_generator"
+    path = arguments.output / f"{name}.ecsv"
 
     def work() -> Table:
-        table = mapped(one_frame, jobs, given.processes)
-        write_images(beside(path), pictures(table), LIMIT)
+        table = mapped(one_frame, jobs, arguments.processes)
+        write_images(image_path(path), pictures(table), LIMIT)
         table.remove_column("image")
         return table
 
     table = timed_table(work, path)
     for contrast in np.unique(table["contrast"]):
         for hours in np.unique(table["hours"]):
-            part = chosen(table, contrast=contrast, hours=hours)
+            part = select(table, contrast=contrast, hours=hours)
             print(f"{contrast:.0e}, {hours:g} h, annulus SNR:")
             for method in methods_in(part):
-                print(f"  {method:13s} {shown(chosen(part, method=method)['annulus_snr'])}")
-            print(f"  marginalised S/N {shown(part['marginalised_snr'])}")
+                snr = median_and_spread(select(part, method=method)["annulus_snr"])
+                print(f"  {method:13s} {snr}")
+            print(f"  marginalised S/N {median_and_spread(part['marginalised_snr'])}")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Where calibration breaks, and whether the status says so.
+"""Cases in which calibration breaks, and whether the status reports it.
 
     python examples/paper/failures.py --opd BEFORE AFTER --seeds 3
 
-Frames without a planet. Each case makes one thing wrong that the fit does not know of: a wavefront
+Frames without a planet. Each case has one error that is unknown to the fit: a wavefront
 that drifted too far, a prior that is wrong and held fixed, an instrument that is not the model's.
 On the embedded generator each seed has a wavefront and a drift of its own.
 """
@@ -32,12 +32,12 @@ GENERATOR_SCALES = {"segment": 2.0, "texture": 0.16}
 
 @dataclass(frozen=True)
 class Case:
-    """What is wrong."""
+    """A case, by its errors."""
 
     name: str
     hours: float = 40.0
     prior: float = 0.0
-    """Factor by which the prior's fixed scales are off; 0 for scales that are fitted."""
+    """Error of the prior's fixed scales, as a factor; 0 for scales that are fitted."""
     fit: dict[str, Any] = field(default_factory=dict)
     truth: dict[str, Any] = field(default_factory=dict)
 
@@ -58,19 +58,19 @@ CASES = (
 MOVED = {"lyot_shift": (0.002, -0.001)}
 
 
-def _prior(here: Setting, factor: float) -> WavefrontPrior:
-    found = MEASURED_SCALES if here.before else GENERATOR_SCALES
-    scales = {name: factor * scale for name, scale in found.items()}
+def _prior(setup: Setting, factor: float) -> WavefrontPrior:
+    typical = MEASURED_SCALES if setup.before else GENERATOR_SCALES
+    scales = {name: factor * scale for name, scale in typical.items()}
     return WavefrontPrior(scales=scales, fit_scales=False)
 
 
-def _shot(here: Setting, case: Case, seed: int) -> Frame:
-    model = here.model.with_fidelity(**case.truth) if case.truth else here.model
+def _shot(setup: Setting, case: Case, seed: int) -> Frame:
+    model = setup.model.with_fidelity(**case.truth) if case.truth else setup.model
     if case.name.startswith("Lyot"):
         model = _moved(model)
-    shot = frame(replace(here, model=model), case.hours, seed)
+    shot = frame(replace(setup, model=model), case.hours, seed)
     # The observer does not know of the difference.
-    scale = here.model.detector.pixelscale
+    scale = setup.model.detector.pixelscale
     return replace(shot, observation=replace(shot.observation, pixelscale=scale))
 
 
@@ -86,15 +86,15 @@ def _moved(model: dr.OpticalSystem) -> Any:
     return Shifted()
 
 
-def one_frame(here: Setting, case: Case, seed: int) -> Table:
+def one_frame(setup: Setting, case: Case, seed: int) -> Table:
     """One row of the table."""
-    here = here.redrawn(seed)
-    shot = _shot(here, case, seed)
-    wrong = {"prior": _prior(here, case.prior)} if case.prior else {}
+    setup = setup.redrawn(seed)
+    shot = _shot(setup, case, seed)
+    wrong = {"prior": _prior(setup, case.prior)} if case.prior else {}
     settings = GaussNewton(**case.fit, **wrong)
-    fit = dr.refine(here.model, shot.observation, here.measured, settings=settings)
-    found = dr.detect(fit, threshold=math.inf)
-    radius = np.hypot(found.grid[..., 0], found.grid[..., 1])
+    fit = dr.refine(setup.model, shot.observation, setup.measured, settings=settings)
+    detection = dr.detect(fit, threshold=math.inf)
+    radius = np.hypot(detection.grid[..., 0], detection.grid[..., 1])
     inside = (radius >= 0.3) & (radius < 2.3)
     return Table(
         rows=[
@@ -104,10 +104,10 @@ def one_frame(here: Setting, case: Case, seed: int) -> Table:
                 "status": fit.status.name,
                 "chi2": fit.chi2_per_pixel,
                 "expected_chi2": 1 - fit.effective_parameters / shot.star.size,
-                "scatter": found.scatter,
-                "null": found.snr[inside].std(),
-                "highest": np.abs(found.snr[inside]).max(),
-                "limit": float(np.median((found.error / found.photon_error)[inside])),
+                "scatter": detection.scatter,
+                "null": detection.snr[inside].std(),
+                "highest": np.abs(detection.snr[inside]).max(),
+                "limit": float(np.median((detection.error / detection.photon_error)[inside])),
                 "cycles": float(fit.basis.frequencies.max()),
                 "seconds": fit.seconds,
             }
@@ -117,15 +117,15 @@ def one_frame(here: Setting, case: Case, seed: int) -> Table:
 
 def main() -> None:
     """Run the study."""
-    given = options(__doc__.splitlines()[0]).parse_args()
-    changes = {"npix": 256, "fov_pixels": 48} if given.quick else {}
-    here = setting(tuple(given.opd) if given.opd else None, **changes)
-    cases = CASES[4:6] if given.quick else CASES
-    seeds = range(1 if given.quick else given.seeds)
-    jobs = [(here, case, seed) for case in cases for seed in seeds]
-    name = "failures_measured" if given.opd else "failures_generator"
+    arguments = options(__doc__.splitlines()[0]).parse_args()
+    changes = {"npix": 256, "fov_pixels": 48} if arguments.quick else {}
+    setup = setting(tuple(arguments.opd) if arguments.opd else None, **changes)
+    cases = CASES[4:6] if arguments.quick else CASES
+    seeds = range(1 if arguments.quick else arguments.seeds)
+    jobs = [(setup, case, seed) for case in cases for seed in seeds]
+    name = "failures_measured" if arguments.opd else "failures_generator"
     table = timed_table(
-        lambda: mapped(one_frame, jobs, given.processes), given.output / f"{name}.ecsv"
+        lambda: mapped(one_frame, jobs, arguments.processes), arguments.output / f"{name}.ecsv"
     )
     for case in cases:
         part = table[table["case"] == case.name]

@@ -27,24 +27,24 @@ LIMIT = 0.0
 """In place of a contrast: the 5-sigma limit."""
 
 
-def one_frame(here: Setting, contrast: float, separation: float, seed: int) -> Table:
+def one_frame(setup: Setting, contrast: float, separation: float, seed: int) -> Table:
     """One row of the table."""
-    here = here.redrawn(seed)
+    setup = setup.redrawn(seed)
     angle = float(np.random.default_rng(1000 + seed).uniform(0, 360))
     limit = contrast == LIMIT
     if limit:
         # The limit at that very place, from a frame without a planet.
-        empty = dr.refine(here.model, frame(here, HOURS, 5000 + seed).observation, here.measured)
+        empty = dr.refine(setup.model, frame(setup, HOURS, 5000 + seed).observation, setup.measured)
         place = Planet(0.0, separation, angle).offset
         contrast = 5 * float(dr.measure(empty, [place])["contrast_error"][0])
     planet = Planet(contrast, separation, angle)
-    shot = frame(here, HOURS, seed, [planet])
-    fit = dr.refine(here.model, shot.observation, here.measured)
+    shot = frame(setup, HOURS, seed, [planet])
+    fit = dr.refine(setup.model, shot.observation, setup.measured)
     row = dr.measure(fit, [planet.offset])[0]
     # What the fit's own residual kept of it, by a matched filter on the true noise.
     weight = shot.planets[0][1] / shot.noise**2
     light = float((weight * shot.planets[0][1]).sum())
-    kept = float((weight * fit.frames[0].residual[0]).sum()) / light
+    throughput_of = float((weight * fit.frames[0].residual[0]).sum()) / light
     return Table(
         rows=[
             {
@@ -56,7 +56,7 @@ def one_frame(here: Setting, contrast: float, separation: float, seed: int) -> T
                 "measured": float(row["contrast"]),
                 "error": float(row["contrast_error"]),
                 "photon_error": contrast * light**-0.5,
-                "kept_by_subtraction": kept,
+                "kept_by_subtraction": throughput_of,
                 "status": fit.status.name,
             }
         ]
@@ -67,12 +67,12 @@ def summary(table: Table) -> Table:
     """Bias and coverage, by contrast and for the planets at the limit."""
     pull = (table["measured"] - table["contrast"]) / table["error"]
     rows = []
-    for name, chosen in [
+    for name, select in [
         *((f"{c:g}", ~table["injected_at_limit"] & (table["contrast"] == c)) for c in CONTRASTS),
         ("5-sigma limit", table["injected_at_limit"]),
         ("all", np.ones(len(table), dtype=bool)),
     ]:
-        part, of = table[chosen], pull[chosen]
+        part, of = table[select], pull[select]
         if not len(part):
             continue
         ratio = part["measured"] / part["contrast"]
@@ -95,29 +95,29 @@ def summary(table: Table) -> Table:
 
 def main() -> None:
     """Run the study."""
-    given = options(__doc__.splitlines()[0]).parse_args()
-    changes = {"npix": 256, "fov_pixels": 48} if given.quick else {}
-    here = setting(tuple(given.opd) if given.opd else None, **changes)
-    if given.quick:
+    arguments = options(__doc__.splitlines()[0]).parse_args()
+    changes = {"npix": 256, "fov_pixels": 48} if arguments.quick else {}
+    setup = setting(tuple(arguments.opd) if arguments.opd else None, **changes)
+    if arguments.quick:
         cases = [(1e-5, 0.6, 0), (LIMIT, 0.9, 1)]
     else:
         cases = [
             (contrast, separation, seed)
-            for seed in range(max(1, given.seeds // 4))
+            for seed in range(max(1, arguments.seeds // 4))
             for separation in SEPARATIONS
             for contrast in (*CONTRASTS, LIMIT)
         ]
         # Every frame its own noise.
         cases = [(c, s, 100 * seed + k) for k, (c, s, seed) in enumerate(cases)]
-    name = "fluxes_measured" if given.opd else "fluxes_generator"
-    jobs = [(here, *case) for case in cases]
+    name = "fluxes_measured" if arguments.opd else "fluxes_generator"
+    jobs = [(setup, *case) for case in cases]
     table = timed_table(
-        lambda: mapped(one_frame, jobs, given.processes), given.output / f"{name}.ecsv"
+        lambda: mapped(one_frame, jobs, arguments.processes), arguments.output / f"{name}.ecsv"
     )
-    found = summary(table)
-    for column in found.colnames[2:]:
-        found[column].info.format = ".3f"
-    print("\n".join(found.pformat(max_lines=-1, max_width=-1)))
+    medians = summary(table)
+    for column in medians.colnames[2:]:
+        medians[column].info.format = ".3f"
+    print("\n".join(medians.pformat(max_lines=-1, max_width=-1)))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ def draw() -> Figure:
     """S/N calibration, limit, fluxes."""
     panels = 3 if tables("fluxes") else 2
     figure = Figure(figsize=(5 * panels, 4.4), layout="constrained")
-    left, middle, *rest = figure.subplots(1, panels)
+    null_axes, middle, *rest = figure.subplots(1, panels)
     middles = calibration.RINGS[:-1] + 0.1
     for kind, table in tables("calibration").items():
         for hours, style in ((3.0, ":"), (40.0, "-"), (86.0, "--"), (200.0, "-.")):
@@ -25,13 +25,13 @@ def draw() -> Figure:
             label = f"{KINDS[kind]}, {hours:g} h"
             nulls = [calibration.rms(part[f"null_{r:.1f}"]) for r in calibration.RINGS[:-1]]
             limits = [part[f"limit_{r:.1f}"].mean() for r in calibration.RINGS[:-1]]
-            left.plot(middles, nulls, style, color=COLOURS[kind], label=label)
+            null_axes.plot(middles, nulls, style, color=COLOURS[kind], label=label)
             middle.plot(middles, limits, style, color=COLOURS[kind], label=label)
-    left.axhspan(0.85, 1.2, color="0.93", zorder=0)
-    left.axhline(1, color="0.5", lw=0.8)
-    left.set_ylim(0.6, 1.5)
+    null_axes.axhspan(0.85, 1.2, color="0.93", zorder=0)
+    null_axes.axhline(1, color="0.5", lw=0.8)
+    null_axes.set_ylim(0.6, 1.5)
     titles = (
-        (left, "Deviation of S/N where there is nothing"),
+        (null_axes, "Standard deviation of planet-free S/N"),
         (middle, "5-sigma limit / photon limit"),
         *((ax, "Injected planets: (measured - true) / error") for ax in rest),
     )
@@ -39,14 +39,14 @@ def draw() -> Figure:
         ax.set_title(title, fontsize=10, loc="left")
         ax.set_xlabel("pull" if ax in rest else "arcsec", fontsize=9)
     middle.set_ylim(1.0, 1.5)
-    left.legend(frameon=False, fontsize=7)
+    null_axes.legend(frameon=False, fontsize=7)
     for ax in rest:
         _draw_pulls(ax)
     return figure
 
 
 def _draw_pulls(ax: Axes) -> None:
-    """Of all injected planets, beside the normal distribution."""
+    """Draw the pulls of all injected planets with the normal distribution."""
     edges = np.arange(-4, 4.01, 0.5)
     for kind, table in tables("fluxes").items():
         pull = (table["measured"] - table["contrast"]) / table["error"]

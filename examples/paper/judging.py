@@ -1,7 +1,7 @@
-"""How what a method leaves of the star is judged, and how spreads are shown.
+"""Figures of merit of the subtracted images, and the format of spreads.
 
-The paper's annulus SNR, matched filters, the share of the planet's light that was kept, and the
-distance of the subtracted star from the true one. Spreads are medians with the 16 and 84
+The paper's annulus SNR, matched filters, the throughput of the planet, and the
+error of the subtracted star. Spreads are medians with the 16 and 84
 percentiles over noise realisations.
 """
 
@@ -24,9 +24,9 @@ from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.refinement import Refinement
 
 FIELD = (0.3, 2.3)
-"""Inner and outer radius over which the star's error is taken, arcsec."""
+"""Inner and outer radius of the region in which the star's error is measured, arcsec."""
 AWAY = 0.4
-"""Positions of a ring nearer to the planet say nothing about the noise, arcsec."""
+"""Smallest distance from the planet of positions that measure the noise, arcsec."""
 
 ORDER = ("initial", "KLIP", "KLIP, library", "Adam", "Gauss-Newton", "marginalised", "optimal")
 COLOURS = {
@@ -40,44 +40,44 @@ COLOURS = {
 }
 
 
-def pixel(here: Setting, offset: tuple[float, float]) -> tuple[float, float]:
+def pixel(setup: Setting, offset: tuple[float, float]) -> tuple[float, float]:
     """x, y in pixels of a position relative to the star."""
-    ny, nx = here.model.detector.shape
-    scale = here.model.detector.pixelscale
+    ny, nx = setup.model.detector.shape
+    scale = setup.model.detector.pixelscale
     return (nx - 1) / 2 + offset[0] / scale[0], (ny - 1) / 2 + offset[1] / scale[1]
 
 
-def separations(here: Setting) -> Image:
+def separations(setup: Setting) -> Image:
     """Of every pixel from the star, arcsec."""
-    ny, nx = here.model.detector.shape
-    scale = here.model.detector.pixelscale
+    ny, nx = setup.model.detector.shape
+    scale = setup.model.detector.pixelscale
     y, x = np.indices((ny, nx))
     return np.hypot((x - (nx - 1) / 2) * scale[0], (y - (ny - 1) / 2) * scale[1])
 
 
-def star_error(here: Setting, shot: Frame, image: Image) -> float:
+def star_error(setup: Setting, shot: Frame, image: Image) -> float:
     """Rms of (subtracted star - true star) / noise, over `FIELD`.
 
-    For KLIP, which has no model of the star, what it took of the planet is part of it.
+    For KLIP, which has no model of the star, this includes the light that it took from the planet.
     """
-    radius = separations(here)
+    radius = separations(setup)
     ring = (radius >= FIELD[0]) & (radius <= FIELD[1]) & np.isfinite(image)
     return float(np.sqrt(np.mean(((shot.known_star - image) / shot.noise)[ring] ** 2)))
 
 
-def paper_snr(here: Setting, image: Image, planet: Planet) -> float:
+def paper_snr(setup: Setting, image: Image, planet: Planet) -> float:
     """The paper's annulus SNR."""
-    return annulus_snr(image, pixel(here, planet.offset), pixel(here, (0.0, 0.0)))
+    return annulus_snr(image, pixel(setup, planet.offset), pixel(setup, (0.0, 0.0)))
 
 
-def kept(here: Setting, shot: Frame, image: Image, empty: Image, which: int = 0) -> float:
-    """Share of a planet's light that a subtraction kept.
+def throughput_of(setup: Setting, shot: Frame, image: Image, empty: Image, which: int = 0) -> float:
+    """Fraction of a planet's light that remains after a subtraction.
 
-    `empty` is what the method left of the same frame without the planet, so that neither the
-    star's noise nor its remains count.
+    `empty` is the image that the method returns for the same frame without the planet. It removes
+    the noise and the residuals of the star.
     """
     planet, light = shot.planets[which]
-    return throughput(image - empty, light, shot.noise, pixel(here, planet.offset))
+    return throughput(image - empty, light, shot.noise, pixel(setup, planet.offset))
 
 
 class Ring:
@@ -88,20 +88,20 @@ class Ring:
     here : Setting
     shot : Frame
     which : int
-        Which of its planets is looked at.
+        Index of the planet.
     """
 
-    def __init__(self, here: Setting, shot: Frame, which: int = 0) -> None:
+    def __init__(self, setup: Setting, shot: Frame, which: int = 0) -> None:
         planet, light = shot.planets[which]
-        scale = here.model.detector.pixelscale
-        ny, nx = here.model.detector.shape
+        scale = setup.model.detector.pixelscale
+        ny, nx = setup.model.detector.shape
         y, x = np.indices((ny, nx))
         x, y = (x - (nx - 1) / 2) * scale[0], (y - (ny - 1) / 2) * scale[1]
-        near = np.hypot(x - planet.offset[0], y - planet.offset[1]) < AWAY
+        close = np.hypot(x - planet.offset[0], y - planet.offset[1]) < AWAY
         ring = np.abs(np.hypot(x, y) - planet.separation) <= scale[0] / 2
-        rows, columns = np.nonzero(ring & ~near)
+        rows, columns = np.nonzero(ring & ~close)
         with torch.no_grad():
-            points = PointSources(here.model, shot.opd).images(rows, columns)
+            points = PointSources(setup.model, shot.opd).images(rows, columns)
         self.templates = np.concatenate([light[None] / planet.contrast, points.double().numpy()])
         self.templates[1:] *= Star().photons
         self.weight = 1 / shot.noise**2
@@ -113,10 +113,10 @@ class Ring:
         return (weighed @ image[good]) / (weighed * self.templates[:, good]).sum(axis=1)
 
     def noise(self, empty: Image) -> float:
-        """Scatter of the amplitudes in what a method leaves of a frame without the planet.
+        """Scatter of the amplitudes in the subtracted frame without the planet.
 
-        Not below the photon noise: a fit that follows the noise makes the ring smoother, but not
-        the planet surer.
+        At least the photon noise: a fit that follows some of the noise makes the ring smoother, but
+        does not improve the measurement of the planet.
         """
         good = np.isfinite(empty)
         light = self.templates[0][good]
@@ -130,7 +130,7 @@ class Ring:
 
 
 def best_snr(shot: Frame) -> float:
-    """S/N of the matched filter that knows the star: nothing can do better."""
+    """S/N of the matched filter for a known star, the highest possible."""
     light = shot.planets[0][1]
     weight = 1 / (shot.noise**2 + light)
     return float((weight * light * shot.known_star).sum() / math.sqrt((weight * light**2).sum()))
@@ -142,13 +142,13 @@ def photon_snr(shot: Frame) -> float:
     return math.sqrt(float((light**2 / (shot.noise**2 + light)).sum()))
 
 
-def judged(
-    here: Setting,
+def judge(
+    setup: Setting,
     shot: Frame,
-    left: dict[str, Subtracted],
+    subtracted: dict[str, Subtracted],
     empty: dict[str, Subtracted],
 ) -> list[dict[str, Any]]:
-    """One row a method.
+    """One row for each method.
 
     Parameters
     ----------
@@ -156,48 +156,48 @@ def judged(
     shot : Frame
         With one planet.
     left, empty : dict of str to Subtracted
-        What each method leaves, with and without the planet.
+        Subtracted images of every method, with and without the planet.
     """
     planet = shot.planets[0][0]
-    ring = Ring(here, shot)
+    ring = Ring(setup, shot)
     rows = []
-    for name, result in left.items():
+    for name, result in subtracted.items():
         snr = ring.snr(result.image, empty[name].image)
         if name == "optimal":
             snr = best_snr(shot)
         rows.append(
             {
                 "method": name,
-                "annulus_snr": paper_snr(here, result.image, planet),
+                "annulus_snr": paper_snr(setup, result.image, planet),
                 "matched_snr": snr,
-                "throughput": kept(here, shot, result.image, empty[name].image),
-                "star_error": star_error(here, shot, result.image),
+                "throughput": throughput_of(setup, shot, result.image, empty[name].image),
+                "star_error": star_error(setup, shot, result.image),
                 "seconds": result.seconds,
             }
         )
-    fit = left["Gauss-Newton"].fit
+    fit = subtracted["Gauss-Newton"].fit
     if fit is not None:
-        rows.append(marginalised(here, shot, fit)[0])
+        rows.append(marginalised(setup, shot, fit)[0])
     return rows
 
 
-def marginalised(here: Setting, shot: Frame, fit: Refinement) -> tuple[dict[str, Any], Image]:
-    """The planet measured with the wavefront integrated out, and the frame less the star.
+def marginalised(setup: Setting, shot: Frame, fit: Refinement) -> tuple[dict[str, Any], Image]:
+    """Measure the planet with the wavefront marginalised; also return the star-subtracted frame.
 
-    The image is subtracted with what `detect` found by itself in the model. Where it misses the
-    planet, the image has lost the same as Gauss-Newton's.
+    The star is subtracted with the candidates of `detect` in the model. If the planet is not among
+    them, the image has lost as much of its light as that of Gauss-Newton.
     """
     began = time.perf_counter()
     planet = shot.planets[0][0]
-    found = dr.detect(fit)
-    there = found.measure([planet.offset])[0]
-    image = found.subtracted[0]
+    detection = dr.detect(fit)
+    measurement = detection.measure([planet.offset])[0]
+    image = detection.subtracted[0]
     row = {
         "method": "marginalised",
-        "annulus_snr": paper_snr(here, image, planet),
-        "matched_snr": float(there["snr"]),
-        "throughput": float(there["contrast"]) / planet.contrast,
-        "star_error": star_error(here, shot, image),
+        "annulus_snr": paper_snr(setup, image, planet),
+        "matched_snr": float(measurement["snr"]),
+        "throughput": float(measurement["contrast"]) / planet.contrast,
+        "star_error": star_error(setup, shot, image),
         "seconds": fit.seconds + time.perf_counter() - began,
     }
     return row, image
@@ -207,7 +207,7 @@ def marginalised(here: Setting, shot: Frame, fit: Refinement) -> tuple[dict[str,
 
 
 def spread(values: Any) -> tuple[float, float, float]:
-    """Median, 16 and 84 percentile of what is no NaN; NaN of nothing."""
+    """Median, 16 and 84 percentile of the values that are not NaN; NaN if there are none."""
     good = np.asarray(values, dtype=float)
     good = good[~np.isnan(good)]
     if not good.size:
@@ -218,7 +218,7 @@ def spread(values: Any) -> tuple[float, float, float]:
     return float(middle), float(low), float(high)
 
 
-def shown(values: Any, form: str = ".1f") -> str:
+def median_and_spread(values: Any, form: str = ".1f") -> str:
     """Median and spread as text."""
     middle, low, high = spread(values)
     if math.isnan(middle):
@@ -226,7 +226,7 @@ def shown(values: Any, form: str = ".1f") -> str:
     return f"{middle:{form}} ({low:{form}} to {high:{form}})"
 
 
-def chosen(table: Table, **conditions: Any) -> Table:
+def select(table: Table, **conditions: Any) -> Table:
     """Rows where the named columns have these values."""
     mask = np.ones(len(table), dtype=bool)
     for name, value in conditions.items():
@@ -240,5 +240,5 @@ def chosen(table: Table, **conditions: Any) -> Table:
 
 def methods_in(table: Table) -> Sequence[str]:
     """Methods of a table, in the usual order."""
-    there = set(table["method"])
-    return [name for name in ORDER if name in there]
+    names = set(table["method"])
+    return [name for name in ORDER if name in names]

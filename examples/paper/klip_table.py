@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).parent))
 import published
-from judging import COLOURS, chosen, judged, methods_in, photon_snr, shown, spread
+from judging import COLOURS, judge, median_and_spread, methods_in, photon_snr, select, spread
 from methods import LIBRARY, QUICK, STEPS, all_of, library, references, with_planets
 from scene import Planet, Setting, frame, mapped, options, setting, timed_table
 
@@ -30,23 +30,23 @@ CASES = tuple(published.TABLE)
 """Separation and contrast; the first three rows are one panel, the last three the other."""
 
 
-def one_seed(here: Setting, cases: tuple[Any, ...], steps: int, count: int, seed: int) -> Table:
-    """One row a planet and method."""
-    shot = frame(here, HOURS, seed)
-    nine, many = references(here, HOURS, seed), library(here, HOURS, seed, count)
+def one_seed(setup: Setting, cases: tuple[Any, ...], steps: int, count: int, seed: int) -> Table:
+    """One row for each planet and method."""
+    shot = frame(setup, HOURS, seed)
+    nine, archive = references(setup, HOURS, seed), library(setup, HOURS, seed, count)
 
-    empty = all_of(here, shot, nine, steps, many)
+    empty = all_of(setup, shot, nine, steps, archive)
     rows = []
     for separation, contrast in cases:
-        seen = with_planets(here, shot, [Planet(contrast, separation, ANGLE)], seed)
-        left = all_of(here, seen, nine, steps, many)
+        with_planet = with_planets(setup, shot, [Planet(contrast, separation, ANGLE)], seed)
+        subtracted = all_of(setup, with_planet, nine, steps, archive)
         facts = {
             "separation": separation,
             "contrast": contrast,
             "seed": seed,
-            "photon_snr": photon_snr(seen),
+            "photon_snr": photon_snr(with_planet),
         }
-        rows += [{**facts, **row} for row in judged(here, seen, left, empty)]
+        rows += [{**facts, **row} for row in judge(setup, with_planet, subtracted, empty)]
     return Table(rows=rows)
 
 
@@ -54,7 +54,7 @@ def draw(table: Table) -> Figure:
     """Annulus SNR and matched-filter S/N, relative to the known star's."""
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     panels = figure.subplots(1, 3)
-    cases = [case for case in CASES if len(chosen(table, separation=case[0], contrast=case[1]))]
+    cases = [case for case in CASES if len(select(table, separation=case[0], contrast=case[1]))]
     names = methods_in(table)
     titles = {
         "annulus_snr": "Annulus SNR (the paper's)",
@@ -64,7 +64,7 @@ def draw(table: Table) -> Figure:
     for ax, (column, title) in zip(panels, titles.items(), strict=True):
         for k, name in enumerate(names):
             spreads = [
-                spread(chosen(table, separation=s, contrast=c, method=name)[column])
+                spread(select(table, separation=s, contrast=c, method=name)[column])
                 for s, c in cases
             ]
             middle, low, high = np.transpose(spreads)
@@ -87,9 +87,11 @@ def lines(table: Table, column: str, form: str) -> list[list[str]]:
     """Rows of the page's table: case, then the spread of every method."""
     rows = []
     for separation, contrast in CASES:
-        case = chosen(table, separation=separation, contrast=contrast)
+        case = select(table, separation=separation, contrast=contrast)
         if len(case):
-            cells = [shown(chosen(case, method=m)[column], form) for m in methods_in(table)]
+            cells = [
+                median_and_spread(select(case, method=m)[column], form) for m in methods_in(table)
+            ]
             rows.append([f"{separation:g} arcsec, {contrast:.0e}", *cells])
     return rows
 
@@ -98,25 +100,25 @@ def main() -> None:
     """Run the study."""
     parser = options(__doc__.splitlines()[0])
     parser.set_defaults(seeds=10)
-    given = parser.parse_args()
-    changes = QUICK if given.quick else {}
-    here = setting(tuple(given.opd) if given.opd else None, **changes)
-    if given.quick:
-        jobs = [(here, CASES[:1], 200, 10, 0)]
+    arguments = parser.parse_args()
+    changes = QUICK if arguments.quick else {}
+    setup = setting(tuple(arguments.opd) if arguments.opd else None, **changes)
+    if arguments.quick:
+        jobs = [(setup, CASES[:1], 200, 10, 0)]
     else:
         jobs = [
-            (here, CASES, STEPS if seed < (given.seeds + 1) // 2 else 0, LIBRARY, seed)
-            for seed in range(given.seeds)
+            (setup, CASES, STEPS if seed < (arguments.seeds + 1) // 2 else 0, LIBRARY, seed)
+            for seed in range(arguments.seeds)
         ]
-    name = "klip_table_measured" if given.opd else "klip_table_generator"
+    name = "klip_table_measured" if arguments.opd else "klip_table_generator"
     table = timed_table(
-        lambda: mapped(one_seed, jobs, given.processes), given.output / f"{name}.ecsv"
+        lambda: mapped(one_seed, jobs, arguments.processes), arguments.output / f"{name}.ecsv"
     )
     for column in ("annulus_snr", "matched_snr", "throughput", "star_error"):
         print(column, *methods_in(table), sep=" | ")
         for row in lines(table, column, ".2f"):
             print("  ", *row, sep=" | ")
-    won = chosen(table, method="marginalised")
+    won = select(table, method="marginalised")
     print(f"marginalised / photon limit: {spread(won['matched_snr'] / won['photon_snr'])}")
 
 

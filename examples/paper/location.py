@@ -1,9 +1,9 @@
-"""Where the planet is, found and true: the paper's experiment on the planet's location.
+"""Detected and true positions: the paper's experiment on the location of the planet.
 
     python examples/paper/location.py --opd BEFORE AFTER --seeds 10
 
 A planet of 2e-6, 0.4 to 2.2 arcsec from the star, at an angle that changes from seed to seed, the
-wavefront map 40 h old. Nothing is told about it: its position is that of the nearest candidate.
+wavefront map 40 h old. The search is blind: the measured position is that of the nearest candidate.
 Adam takes a fifth of the seeds.
 """
 
@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 import pyklip_diffrender as dr
 
 sys.path.insert(0, str(Path(__file__).parent))
-from judging import COLOURS, chosen, paper_snr, photon_snr, spread
+from judging import COLOURS, paper_snr, photon_snr, select, spread
 from methods import QUICK, STEPS, all_of, references
 from scene import Planet, Setting, frame, mapped, options, setting, timed_table
 
@@ -33,14 +33,14 @@ NEAR = 0.15
 SNRS = ("initial", "KLIP", "Adam", "Gauss-Newton", "optimal")
 
 
-def one_frame(here: Setting, separation: float, steps: int, seed: int) -> Table:
+def one_frame(setup: Setting, separation: float, steps: int, seed: int) -> Table:
     """One row of the table."""
     place = round(1000 * separation)
     angle = float(np.random.default_rng([seed, place]).uniform(0, 360))
     planet = Planet(CONTRAST, separation, angle)
-    shot = frame(here, HOURS, 10 * place + seed, [planet])
-    left = all_of(here, shot, references(here, HOURS, seed), steps)
-    fit = left["Gauss-Newton"].fit
+    shot = frame(setup, HOURS, 10 * place + seed, [planet])
+    subtracted = all_of(setup, shot, references(setup, HOURS, seed), steps)
+    fit = subtracted["Gauss-Newton"].fit
     assert fit is not None
     table = dr.detect(fit).table
     row: dict[str, Any] = {
@@ -55,9 +55,9 @@ def one_frame(here: Setting, separation: float, steps: int, seed: int) -> Table:
     }
     row |= dict.fromkeys(("x_found", "y_found", "x_error", "y_error", "snr", "flux_ratio"), np.nan)
     if len(table):
-        away = np.hypot(table["x"].value - row["x"], table["y"].value - row["y"])
-        best = table[int(np.argmin(away))]
-        if away.min() < NEAR:
+        distance_to = np.hypot(table["x"].value - row["x"], table["y"].value - row["y"])
+        best = table[int(np.argmin(distance_to))]
+        if distance_to.min() < NEAR:
             row |= {
                 "found": True,
                 "false_candidates": len(table) - 1,
@@ -69,12 +69,14 @@ def one_frame(here: Setting, separation: float, steps: int, seed: int) -> Table:
                 "flux_ratio": float(best["contrast"]) / CONTRAST,
             }
     for name in SNRS:
-        row[f"snr_{name}"] = paper_snr(here, left[name].image, planet) if name in left else np.nan
+        row[f"snr_{name}"] = (
+            paper_snr(setup, subtracted[name].image, planet) if name in subtracted else np.nan
+        )
     return Table(rows=[row])
 
 
 def distance(table: Table) -> np.ndarray:
-    """Of what was found from the truth, mas."""
+    """Distance of the detected from the true positions, mas."""
     return 1e3 * np.hypot(table["x_found"] - table["x"], table["y_found"] - table["y"])
 
 
@@ -93,13 +95,13 @@ def draw(table: Table) -> Figure:
     middle.semilogy(table["separation"], distance(table), ".", color=COLOURS["marginalised"])
     expected = [
         1e3 * np.nanmedian(np.hypot(part["x_error"], part["y_error"]))
-        for part in (chosen(table, separation=place) for place in places)
+        for part in (select(table, separation=place) for place in places)
     ]
     middle.semilogy(places, expected, "-", color="0.5", label="expected, 1 sigma")
     middle.set_title("Found position from the true one, mas", fontsize=10, loc="left")
     middle.legend(frameon=False, fontsize=8)
     for name in SNRS:
-        spreads = [spread(chosen(table, separation=p)[f"snr_{name}"]) for p in places]
+        spreads = [spread(select(table, separation=p)[f"snr_{name}"]) for p in places]
         values, low, high = np.transpose(spreads)
         right.plot(places, values, ".-", color=COLOURS[name], label=name)
         right.fill_between(places, low, high, color=COLOURS[name], alpha=0.15, lw=0)
@@ -114,29 +116,31 @@ def main() -> None:
     """Run the study."""
     parser = options(__doc__.splitlines()[0])
     parser.set_defaults(seeds=10)
-    given = parser.parse_args()
-    here = setting(tuple(given.opd) if given.opd else None, **(QUICK if given.quick else {}))
-    if given.quick:
-        jobs = [(here, 0.8, 200, 0)]
+    arguments = parser.parse_args()
+    setup = setting(
+        tuple(arguments.opd) if arguments.opd else None, **(QUICK if arguments.quick else {})
+    )
+    if arguments.quick:
+        jobs = [(setup, 0.8, 200, 0)]
     else:
         jobs = [
-            (here, separation, STEPS if seed < (given.seeds + 4) // 5 else 0, seed)
-            for seed in range(given.seeds)
+            (setup, separation, STEPS if seed < (arguments.seeds + 4) // 5 else 0, seed)
+            for seed in range(arguments.seeds)
             for separation in SEPARATIONS
         ]
-    name = "location_measured" if given.opd else "location_generator"
+    name = "location_measured" if arguments.opd else "location_generator"
     table = timed_table(
-        lambda: mapped(one_frame, jobs, given.processes), given.output / f"{name}.ecsv"
+        lambda: mapped(one_frame, jobs, arguments.processes), arguments.output / f"{name}.ecsv"
     )
     for separation in np.unique(table["separation"]):
-        part = chosen(table, separation=separation)
-        seen = part[part["found"]]
+        part = select(table, separation=separation)
+        detected = part[part["found"]]
         pulls = np.concatenate(
-            [(seen[f"{c}_found"] - seen[c]) / seen[f"{c}_error"] for c in ("x", "y")]
+            [(detected[f"{c}_found"] - detected[c]) / detected[f"{c}_error"] for c in ("x", "y")]
         )
         root = math.sqrt(np.mean(pulls**2)) if len(pulls) else math.nan
         print(
-            f"{separation:.1f} arcsec: {len(seen)} of {len(part)} found, "
+            f"{separation:.1f} arcsec: {len(detected)} of {len(part)} found, "
             f"{spread(distance(part))[0]:.2f} mas off, rms pull {root:.2f}, flux "
             f"{spread(part['flux_ratio'])[0]:.3f}, S/N {spread(part['snr'])[0]:.1f} of "
             f"{spread(part['photon_snr'])[0]:.1f}, {int(part['false_candidates'].max())} false"

@@ -1,4 +1,4 @@
-"""What the experiments compare: ways to deal with the star, all given the same frame."""
+"""The methods of star subtraction that the experiments compare on the same frames."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ QUICK = {"npix": 256, "fov_pixels": 40}
 
 @dataclass(frozen=True)
 class Subtracted:
-    """What a method leaves of a frame.
+    """The result of a subtraction.
 
     Attributes
     ----------
     image : ndarray, (ny, nx)
-        NaN where the method says nothing.
+        NaN where the method has no result.
     seconds : float
     fit : Refinement or None
     """
@@ -49,24 +49,24 @@ class Subtracted:
 # -- frames --------------------------------------------------------------------------------------
 
 
-def with_planets(here: Setting, shot: Frame, planets: Iterable[Planet], seed: int) -> Frame:
+def with_planets(setup: Setting, shot: Frame, planets: Iterable[Planet], seed: int) -> Frame:
     """The same frame, with the same noise of the star, and planets with their own noise."""
     rng = np.random.default_rng([seed, 77])
-    light = tuple((p, planet_photons(here.model, Scene(), p, shot.opd)) for p in planets)
+    light = tuple((p, planet_photons(setup.model, Scene(), p, shot.opd)) for p in planets)
     counts = shot.observation.data[0] + sum(rng.poisson(photons) for _, photons in light)
     error = np.sqrt(np.maximum(counts, 0) + Scene().read_noise ** 2)
     observation = dr.Observation.from_arrays(
-        counts, error, unit="photon", pixelscale=here.model.detector.pixelscale, filter="F444W"
+        counts, error, unit="photon", pixelscale=setup.model.detector.pixelscale, filter="F444W"
     )
     return replace(shot, observation=observation, planets=light)
 
 
-def references(here: Setting, hours: float, seed: int) -> Image:
+def references(setup: Setting, hours: float, seed: int) -> Image:
     """Nine dithered frames of alpha Pictoris, three hours after the target."""
-    return simulate_references(here.model, here.drifted(hours + LATER), seed=10_000 + 100 * seed)
+    return simulate_references(setup.model, setup.drifted(hours + LATER), seed=10_000 + 100 * seed)
 
 
-def library(here: Setting, hours: float, seed: int, count: int = LIBRARY) -> Image:
+def library(setup: Setting, hours: float, seed: int, count: int = LIBRARY) -> Image:
     """Many frames of alpha Pictoris, (count, ny, nx).
 
     Kinder to KLIP than an archive is: the same star, the same optics, wavefronts on the target's
@@ -75,14 +75,14 @@ def library(here: Setting, hours: float, seed: int, count: int = LIBRARY) -> Ima
     rng = np.random.default_rng([seed, 55])
     scene = Scene(star=Star(w2_magnitude=ALPHA_PICTORIS_W2, exposure=400.0))
     # Drift is linear in time; where it is not (the embedded generator), its direction is kept.
-    rate = (here.drifted(hours) - here.measured) / hours
+    rate = (setup.drifted(hours) - setup.measured) / hours
     frames = []
     for k in range(count):
         radius, angle = 0.030 * math.sqrt(rng.uniform()), rng.uniform(0, 2 * math.pi)
         offset = (radius * math.cos(angle), radius * math.sin(angle))
-        opd = here.measured + rate * max(0.0, hours + rng.uniform(-40, 40))
+        opd = setup.measured + rate * max(0.0, hours + rng.uniform(-40, 40))
         at = replace(scene, star_offset=offset)
-        shot = simulate(here.model, at, opd, seed=1_000_000 + 1000 * seed + k)
+        shot = simulate(setup.model, at, opd, seed=1_000_000 + 1000 * seed + k)
         frames.append(shot.data[0])
     return np.stack(frames)
 
@@ -90,10 +90,10 @@ def library(here: Setting, hours: float, seed: int, count: int = LIBRARY) -> Ima
 # -- methods -------------------------------------------------------------------------------------
 
 
-def initial(here: Setting, shot: Frame) -> Subtracted:
+def initial(setup: Setting, shot: Frame) -> Subtracted:
     """Subtract the star of the outdated map."""
     began = time.perf_counter()
-    star = star_photons(here.model, Scene(), here.measured)
+    star = star_photons(setup.model, Scene(), setup.measured)
     return Subtracted(shot.observation.data[0] - star, time.perf_counter() - began)
 
 
@@ -104,7 +104,7 @@ def klip(shot: Frame, frames: Image, numbasis: int = 9) -> Subtracted:
     return Subtracted(image, time.perf_counter() - began)
 
 
-def adam(here: Setting, shot: Frame, steps: int = STEPS) -> Subtracted:
+def adam(setup: Setting, shot: Frame, steps: int = STEPS) -> Subtracted:
     """The paper's recipe: every OPD pixel free, Adam, L1, the star's flux known.
 
     Its steps are taken on a coarse pupil, from the fine model's star at the known map: a twelfth
@@ -112,22 +112,22 @@ def adam(here: Setting, shot: Frame, steps: int = STEPS) -> Subtracted:
     samples and 1.025 with all 1024.
     """
     began = time.perf_counter()
-    coarse = coarse_steps(here.model, here.measured, min(256, here.model.npix // 2))
+    coarse = coarse_steps(setup.model, setup.measured, min(256, setup.model.npix // 2))
     fit = dr.refine(
         coarse,
         shot.observation,
-        here.measured,
+        setup.measured,
         settings=Adam(iterations=steps),
         start={"flux": Star().photons, "background": 0.0},
     )
     return Subtracted(fit.frames[0].residual[0], time.perf_counter() - began, fit)
 
 
-def gauss_newton(here: Setting, shot: Frame, **changes: Any) -> Subtracted:
+def gauss_newton(setup: Setting, shot: Frame, **changes: Any) -> Subtracted:
     """This package's default, or with other settings."""
     began = time.perf_counter()
     settings = GaussNewton(**changes)
-    fit = dr.refine(here.model, shot.observation, here.measured, settings=settings)
+    fit = dr.refine(setup.model, shot.observation, setup.measured, settings=settings)
     return Subtracted(fit.frames[0].residual[0], time.perf_counter() - began, fit)
 
 
@@ -137,14 +137,14 @@ def optimal(shot: Frame) -> Subtracted:
 
 
 def all_of(
-    here: Setting,
+    setup: Setting,
     shot: Frame,
     frames: Image,
     steps: int = 0,
-    many: Image | None = None,
+    archive: Image | None = None,
     **fit: Any,
 ) -> dict[str, Subtracted]:
-    """What every method leaves of a frame.
+    """Apply every method to a frame.
 
     Parameters
     ----------
@@ -159,9 +159,13 @@ def all_of(
     **fit
         Fields of `GaussNewton`.
     """
-    found = {"initial": initial(here, shot), "KLIP": klip(shot, frames)}
-    if many is not None:
-        found["KLIP, library"] = klip(shot, many, min(LIBRARY_MODES, len(many)))
+    subtracted = {"initial": initial(setup, shot), "KLIP": klip(shot, frames)}
+    if archive is not None:
+        subtracted["KLIP, library"] = klip(shot, archive, min(LIBRARY_MODES, len(archive)))
     if steps:
-        found["Adam"] = adam(here, shot, steps)
-    return {**found, "Gauss-Newton": gauss_newton(here, shot, **fit), "optimal": optimal(shot)}
+        subtracted["Adam"] = adam(setup, shot, steps)
+    return {
+        **subtracted,
+        "Gauss-Newton": gauss_newton(setup, shot, **fit),
+        "optimal": optimal(shot),
+    }

@@ -1,4 +1,4 @@
-"""A Lyot stop that is not where the model has it, shifted and turned: the paper's figure 12.
+"""A misaligned Lyot stop, shifted and rotated: the paper's figure 12.
 
     python examples/paper/misalignment.py --opd BEFORE AFTER --seeds 10
 
@@ -26,7 +26,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection.metrics import psnr
 
 sys.path.insert(0, str(Path(__file__).parent))
-from judging import COLOURS, chosen, pixel, spread, star_error
+from judging import COLOURS, pixel, select, spread, star_error
 from methods import (
     QUICK,
     STEPS,
@@ -47,10 +47,10 @@ AMOUNTS = {
     "rotation, deg": (1.0, 2.0),
 }
 HELD = ("star_offset", "flux", "background")
-"""What Gauss-Newton may fit when the stop is held."""
+"""Free parameters of Gauss-Newton if the stop is held."""
 HELD_FIT = {"max_iterations": 20, "cycles": (24.0,)}
 QUICK_FIT = {"max_iterations": 8, "cycles": (24.0,)}
-"""What the small version is content with."""
+"""Settings of the small version."""
 STYLES = {
     "initial": (COLOURS["initial"], ":"),
     "Adam, held": (COLOURS["Adam"], "-"),
@@ -79,21 +79,21 @@ class Moved:
         return self.model(opd, offset, **self.values)
 
 
-def observed(here: Setting, values: dict[str, Any], seed: int) -> Frame:
+def observed(setup: Setting, values: dict[str, Any], seed: int) -> Frame:
     """A frame through the moved stop."""
-    model: Any = Moved(here.model, values)
-    moved = replace(here, model=model)
-    opd = here.drifted(HOURS)
+    model: Any = Moved(setup.model, values)
+    moved = replace(setup, model=model)
+    opd = setup.drifted(HOURS)
     star = star_photons(model, Scene(), opd)
     noise = np.sqrt(star + Scene().read_noise ** 2)
     rng = np.random.default_rng(seed)
     counts = rng.poisson(star) + rng.normal(0, Scene().read_noise, star.shape)
-    bare = dr.Observation.from_arrays(counts, noise, pixelscale=here.model.detector.pixelscale)
+    bare = dr.Observation.from_arrays(counts, noise, pixelscale=setup.model.detector.pixelscale)
     return with_planets(moved, Frame(bare, star, noise, (), opd), [PLANET], seed)
 
 
 def one_frame(
-    here: Setting,
+    setup: Setting,
     axis: str,
     amount: float,
     steps: int,
@@ -101,32 +101,34 @@ def one_frame(
     seed: int,
     limits: dict[str, Any],
 ) -> Table:
-    """One row a method."""
-    shot = observed(here, stop(axis, amount), seed)
-    fitted = gauss_newton(here, shot, **limits)
-    left: dict[str, Subtracted] = {
-        "initial": initial(here, shot),
+    """One row for each method."""
+    shot = observed(setup, stop(axis, amount), seed)
+    fitted = gauss_newton(setup, shot, **limits)
+    subtracted: dict[str, Subtracted] = {
+        "initial": initial(setup, shot),
         "Gauss-Newton, fitted": fitted,
         "optimal": optimal(shot),
     }
     if held:
-        left["Gauss-Newton, held"] = gauss_newton(here, shot, free=HELD, **(limits or HELD_FIT))
+        subtracted["Gauss-Newton, held"] = gauss_newton(
+            setup, shot, free=HELD, **(limits or HELD_FIT)
+        )
     if steps:
-        left["Adam, held"] = adam(here, shot, steps)
+        subtracted["Adam, held"] = adam(setup, shot, steps)
     assert fitted.fit is not None
-    found = dr.measure(fitted.fit, [PLANET.offset])[0]
+    planet = dr.measure(fitted.fit, [PLANET.offset])[0]
     rows = []
-    for name, result in left.items():
+    for name, result in subtracted.items():
         rows.append(
             {
                 "axis": axis,
                 "amount": amount,
                 "seed": seed,
                 "method": name,
-                "psnr": psnr(result.image, shot.planets[0][1], pixel(here, PLANET.offset)),
-                "star_error": star_error(here, shot, result.image),
-                "marginalised_snr": float(found["snr"]),
-                "marginalised_throughput": float(found["contrast"]) / PLANET.contrast,
+                "psnr": psnr(result.image, shot.planets[0][1], pixel(setup, PLANET.offset)),
+                "star_error": star_error(setup, shot, result.image),
+                "marginalised_snr": float(planet["snr"]),
+                "marginalised_throughput": float(planet["contrast"]) / PLANET.contrast,
                 "seconds": result.seconds,
             }
         )
@@ -140,11 +142,11 @@ def draw(table: Table) -> Figure:
     for ax, axis in zip(panels, AMOUNTS, strict=True):
         part = table[(table["axis"] == axis) | (table["amount"] == 0)]
         for name, (colour, style) in STYLES.items():
-            mine = chosen(part, method=name)
-            amounts = np.unique(mine["amount"])
+            subset = select(part, method=name)
+            amounts = np.unique(subset["amount"])
             if not len(amounts):
                 continue
-            spreads = [spread(chosen(mine, amount=amount)["psnr"]) for amount in amounts]
+            spreads = [spread(select(subset, amount=amount)["psnr"]) for amount in amounts]
             middle, low, high = np.transpose(spreads)
             ax.plot(amounts, middle, style, marker=".", color=colour, label=name)
             ax.fill_between(amounts, low, high, color=colour, alpha=0.15, lw=0)
@@ -158,29 +160,37 @@ def main() -> None:
     """Run the study."""
     parser = options(__doc__.splitlines()[0])
     parser.set_defaults(seeds=10)
-    given = parser.parse_args()
-    here = setting(tuple(given.opd) if given.opd else None, **(QUICK if given.quick else {}))
-    cases = [("rotation, deg", 0.0), *((axis, a) for axis, some in AMOUNTS.items() for a in some)]
-    if given.quick:
-        jobs = [(here, "shift in x, %", 0.2, 200, True, 0, QUICK_FIT)]
+    arguments = parser.parse_args()
+    setup = setting(
+        tuple(arguments.opd) if arguments.opd else None, **(QUICK if arguments.quick else {})
+    )
+    cases = [
+        ("rotation, deg", 0.0),
+        *((axis, a) for axis, amounts in AMOUNTS.items() for a in amounts),
+    ]
+    if arguments.quick:
+        jobs = [(setup, "shift in x, %", 0.2, 200, True, 0, QUICK_FIT)]
     else:
-        few = (given.seeds + 4) // 5
+        adam_seeds = (arguments.seeds + 4) // 5
         jobs = [
-            (here, axis, amount, STEPS if seed < few else 0, seed < few, seed, {})
-            for seed in range(given.seeds)
+            (setup, axis, amount, STEPS if seed < adam_seeds else 0, seed < adam_seeds, seed, {})
+            for seed in range(arguments.seeds)
             for axis, amount in cases
         ]
-    name = "misalignment_measured" if given.opd else "misalignment_generator"
+    name = "misalignment_measured" if arguments.opd else "misalignment_generator"
     table = timed_table(
-        lambda: mapped(one_frame, jobs, given.processes), given.output / f"{name}.ecsv"
+        lambda: mapped(one_frame, jobs, arguments.processes), arguments.output / f"{name}.ecsv"
     )
     for axis, amount in dict.fromkeys((job[1], job[2]) for job in jobs):
-        part = chosen(table, axis=axis, amount=amount)
+        part = select(table, axis=axis, amount=amount)
         print(f"{axis} {amount:g}:")
         for method in STYLES:
-            mine = chosen(part, method=method)
-            if len(mine):
-                decibel, error = spread(mine["psnr"])[0], spread(mine["star_error"])[0]
+            subset = select(part, method=method)
+            if len(subset):
+                decibel, error = (
+                    spread(subset["psnr"])[0],
+                    spread(subset["star_error"])[0],
+                )
                 print(f"  {method:20s} PSNR {decibel:6.1f} dB, star error {error:.2f} sigma")
         print(f"  marginalised S/N {spread(part['marginalised_snr'])[0]:.1f}")
 

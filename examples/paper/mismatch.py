@@ -35,35 +35,35 @@ HOURS = 40.0
 READ_NOISE = 42.0
 
 
-def observed(here: Setting, seed: int) -> tuple[dr.Observation, float]:
+def observed(setup: Setting, seed: int) -> tuple[dr.Observation, float]:
     """A frame and the star's true light."""
-    opd = here.drifted(HOURS)
+    opd = setup.drifted(HOURS)
     values = {"lyot_shift": LYOT, "lyot_rotation": ROTATION}
     photons = Star().photons * BRIGHTER
     with torch.no_grad():
-        image = here.model(opd, OFFSET, **values).numpy()
-        planet = here.model(opd, tuple(np.add(OFFSET, PLANET.offset)), **values).numpy()
+        image = setup.model(opd, OFFSET, **values).numpy()
+        planet = setup.model(opd, tuple(np.add(OFFSET, PLANET.offset)), **values).numpy()
     expected = photons * (image + PLANET.contrast * planet) + BACKGROUND
     rng = np.random.default_rng(seed)
     counts = rng.poisson(expected) + rng.normal(0, READ_NOISE, expected.shape)
     error = np.sqrt(np.maximum(counts, 0) + READ_NOISE**2)
-    scale = here.model.detector.pixelscale
+    scale = setup.model.detector.pixelscale
     return dr.Observation.from_arrays(counts, error, pixelscale=scale), photons
 
 
-def one_seed(here: Setting, seed: int) -> Table:
+def one_seed(setup: Setting, seed: int) -> Table:
     """One row of the table."""
-    here = here.redrawn(seed)
-    shot, photons = observed(here, seed)
-    known = {"star_offset": OFFSET, "lyot_shift": LYOT, "lyot_rotation": ROTATION}
+    setup = setup.redrawn(seed)
+    shot, photons = observed(setup, seed)
+    truth = {"star_offset": OFFSET, "lyot_shift": LYOT, "lyot_rotation": ROTATION}
     held = GaussNewton(free=("flux", "background"))
-    aligned = dr.refine(here.model, shot, here.measured, settings=held, start=known)
+    aligned = dr.refine(setup.model, shot, setup.measured, settings=held, start=truth)
     matched = dr.measure(aligned, [PLANET.offset])
-    fit = dr.refine(here.model, shot, here.measured)
-    found = dr.detect(fit)
-    planet = found.measure([PLANET.offset])
-    radius = np.hypot(found.grid[..., 0], found.grid[..., 1])
-    null = found.residual_snr[(radius > 0.3) & (radius < 2.3)]
+    fit = dr.refine(setup.model, shot, setup.measured)
+    detection = dr.detect(fit)
+    planet = detection.measure([PLANET.offset])
+    radius = np.hypot(detection.grid[..., 0], detection.grid[..., 1])
+    null = detection.residual_snr[(radius > 0.3) & (radius < 2.3)]
     values = fit.frames[0].values
     return Table(
         rows=[
@@ -91,13 +91,13 @@ def one_seed(here: Setting, seed: int) -> Table:
 
 def main() -> None:
     """Run the study."""
-    given = options(__doc__.splitlines()[0]).parse_args()
-    changes = {"npix": 256, "fov_pixels": 48} if given.quick else {}
-    here = setting(tuple(given.opd) if given.opd else None, **changes)
-    jobs = [(here, seed) for seed in range(1 if given.quick else given.seeds)]
-    name = "mismatch_measured" if given.opd else "mismatch_generator"
+    arguments = options(__doc__.splitlines()[0]).parse_args()
+    changes = {"npix": 256, "fov_pixels": 48} if arguments.quick else {}
+    setup = setting(tuple(arguments.opd) if arguments.opd else None, **changes)
+    jobs = [(setup, seed) for seed in range(1 if arguments.quick else arguments.seeds)]
+    name = "mismatch_measured" if arguments.opd else "mismatch_generator"
     table = timed_table(
-        lambda: mapped(one_seed, jobs, given.processes), given.output / f"{name}.ecsv"
+        lambda: mapped(one_seed, jobs, arguments.processes), arguments.output / f"{name}.ecsv"
     )
     for column in table.colnames[3:]:
         values = np.asarray(table[column])

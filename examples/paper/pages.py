@@ -1,4 +1,4 @@
-"""What the pages made from committed tables have in common."""
+"""Functions shared by the pages that are made from committed tables."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def read(study: str, kind: str) -> Table | None:
 
 
 def tables(study: str) -> dict[str, Table]:
-    """Of all kinds of wavefront that the study was run on."""
-    found = {kind: read(study, kind) for kind in KINDS}
-    return {kind: table for kind, table in found.items() if table is not None}
+    """Tables of a study, for every kind of wavefront."""
+    by_kind = {kind: read(study, kind) for kind in KINDS}
+    return {kind: table for kind, table in by_kind.items() if table is not None}
 
 
 def markdown(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    """A table."""
+    """Format a table in Markdown."""
     head = list(header)
     return [
         "| " + " | ".join(head) + " |",
@@ -35,17 +35,17 @@ def markdown(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
     ]
 
 
-def origin(found: dict[str, Table]) -> list[str]:
-    """Where tables come from."""
+def origin(by_kind: dict[str, Table]) -> list[str]:
+    """List the command, date and duration of each table."""
     return [
         f"- {KINDS[kind]}: `{table.meta['command']}`, {table.meta['date']}, "
         f"{table.meta['seconds'] / 60:.0f} min ({table.meta['machine']})."
-        for kind, table in found.items()
+        for kind, table in by_kind.items()
     ] + [""]
 
 
-def preferred(results: Path, name: str) -> tuple[Table, Path, str] | None:
-    """A study's table: on the measured maps if there is one."""
+def study_table(results: Path, name: str) -> tuple[Table, Path, str] | None:
+    """A study's table, that on the measured maps if it exists."""
     for kind, label in KINDS.items():
         path = results / f"{name}_{kind}.ecsv"
         if path.is_file():

@@ -1,4 +1,4 @@
-"""Small images beside a table: written in whole steps of a hundredth of their range."""
+"""Small images that belong to a table, stored as multiples of a hundredth of their range."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pyklip_diffrender.io.files import open_fits, write_fits
 Image = NDArray[np.float64]
 
 
-def beside(table: Path) -> Path:
-    """Where the images of a table are."""
+def image_path(table: Path) -> Path:
+    """Path of the images of a table."""
     return table.with_suffix(".fits.gz")
 
 
@@ -32,7 +32,7 @@ def write_images(path: Path, images: Mapping[str, Image], limit: float) -> None:
 
 
 def read_images(path: Path) -> dict[str, Image]:
-    """What `write_images` wrote."""
+    """Read images that `write_images` wrote."""
     with open_fits(path) as hdus:
         header, cube = hdus[0].header, np.asarray(hdus[0].data, dtype=float)
     return {header[f"NAME{k}"]: image * header["LIMIT"] / 100 for k, image in enumerate(cube)}

@@ -25,9 +25,9 @@ from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.wavefront.opd import resample
 
 sys.path.insert(0, str(Path(__file__).parent))
-from judging import COLOURS, chosen, paper_snr, spread, star_error
+from judging import COLOURS, paper_snr, select, spread, star_error
 from methods import QUICK, STEPS, Subtracted, adam, gauss_newton, initial
-from pictures import beside, show, write_images
+from pictures import image_path, show, write_images
 from scene import Frame, Image, Planet, Setting, frame, mapped, options, setting, timed_table
 
 PLANET = Planet(1e-6, 0.6, 54.0)
@@ -41,57 +41,62 @@ LIMIT = 20.0
 """nm."""
 
 
-def seen_change(here: Setting, opd: Image) -> Image:
+def seen_change(setup: Setting, opd: Image) -> Image:
     """Change since the map, nm, coarse, NaN outside the Lyot stop's openings, mean 0."""
-    grid = PupilGrid.full(SAMPLES, here.model.diameter)
+    grid = PupilGrid.full(SAMPLES, setup.model.diameter)
     stop = polygon_coverage(maskrnd_openings(), grid).numpy() > 0.5
-    change = 1e9 * (resample(opd, SAMPLES) - resample(here.measured, SAMPLES))
+    change = 1e9 * (resample(opd, SAMPLES) - resample(setup.measured, SAMPLES))
     return np.where(stop, change - change[stop].mean(), np.nan)
 
 
-def judge(here: Setting, shot: Frame, step: Subtracted, fit: Refinement | None) -> dict[str, Any]:
+def judge(setup: Setting, shot: Frame, step: Subtracted, fit: Refinement | None) -> dict[str, Any]:
     """Numbers of one stage."""
-    true = seen_change(here, shot.opd)
-    found = seen_change(here, here.measured if fit is None else np.real(fit.wavefront))
+    true_change = seen_change(setup, shot.opd)
+    fitted_change = seen_change(setup, setup.measured if fit is None else np.real(fit.wavefront))
     return {
-        "annulus_snr": paper_snr(here, step.image, PLANET),
-        "star_error": star_error(here, shot, step.image),
-        "opd_left": float(np.nanstd(true - found) / np.nanstd(true)),
-        "opd_change_nm": float(np.nanstd(true)),
+        "annulus_snr": paper_snr(setup, step.image, PLANET),
+        "star_error": star_error(setup, shot, step.image),
+        "opd_left": float(np.nanstd(true_change - fitted_change) / np.nanstd(true_change)),
+        "opd_change_nm": float(np.nanstd(true_change)),
         "seconds": step.seconds,
     }
 
 
-def one_seed(here: Setting, counts: tuple[int, ...], steps: tuple[int, ...], seed: int) -> Table:
-    """One row a stage."""
-    shot = frame(here, HOURS, seed, [PLANET])
+def one_seed(setup: Setting, counts: tuple[int, ...], steps: tuple[int, ...], seed: int) -> Table:
+    """One row for each stage."""
+    shot = frame(setup, HOURS, seed, [PLANET])
     began = time.perf_counter()
-    start = judge(here, shot, initial(here, shot), None)
-    maps = {"true": seen_change(here, shot.opd)}
+    start = judge(setup, shot, initial(setup, shot), None)
+    maps = {"true": seen_change(setup, shot.opd)}
     rows = [
         {"method": method, "step": 0, "seed": seed, **start} for method in ("Adam", "Gauss-Newton")
     ]
     stages = [("Gauss-Newton", n) for n in counts] + [("Adam", n) for n in steps]
     for method, count in stages:
         if method == "Adam":
-            left = adam(here, shot, count)
+            subtracted = adam(setup, shot, count)
         else:
             # One basis for all stages: it would grow where the first one is not done.
-            left = gauss_newton(here, shot, max_iterations=count, cycles=(24.0,))
-        assert left.fit is not None
+            subtracted = gauss_newton(setup, shot, max_iterations=count, cycles=(24.0,))
+        assert subtracted.fit is not None
         # Those that stop by themselves have fewer.
-        taken = count if method == "Adam" else min(count, len(left.fit.history))
+        steps_done = count if method == "Adam" else min(count, len(subtracted.fit.history))
         rows.append(
-            {"method": method, "step": taken, "seed": seed, **judge(here, shot, left, left.fit)}
+            {
+                "method": method,
+                "step": steps_done,
+                "seed": seed,
+                **judge(setup, shot, subtracted, subtracted.fit),
+            }
         )
-        maps[method] = seen_change(here, np.real(left.fit.wavefront))
-    found = Table(rows=rows)
-    found.meta = {"seconds": time.perf_counter() - began}
+        maps[method] = seen_change(setup, np.real(subtracted.fit.wavefront))
+    table = Table(rows=rows)
+    table.meta = {"seconds": time.perf_counter() - began}
     for name in ("true", "Gauss-Newton", "Adam"):
         blank = np.zeros((SAMPLES, SAMPLES))
         image = np.nan_to_num(maps[name]) if seed == 0 and name in maps else blank
-        found[f"map {name}"] = np.broadcast_to(image, (len(found), SAMPLES, SAMPLES)).copy()
-    return found
+        table[f"map {name}"] = np.broadcast_to(image, (len(table), SAMPLES, SAMPLES)).copy()
+    return table
 
 
 def draw(table: Table, images: dict[str, Image]) -> Figure:
@@ -105,11 +110,11 @@ def draw(table: Table, images: dict[str, Image]) -> Figure:
         strict=True,
     ):
         for name in ("Adam", "Gauss-Newton"):
-            mine = chosen(table, method=name)
-            steps = np.unique(mine["step"])
+            subset = select(table, method=name)
+            steps = np.unique(subset["step"])
             if not len(steps):
                 continue
-            spreads = [spread(chosen(mine, step=step)[column]) for step in steps]
+            spreads = [spread(select(subset, step=step)[column]) for step in steps]
             middle, low, high = np.transpose(spreads)
             ax.plot(steps, middle, ".-", color=COLOURS[name], label=name)
             ax.fill_between(steps, low, high, color=COLOURS[name], alpha=0.15, lw=0)
@@ -130,30 +135,32 @@ def main() -> None:
     """Run the study."""
     parser = options(__doc__.splitlines()[0])
     parser.set_defaults(seeds=10)
-    given = parser.parse_args()
-    here = setting(tuple(given.opd) if given.opd else None, **(QUICK if given.quick else {}))
-    if given.quick:
-        jobs = [(here, (2, 5), (30, 200), 0)]
+    arguments = parser.parse_args()
+    setup = setting(
+        tuple(arguments.opd) if arguments.opd else None, **(QUICK if arguments.quick else {})
+    )
+    if arguments.quick:
+        jobs = [(setup, (2, 5), (30, 200), 0)]
     else:
         jobs = [
-            (here, NEWTON_STEPS, ADAM_STEPS if seed < (given.seeds + 4) // 5 else (), seed)
-            for seed in range(given.seeds)
+            (setup, NEWTON_STEPS, ADAM_STEPS if seed < (arguments.seeds + 4) // 5 else (), seed)
+            for seed in range(arguments.seeds)
         ]
-    name = "progress_measured" if given.opd else "progress_generator"
-    path = given.output / f"{name}.ecsv"
+    name = "progress_measured" if arguments.opd else "progress_generator"
+    path = arguments.output / f"{name}.ecsv"
 
     def work() -> Table:
-        table = mapped(one_seed, jobs, given.processes)
+        table = mapped(one_seed, jobs, arguments.processes)
         maps = {n.removeprefix("map "): table[n][0] for n in table.colnames if n[:4] == "map "}
-        write_images(beside(path), maps, LIMIT)
+        write_images(image_path(path), maps, LIMIT)
         table.remove_columns([f"map {name}" for name in maps])
         return table
 
     table = timed_table(work, path)
     for method in ("Adam", "Gauss-Newton"):
-        mine = chosen(table, method=method)
-        for step in np.unique(mine["step"]):
-            part = chosen(mine, step=step)
+        subset = select(table, method=method)
+        for step in np.unique(subset["step"]):
+            part = select(subset, step=step)
             print(
                 f"{method:13s} {step:5d} steps: star error {spread(part['star_error'])[0]:7.2f}, "
                 f"annulus SNR {spread(part['annulus_snr'])[0]:6.2f}, change not found "

@@ -32,39 +32,39 @@ RING_LIGHT = 3e-5
 """Of the whole ring, relative to the star."""
 
 
-def ring_photons(here: Setting, opd: NDArray[np.float64]) -> NDArray[np.float64]:
+def ring_photons(setup: Setting, opd: NDArray[np.float64]) -> NDArray[np.float64]:
     """Expected photons of a smooth ring: the mean of point sources spread over it."""
     radii = np.linspace(*RING, 4)
     angles = np.arange(0, 2 * math.pi, 2 * math.pi / 60)
     r, a = (grid.ravel() for grid in np.meshgrid(radii, angles))
     offsets = torch.from_numpy(np.stack([r * np.cos(a), r * np.sin(a)], axis=1))
-    total = np.zeros(here.model.detector.shape)
+    total = np.zeros(setup.model.detector.shape)
     with torch.no_grad():
         for place, weight in zip(offsets, r / r.sum(), strict=True):
-            total += weight * here.model(opd, place).numpy()
+            total += weight * setup.model(opd, place).numpy()
     return RING_LIGHT * Star().photons * total
 
 
-def one_ring(here: Setting, seed: int) -> Table:
+def one_ring(setup: Setting, seed: int) -> Table:
     """One row: how much of the ring the estimate has, and the subtracted frame."""
-    here = here.redrawn(seed)
-    opd = here.drifted(HOURS)
-    star = star_photons(here.model, Scene(), opd)
-    light = ring_photons(here, opd)
+    setup = setup.redrawn(seed)
+    opd = setup.drifted(HOURS)
+    star = star_photons(setup.model, Scene(), opd)
+    light = ring_photons(setup, opd)
     rng = np.random.default_rng(seed)
-    shot = simulate(here.model, Scene(), opd, seed=seed)
+    shot = simulate(setup.model, Scene(), opd, seed=seed)
     # The ring's own photons.
     counts = shot.data[0] + rng.poisson(light)
     error = np.sqrt(np.maximum(counts, 0) + Scene().read_noise ** 2)
-    scale = here.model.detector.pixelscale
+    scale = setup.model.detector.pixelscale
     observation = dr.Observation.from_arrays(counts, error, pixelscale=scale)
-    fit = dr.refine(here.model, observation, here.measured)
-    found = dr.detect(fit, threshold=math.inf)
+    fit = dr.refine(setup.model, observation, setup.measured)
+    detection = dr.detect(fit, threshold=math.inf)
     # The shape as an observer would make it: with the fitted wavefront, not the true one.
-    shape = ring_photons(here, np.real(fit.wavefront))
-    amplitude, deviation = found.measure_shape(shape)
+    shape = ring_photons(setup, np.real(fit.wavefront))
+    amplitude, deviation = detection.measure_shape(shape)
     weight = light / error**2
-    kept = float((weight * (counts - fit.frames[0].star)).sum() / (weight * light).sum())
+    throughput_of = float((weight * (counts - fit.frames[0].star)).sum() / (weight * light).sum())
     return Table(
         rows=[
             {
@@ -73,7 +73,7 @@ def one_ring(here: Setting, seed: int) -> Table:
                 "measured": amplitude * RING_LIGHT,
                 "error": deviation * RING_LIGHT,
                 "status": fit.status.name,
-                "kept_by_subtraction": kept,
+                "kept_by_subtraction": throughput_of,
                 "ring_over_star": float((light / star)[light > light.max() / 2].mean()),
             }
         ]
@@ -82,14 +82,14 @@ def one_ring(here: Setting, seed: int) -> Table:
 
 def main() -> None:
     """Run the study."""
-    given = options(__doc__.splitlines()[0]).parse_args()
-    changes = {"npix": 256, "fov_pixels": 48} if given.quick else {}
-    here = setting(tuple(given.opd) if given.opd else None, **changes)
-    seeds = range(1 if given.quick else given.seeds)
-    name = "ring_measured" if given.opd else "ring_generator"
+    arguments = options(__doc__.splitlines()[0]).parse_args()
+    changes = {"npix": 256, "fov_pixels": 48} if arguments.quick else {}
+    setup = setting(tuple(arguments.opd) if arguments.opd else None, **changes)
+    seeds = range(1 if arguments.quick else arguments.seeds)
+    name = "ring_measured" if arguments.opd else "ring_generator"
     table = timed_table(
-        lambda: mapped(one_ring, [(here, seed) for seed in seeds], given.processes),
-        given.output / f"{name}.ecsv",
+        lambda: mapped(one_ring, [(setup, seed) for seed in seeds], arguments.processes),
+        arguments.output / f"{name}.ecsv",
     )
     ratio = table["measured"] / table["light"]
     pull = (table["measured"] - table["light"]) / table["error"]

@@ -1,8 +1,8 @@
-"""What the studies share: the paper's scene, command-line options, tables that can be rebuilt.
+"""Functions shared by the studies: the paper's scene, command-line options, and tables.
 
 The scene is that of Feng et al. 2025: beta Pictoris for two hours at 4.5 um, 80 x 80 pixels, a
 wavefront map that is some hours old. With ``--opd before.fits after.fits`` (two measured maps, 86
-hours apart) the drift is real; without, both maps come from the embedded generator.
+hours apart) the drift is real; otherwise both maps are simulated.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ from pyklip_diffrender.wavefront.opd import drift, random_drift, random_opd, rea
 
 Image = NDArray[np.float64]
 
-CENTER = (39.5, 39.5)
 WAVELENGTH = 4.5e-6
 
 
@@ -46,7 +45,7 @@ class Setting:
     ----------
     model : OpticalSystem
     measured : ndarray, (npix, npix)
-        The wavefront map that is known, m.
+        The wavefront map at the start of a fit, m.
     before, after : str
         Paths of measured maps, or "" for the embedded generator.
     """
@@ -66,10 +65,10 @@ class Setting:
         return self.measured + change
 
     def redrawn(self, seed: int) -> Setting:
-        """With another wavefront of the generator and another drift; measured maps stay.
+        """The setting with another simulated wavefront and drift; measured maps are kept.
 
-        Errors hold what is not known of the wavefront. Frames that share one wavefront share one
-        draw of that part, however different their noise.
+        Errors include the uncertainty of the wavefront. Frames of the same wavefront share one draw
+        of it, even if their noise differs.
         """
         if self.before:
             return self
@@ -77,7 +76,7 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Which wavefronts these are."""
+        """Origin of the wavefronts."""
         return "measured maps" if self.before else f"generator, seed {self.seed}"
 
 
@@ -99,7 +98,7 @@ def setting(opd: tuple[str, str] | None, seed: int = 1, **changes: Any) -> Setti
 
 @dataclass(frozen=True)
 class Frame:
-    """A simulated frame and what is true of it.
+    """A simulated frame with its true star, planets and wavefront.
 
     Attributes
     ----------
@@ -122,12 +121,12 @@ class Frame:
 
     @property
     def known_star(self) -> Image:
-        """The frame less the true star: what the optimal subtraction leaves."""
+        """The frame minus the true star, the optimal subtraction."""
         return self.observation.data[0] - self.star
 
 
 def frame(
-    here: Setting,
+    setup: Setting,
     hours: float,
     seed: int,
     planets: Iterable[Planet] = (),
@@ -135,26 +134,20 @@ def frame(
     **scene: Any,
 ) -> Frame:
     """Simulate one frame."""
-    opd = here.drifted(hours)
-    what = Scene(star=star or Star(), planets=tuple(planets), **scene)
-    observation = simulate(here.model, what, opd, seed=seed)
-    shining = star_photons(here.model, what, opd)
-    noise = np.sqrt(shining + what.background + what.read_noise**2)
-    light = tuple((p, planet_photons(here.model, what, p, opd)) for p in what.planets)
+    opd = setup.drifted(hours)
+    sky = Scene(star=star or Star(), planets=tuple(planets), **scene)
+    observation = simulate(setup.model, sky, opd, seed=seed)
+    shining = star_photons(setup.model, sky, opd)
+    noise = np.sqrt(shining + sky.background + sky.read_noise**2)
+    light = tuple((p, planet_photons(setup.model, sky, p, opd)) for p in sky.planets)
     return Frame(observation, shining, noise, light, opd)
-
-
-def pixel_of(here: Setting, offset: tuple[float, float]) -> tuple[float, float]:
-    """x, y in pixels of a position relative to a centred star."""
-    scale = here.model.detector.pixelscale
-    return CENTER[0] + offset[0] / scale[0], CENTER[1] + offset[1] / scale[1]
 
 
 # -- running and writing -------------------------------------------------------------------------
 
 
 def options(description: str) -> argparse.ArgumentParser:
-    """The options that every study has."""
+    """Make a parser with the options of every study."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--opd", nargs=2, metavar=("BEFORE", "AFTER"), help="measured OPD maps")
     parser.add_argument("--seeds", type=int, default=20, help="noise realisations")
@@ -196,27 +189,22 @@ def write_table(table: Table, path: Path, seconds: float) -> None:
 
 
 def _without_folders(words: list[str]) -> list[str]:
-    """Arguments as they can be shown to others: paths outside the project by name only."""
-    here = Path.cwd()
-    shown = []
+    """Arguments with paths relative to the project, or by name only if they are outside it."""
+    root = Path.cwd()
+    shortened = []
     for word in words:
         path = Path(word)
-        if path.is_absolute() and path.is_relative_to(here):
-            word = str(path.relative_to(here))
+        if path.is_absolute() and path.is_relative_to(root):
+            word = str(path.relative_to(root))
         elif path.is_absolute():
             word = path.name
-        shown.append(word)
-    return shown
+        shortened.append(word)
+    return shortened
 
 
 def timed_table(work: Callable[[], Table], path: Path) -> Table:
-    """Run a study, write its table, and give it back."""
+    """Run a study, write its table, and return it."""
     began = time.perf_counter()
     table = work()
     write_table(table, path, time.perf_counter() - began)
     return table
-
-
-def brighter(star: Star, times: float) -> Star:
-    """The same star, exposed longer."""
-    return replace(star, exposure=star.exposure * times)

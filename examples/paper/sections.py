@@ -9,26 +9,28 @@ import misalignment
 import numpy as np
 import published
 from astropy.table import Table
-from judging import chosen, methods_in, shown, spread
+from judging import median_and_spread, methods_in, select, spread
 from pages import markdown
 
 Lines = list[str]
 
 
 def grid(table: Table, keys: tuple[str, ...], columns: dict[str, str], form: str) -> Lines:
-    """Markdown with a row a setting, a column a method, median and spread in each cell."""
-    found: Lines = []
+    """Markdown table of medians and spreads, with settings as rows and methods as columns."""
+    lines: Lines = []
     names = methods_in(table)
     settings = list(dict.fromkeys(tuple(row[key] for key in keys) for row in table))
     for column, title in columns.items():
-        with_values = [n for n in names if np.isfinite(chosen(table, method=n)[column]).any()]
+        with_values = [n for n in names if np.isfinite(select(table, method=n)[column]).any()]
         rows = []
         for setting in settings:
-            part = chosen(table, **dict(zip(keys, setting, strict=True)))
-            cells = [shown(chosen(part, method=name)[column], form) for name in with_values]
+            part = select(table, **dict(zip(keys, setting, strict=True)))
+            cells = [
+                median_and_spread(select(part, method=name)[column], form) for name in with_values
+            ]
             rows.append([", ".join(_short(value) for value in setting), *cells])
-        found += [f"{title}:", "", *markdown((", ".join(keys), *with_values), rows)]
-    return found
+        lines += [f"{title}:", "", *markdown((", ".join(keys), *with_values), rows)]
+    return lines
 
 
 def _short(value: object) -> str:
@@ -40,13 +42,15 @@ def about_boundary(table: Table) -> Lines:
     names = [*contrast_boundary.LIMITS, "KLIP", "Adam", "Gauss-Newton", "marginalised"]
     rows = []
     for separation in np.unique(table["separation"]):
-        part = chosen(table, separation=separation)
-        cells = [shown(chosen(part, method=name)["contrast"], ".2g") for name in names]
+        part = select(table, separation=separation)
+        cells = [median_and_spread(select(part, method=name)["contrast"], ".2g") for name in names]
         theirs = dict(zip(published.SEPARATIONS, published.BOUNDARY["theirs"], strict=True))
         rows.append([f"{separation:g}", *cells, f"{theirs[round(float(separation), 3)]:.2g}"])
     ordered = table[np.argsort(table["separation"], kind="stable")]
-    kept = grid(ordered, ("separation",), {"throughput": "Planet's light kept"}, ".2f")
-    return [*markdown(("arcsec", *names, "published, theirs"), rows), *kept]
+    throughput_of = grid(
+        ordered, ("separation",), {"throughput": "Throughput of the planet"}, ".2f"
+    )
+    return [*markdown(("arcsec", *names, "published, theirs"), rows), *throughput_of]
 
 
 def about_klip(table: Table) -> Lines:
@@ -73,12 +77,14 @@ def about_misalignment(table: Table) -> Lines:
     """PSNR."""
     rows, behind = [], []
     for axis, amount in dict.fromkeys((row["axis"], row["amount"]) for row in table):
-        part = chosen(table, axis=axis, amount=amount)
-        cells = [shown(chosen(part, method=m)["psnr"]) for m in misalignment.STYLES]
-        share = shown(part["marginalised_throughput"], ".3f")
-        rows.append([f"{axis}: {amount:g}", *cells, shown(part["marginalised_snr"]), share])
+        part = select(table, axis=axis, amount=amount)
+        cells = [median_and_spread(select(part, method=m)["psnr"]) for m in misalignment.STYLES]
+        share = median_and_spread(part["marginalised_throughput"], ".3f")
+        rows.append(
+            [f"{axis}: {amount:g}", *cells, median_and_spread(part["marginalised_snr"]), share]
+        )
         fitted, best = (
-            spread(chosen(part, method=m)["psnr"])[0] for m in ("Gauss-Newton, fitted", "optimal")
+            spread(select(part, method=m)["psnr"])[0] for m in ("Gauss-Newton, fitted", "optimal")
         )
         behind.append(best - fitted)
     header = ("misalignment", *misalignment.STYLES, "marginalised S/N", "its contrast / true")
@@ -95,12 +101,15 @@ def about_misalignment(table: Table) -> Lines:
 def about_drift(table: Table) -> Lines:
     """SNR, and S/N of the marginalised estimate."""
     lines = grid(table, ("contrast", "hours"), {"annulus_snr": "Annulus SNR"}, ".1f")
-    one = chosen(table, method="Gauss-Newton")
+    rows_of_fit = select(table, method="Gauss-Newton")
     rows = []
-    for contrast in np.unique(one["contrast"]):
-        for hours in np.unique(one["hours"]):
-            part = chosen(one, contrast=contrast, hours=hours)
-            values = shown(part["marginalised_snr"]), shown(part["marginalised_throughput"], ".2f")
+    for contrast in np.unique(rows_of_fit["contrast"]):
+        for hours in np.unique(rows_of_fit["hours"]):
+            part = select(rows_of_fit, contrast=contrast, hours=hours)
+            values = (
+                median_and_spread(part["marginalised_snr"]),
+                median_and_spread(part["marginalised_throughput"], ".2f"),
+            )
             rows.append([f"{contrast:g}", f"{hours:g}", *values])
     header = ("contrast", "drift, h", "marginalised S/N", "contrast / true")
     return [*lines, *markdown(header, rows)]
@@ -110,19 +119,19 @@ def about_location(table: Table) -> Lines:
     """Positions."""
     rows = []
     for separation in np.unique(table["separation"]):
-        part = chosen(table, separation=separation)
-        seen = part[part["found"]]
+        part = select(table, separation=separation)
+        detected = part[part["found"]]
         rows.append(
             [
                 f"{separation:g}",
-                f"{len(seen)} of {len(part)}",
+                f"{len(detected)} of {len(part)}",
                 str(int(part["false_candidates"].sum())),
-                shown(location.distance(seen), ".2f"),
-                shown(1e3 * np.hypot(seen["x_error"], seen["y_error"]), ".2f"),
-                shown(seen["flux_ratio"], ".3f"),
-                shown(seen["snr"]),
-                shown(part["photon_snr"]),
-                *(shown(part[f"snr_{name}"]) for name in location.SNRS),
+                median_and_spread(location.distance(detected), ".2f"),
+                median_and_spread(1e3 * np.hypot(detected["x_error"], detected["y_error"]), ".2f"),
+                median_and_spread(detected["flux_ratio"], ".3f"),
+                median_and_spread(detected["snr"]),
+                median_and_spread(part["photon_snr"]),
+                *(median_and_spread(part[f"snr_{name}"]) for name in location.SNRS),
             ]
         )
     header = (
@@ -136,7 +145,7 @@ def about_grid(table: Table) -> Lines:
     """SNR against three things."""
     keys = ("contrast", "hours", "separation")
     columns = {"annulus_snr": "Annulus SNR", "matched_snr": "Matched-filter S/N",
-               "throughput": "Planet's light kept"}  # fmt: skip
+               "throughput": "Throughput of the planet"}  # fmt: skip
     return grid(table, keys, columns, ".2f")
 
 
@@ -145,9 +154,9 @@ def about_progress(table: Table) -> Lines:
     columns = {"star_error": ".2f", "annulus_snr": ".1f", "opd_left": ".2f", "seconds": ".1f"}
     rows = []
     for method in ("Adam", "Gauss-Newton"):
-        for step in np.unique(chosen(table, method=method)["step"]):
-            part = chosen(table, method=method, step=step)
-            cells = (shown(part[column], form) for column, form in columns.items())
+        for step in np.unique(select(table, method=method)["step"]):
+            part = select(table, method=method, step=step)
+            cells = (median_and_spread(part[column], form) for column, form in columns.items())
             rows.append([method, str(step), *cells])
     header = ("method", "steps", "star error, sigma", "annulus SNR", "change not found", "seconds")
     return markdown(header, rows)
@@ -158,21 +167,21 @@ def about_beyond(table: Table) -> Lines:
     methods = [m for m in beyond.METHODS if m in set(table["method"]) and m != "optimal"]
     rows, behind = [], []
     for case in dict.fromkeys(table["case"]):
-        part = chosen(table, case=case, method="Gauss-Newton")
-        every = chosen(table, case=case)
+        part = select(table, case=case, method="Gauss-Newton")
+        every = select(table, case=case)
         rows.append(
             [
                 str(case),
                 str(len(part)),
                 ", ".join(sorted(set(part["status"]))),
-                shown(part["marginalised_snr"]),
-                shown(part["marginalised_snr"] / part["photon_snr"], ".2f"),
-                shown(part["marginalised_throughput"], ".2f"),
-                shown(part["null"], ".2f"),
-                *(shown(chosen(every, method=m)["star_error"], ".2f") for m in methods),
+                median_and_spread(part["marginalised_snr"]),
+                median_and_spread(part["marginalised_snr"] / part["photon_snr"], ".2f"),
+                median_and_spread(part["marginalised_throughput"], ".2f"),
+                median_and_spread(part["null"], ".2f"),
+                *(median_and_spread(select(every, method=m)["star_error"], ".2f") for m in methods),
             ]
         )
-        errors = {m: spread(chosen(every, method=m)["star_error"])[0] for m in methods}
+        errors = {m: spread(select(every, method=m)["star_error"])[0] for m in methods}
         ours = min(errors["Gauss-Newton"], errors["marginalised"])
         for method in ("KLIP", "Adam"):
             if errors.get(method, np.inf) < ours:

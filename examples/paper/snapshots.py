@@ -29,28 +29,28 @@ BEGIN, APART = 40.0, 3.0
 DRIFT = WavefrontPrior(scales={"segment": 0.2, "texture": 0.01})
 
 
-def one_seed(here: Setting, counts: tuple[int, ...], linked: int, seed: int) -> Table:
-    """One row a number of snapshots."""
-    here = here.redrawn(seed)
+def one_seed(setup: Setting, counts: tuple[int, ...], linked: int, seed: int) -> Table:
+    """One row for each number of snapshots."""
+    setup = setup.redrawn(seed)
     shots = [
-        frame(here, BEGIN + APART * k, 100 * seed + k, [PLANET]).observation
+        frame(setup, BEGIN + APART * k, 100 * seed + k, [PLANET]).observation
         for k in range(max(counts))
     ]
-    fits = [dr.refine(here.model, shot, here.measured) for shot in shots]
+    fits = [dr.refine(setup.model, shot, setup.measured) for shot in shots]
     rows = []
     for count in counts:
-        apart = dr.measure(fits[:count], [PLANET.offset])
+        separate = dr.measure(fits[:count], [PLANET.offset])
         row = {
             "snapshots": count,
             "seed": seed,
-            "measured": float(apart["contrast"][0]),
-            "error": float(apart["contrast_error"][0]),
+            "measured": float(separate["contrast"][0]),
+            "error": float(separate["contrast_error"][0]),
             "linked": math.nan,
             "linked_error": math.nan,
         }
         if 1 < count <= linked:
             settings = GaussNewton(drift=DRIFT)
-            joint = dr.refine(here.model, shots[:count], here.measured, settings=settings)
+            joint = dr.refine(setup.model, shots[:count], setup.measured, settings=settings)
             together = dr.measure(joint, [PLANET.offset])
             row["linked"] = float(together["contrast"][0])
             row["linked_error"] = float(together["contrast_error"][0])
@@ -64,8 +64,8 @@ def gain(table: Table, count: int, error: str) -> float:
     Seed by seed, for each may have a wavefront of its own; rows are in the order of seeds.
     """
     single = np.asarray(table["error"][table["snapshots"] == 1], dtype=float)
-    several = np.asarray(table[error][table["snapshots"] == count], dtype=float)
-    ratio = single / several / math.sqrt(count)
+    combined = np.asarray(table[error][table["snapshots"] == count], dtype=float)
+    ratio = single / combined / math.sqrt(count)
     return float(np.mean(ratio[np.isfinite(ratio)])) if np.isfinite(ratio).any() else math.nan
 
 
@@ -73,25 +73,25 @@ def main() -> None:
     """Run the study."""
     parser = options(__doc__.splitlines()[0])
     parser.add_argument("--linked", type=int, default=4, help="most snapshots fitted together")
-    given = parser.parse_args()
-    changes = {"npix": 256, "fov_pixels": 48} if given.quick else {}
-    here = setting(tuple(given.opd) if given.opd else None, **changes)
-    counts = COUNTS[:2] if given.quick else COUNTS
-    seeds = 1 if given.quick else given.seeds
+    arguments = parser.parse_args()
+    changes = {"npix": 256, "fov_pixels": 48} if arguments.quick else {}
+    setup = setting(tuple(arguments.opd) if arguments.opd else None, **changes)
+    counts = COUNTS[:2] if arguments.quick else COUNTS
+    seeds = 1 if arguments.quick else arguments.seeds
     jobs = [
-        (here, counts, given.linked if seed < max(1, seeds // 4) else 0, seed)
+        (setup, counts, arguments.linked if seed < max(1, seeds // 4) else 0, seed)
         for seed in range(seeds)
     ]
-    name = "snapshots_measured" if given.opd else "snapshots_generator"
+    name = "snapshots_measured" if arguments.opd else "snapshots_generator"
     table = timed_table(
-        lambda: mapped(one_seed, jobs, given.processes), given.output / f"{name}.ecsv"
+        lambda: mapped(one_seed, jobs, arguments.processes), arguments.output / f"{name}.ecsv"
     )
     for count in counts:
         part = table[table["snapshots"] == count]
         pull = (part["measured"] - PLANET.contrast) / part["error"]
-        apart, linked = (gain(table, count, name) for name in ("error", "linked_error"))
+        separate, linked = (gain(table, count, name) for name in ("error", "linked_error"))
         print(
-            f"N = {count}: gain over sqrt(N) {apart:.3f}, fitted together {linked:.3f}, "
+            f"N = {count}: gain over sqrt(N) {separate:.3f}, fitted together {linked:.3f}, "
             f"pull {pull.mean():.2f}"
         )
 

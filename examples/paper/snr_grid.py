@@ -2,9 +2,9 @@
 
     python examples/paper/snr_grid.py --opd BEFORE AFTER --seeds 10
 
-One of the three changes at a time, about a planet of 1e-6 at 0.6 arcsec and a wavefront map that
-is 40 h old. Throughput compares with the same frame without the planet. Adam takes a fifth of the
-seeds.
+One of the three quantities varies at a time, about a planet of 1e-6 at 0.6 arcsec and a wavefront
+map that is 40 h old. Throughput compares with the same frame without the planet. Adam is run for a
+fifth of the seeds.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from astropy.table import Table
 from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).parent))
-from judging import COLOURS, chosen, judged, methods_in, photon_snr, spread
+from judging import COLOURS, judge, methods_in, photon_snr, select, spread
 from methods import QUICK, STEPS, all_of, references, with_planets
 from scene import Planet, Setting, frame, mapped, options, setting, timed_table
 
@@ -34,31 +34,31 @@ UNITS = {"contrast": "contrast", "hours": "drift, h", "separation": "separation,
 
 def points() -> list[dict[str, float]]:
     """All settings, each once."""
-    found = [{**CENTRE, axis: value} for axis, values in AXES.items() for value in values]
-    return [point for k, point in enumerate(found) if point not in found[:k]]
+    points_of_axes = [{**CENTRE, axis: value} for axis, values in AXES.items() for value in values]
+    return [point for k, point in enumerate(points_of_axes) if point not in points_of_axes[:k]]
 
 
-def one_seed(here: Setting, some: list[dict[str, float]], steps: int, seed: int) -> Table:
-    """One row a point and method."""
+def one_seed(setup: Setting, chosen_points: list[dict[str, float]], steps: int, seed: int) -> Table:
+    """One row for each point and method."""
     rows: list[dict[str, Any]] = []
-    for hours in dict.fromkeys(point["hours"] for point in some):
-        shot = frame(here, hours, seed)
-        frames = references(here, hours, seed)
-        empty = all_of(here, shot, frames, steps)
-        for point in some:
+    for hours in dict.fromkeys(point["hours"] for point in chosen_points):
+        shot = frame(setup, hours, seed)
+        frames = references(setup, hours, seed)
+        empty = all_of(setup, shot, frames, steps)
+        for point in chosen_points:
             if point["hours"] == hours:
                 planet = Planet(point["contrast"], point["separation"], ANGLE)
-                seen = with_planets(here, shot, [planet], seed)
-                facts = {**point, "seed": seed, "photon_snr": photon_snr(seen)}
-                left = all_of(here, seen, frames, steps)
-                rows += [{**facts, **row} for row in judged(here, seen, left, empty)]
+                with_planet = with_planets(setup, shot, [planet], seed)
+                facts = {**point, "seed": seed, "photon_snr": photon_snr(with_planet)}
+                subtracted = all_of(setup, with_planet, frames, steps)
+                rows += [{**facts, **row} for row in judge(setup, with_planet, subtracted, empty)]
     return Table(rows=rows)
 
 
 def along(table: Table, axis: str) -> Table:
-    """The rows in which only this changes."""
+    """Rows in which only this quantity varies."""
     others = {name: value for name, value in CENTRE.items() if name != axis}
-    return chosen(table, **others)
+    return select(table, **others)
 
 
 def draw(table: Table) -> Figure:
@@ -72,8 +72,8 @@ def draw(table: Table) -> Figure:
             panels[:, column], ("annulus_snr", "matched_snr", "throughput"), strict=True
         ):
             for name in methods_in(part):
-                mine = chosen(part, method=name)
-                spreads = [spread(chosen(mine, **{axis: v})[quantity]) for v in values]
+                subset = select(part, method=name)
+                spreads = [spread(select(subset, **{axis: v})[quantity]) for v in values]
                 middle, low, high = np.transpose(spreads)
                 ax.plot(values, middle, ".-", color=COLOURS[name], label=name)
                 ax.fill_between(values, low, high, color=COLOURS[name], alpha=0.15, lw=0)
@@ -96,27 +96,30 @@ def main() -> None:
     """Run the study."""
     parser = options(__doc__.splitlines()[0])
     parser.set_defaults(seeds=10)
-    given = parser.parse_args()
-    here = setting(tuple(given.opd) if given.opd else None, **(QUICK if given.quick else {}))
-    if given.quick:
-        jobs = [(here, points()[1:2], 200, 0)]
+    arguments = parser.parse_args()
+    setup = setting(
+        tuple(arguments.opd) if arguments.opd else None, **(QUICK if arguments.quick else {})
+    )
+    if arguments.quick:
+        jobs = [(setup, points()[1:2], 200, 0)]
     else:
         jobs = [
-            (here, points(), STEPS if seed < (given.seeds + 4) // 5 else 0, seed)
-            for seed in range(given.seeds)
+            (setup, points(), STEPS if seed < (arguments.seeds + 4) // 5 else 0, seed)
+            for seed in range(arguments.seeds)
         ]
-    name = "snr_grid_measured" if given.opd else "snr_grid_generator"
+    name = "snr_grid_measured" if arguments.opd else "snr_grid_generator"
     table = timed_table(
-        lambda: mapped(one_seed, jobs, given.processes), given.output / f"{name}.ecsv"
+        lambda: mapped(one_seed, jobs, arguments.processes), arguments.output / f"{name}.ecsv"
     )
     for point in jobs[0][1]:
-        part = chosen(table, **point)
+        part = select(table, **point)
         print(", ".join(f"{name} {value:g}" for name, value in point.items()))
         for method in methods_in(part):
-            mine = chosen(part, method=method)
+            subset = select(part, method=method)
             print(
-                f"  {method:13s} annulus SNR {spread(mine['annulus_snr'])[0]:6.2f}, matched "
-                f"{spread(mine['matched_snr'])[0]:6.2f}, kept {spread(mine['throughput'])[0]:.2f}"
+                f"  {method:13s} annulus SNR {spread(subset['annulus_snr'])[0]:6.2f}, matched "
+                f"{spread(subset['matched_snr'])[0]:6.2f}, "
+                f"throughput {spread(subset['throughput'])[0]:.2f}"
             )
 
 

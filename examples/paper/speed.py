@@ -29,20 +29,20 @@ STEPS = 20
 
 
 def measured(
-    here: Setting, name: str, runs: tuple[str, ...], star_known: bool
+    setup: Setting, name: str, runs: tuple[str, ...], star_known: bool
 ) -> list[dict[str, Any]]:
     """Rows for one model."""
-    shot = frame(here, HOURS, 1, [PLANET])
+    shot = frame(setup, HOURS, 1, [PLANET])
     rows = []
     for run in runs:
         times = [time.perf_counter()]
-        fit = dr.refine(here.model, shot.observation, here.measured)
+        fit = dr.refine(setup.model, shot.observation, setup.measured)
         times.append(time.perf_counter())
         dr.contrast_curve(fit)
         times.append(time.perf_counter())
-        found = None
+        detection = None
         if star_known:
-            found = dr.detect(fit)
+            detection = dr.detect(fit)
         times.append(time.perf_counter())
         refine, curve, detect = np.diff(times)
         (fitted,) = fit.frames
@@ -54,33 +54,33 @@ def measured(
                 "refine": refine,
                 "contrast_curve": curve,
                 "refine_and_curve": refine + curve,
-                "detect": detect if found is not None else np.nan,
-                "all": refine + curve + detect if found is not None else np.nan,
+                "detect": detect if detection is not None else np.nan,
+                "all": refine + curve + detect if detection is not None else np.nan,
                 "star_error": float(np.sqrt(np.mean(((star - shot.star) / shot.noise) ** 2))),
             }
         )
     return rows
 
 
-def recipe(here: Setting) -> dict[str, Any]:
+def recipe(setup: Setting) -> dict[str, Any]:
     """The paper's 1000 Adam steps, from a sample of them, on this package's propagation."""
-    shot = frame(here, HOURS, 1, [PLANET])
+    shot = frame(setup, HOURS, 1, [PLANET])
     seconds = []
     for steps in (2, 2 + STEPS):
         began = time.perf_counter()
         dr.refine(
-            here.model,
+            setup.model,
             shot.observation,
-            here.measured,
+            setup.measured,
             settings=Adam(iterations=steps),
             start={"flux": 2.7807e12, "background": 0.0},
         )
         seconds.append(time.perf_counter() - began)
-    whole = 1000 * (seconds[1] - seconds[0]) / STEPS
+    milliseconds = 1000 * (seconds[1] - seconds[0]) / STEPS
     return {
         "model": "monochromatic, Adam recipe, 1000 steps",
         "run": f"{STEPS} steps",
-        "refine": whole,
+        "refine": milliseconds,
         "contrast_curve": np.nan,
         "refine_and_curve": np.nan,
         "detect": np.nan,
@@ -91,24 +91,24 @@ def recipe(here: Setting) -> dict[str, Any]:
 
 def main() -> None:
     """Run the study."""
-    given = options(__doc__.splitlines()[0]).parse_args()
-    changes = {"npix": 256, "fov_pixels": 48} if given.quick else {}
-    opd = tuple(given.opd) if given.opd else None
+    arguments = options(__doc__.splitlines()[0]).parse_args()
+    changes = {"npix": 256, "fov_pixels": 48} if arguments.quick else {}
+    opd = tuple(arguments.opd) if arguments.opd else None
 
     def work() -> Table:
-        one = setting(opd, **changes)
-        cases = [(one, "monochromatic", True)]
-        if not given.quick:
+        standard = setting(opd, **changes)
+        cases = [(standard, "monochromatic", True)]
+        if not arguments.quick:
             ten = setting(opd, monochromatic=None, nlambda=10)
             cases.append((ten, "10 wavelengths", False))
         rows = []
-        for here, name, star_known in cases:
-            rows += measured(here, name, ("first", "second"), star_known)
-        rows.append(recipe(one))
+        for setup, name, star_known in cases:
+            rows += measured(setup, name, ("first", "second"), star_known)
+        rows.append(recipe(standard))
         return Table(rows=rows)
 
-    name = "speed_measured" if given.opd else "speed_generator"
-    table = timed_table(work, given.output / f"{name}.ecsv")
+    name = "speed_measured" if arguments.opd else "speed_generator"
+    table = timed_table(work, arguments.output / f"{name}.ecsv")
     print("\n".join(table.pformat(max_lines=-1, max_width=-1)))
 
 

@@ -26,15 +26,15 @@ from pyklip_diffrender.plotting import save
 
 
 def about_calibration() -> list[str]:
-    """S/N where there is nothing, and the limit."""
-    found = tables("calibration")
-    if not found:
+    """S/N at planet-free positions, and the contrast limit."""
+    by_kind = tables("calibration")
+    if not by_kind:
         return []
     rows = []
-    for kind, table in found.items():
+    for kind, table in by_kind.items():
         for hours in sorted(set(table["hours"])):
             part = table[table["hours"] == hours]
-            rings, known = (
+            rings, star_known = (
                 [rms(part[f"{name}_{r:.1f}"]) for r in calibration.RINGS[:-1]]
                 for name in ("null", "known_star")
             )
@@ -50,7 +50,8 @@ def about_calibration() -> list[str]:
                     str(len(part)),
                     f"{rms(part['null']):.3f}",
                     f"{min(rings):.2f} to {max(rings):.2f}",
-                    f"{rms(part['known_star_null']):.3f} ({min(known):.2f} to {max(known):.2f})",
+                    f"{rms(part['known_star_null']):.3f} "
+                    f"({min(star_known):.2f} to {max(star_known):.2f})",
                     f"{beyond.sum()} ± {math.sqrt(len(part)) * np.std(beyond, ddof=1):.0f} "
                     f"({expected[0]:.1f}; {expected[1]:.1f})",
                     f"{part['highest'].max():.1f}",
@@ -79,17 +80,17 @@ def about_calibration() -> list[str]:
         "deviation 1 and of the deviation measured.",
         "",
         *markdown(header, rows),
-        *origin(found),
+        *origin(by_kind),
     ]
 
 
 def about_fluxes() -> list[str]:
     """Bias and coverage."""
-    found = tables("fluxes")
-    if not found:
+    by_kind = tables("fluxes")
+    if not by_kind:
         return []
     rows = []
-    for kind, table in found.items():
+    for kind, table in by_kind.items():
         for row in fluxes.summary(table):
             rows.append(
                 (
@@ -117,14 +118,14 @@ def about_fluxes() -> list[str]:
         "The last column is the share of the planet's light that the subtracted frame still has.",
         "",
         *markdown(header, rows),
-        *origin(found),
+        *origin(by_kind),
     ]
 
 
 def about_mismatch() -> list[str]:
     """The instrument found from the frame."""
-    found = tables("mismatch")
-    if not found:
+    by_kind = tables("mismatch")
+    if not by_kind:
         return []
     names = {
         "offset_error_mas": "star position, mas",
@@ -141,11 +142,11 @@ def about_mismatch() -> list[str]:
     rows = []
     for name, label in names.items():
         cells = [label]
-        for table in found.values():
+        for table in by_kind.values():
             values = np.asarray(table[name], dtype=float)
             cells.append(f"{np.median(values):.4g} ({values.min():.4g} to {values.max():.4g})")
         rows.append(cells)
-    frames = ", ".join(f"{len(table)} frames ({KINDS[kind]})" for kind, table in found.items())
+    frames = ", ".join(f"{len(table)} frames ({KINDS[kind]})" for kind, table in by_kind.items())
     return [
         "## Nothing known about the instrument",
         "",
@@ -153,29 +154,29 @@ def about_mismatch() -> list[str]:
         "flux 20 % higher, an unknown background; a planet of 1e-6 at 0.6 arcsec. Errors of what "
         f"the fit found from the frame alone: median, smallest and largest of {frames}.",
         "",
-        *markdown(("", *(KINDS[kind] for kind in found)), rows),
-        *origin(found),
+        *markdown(("", *(KINDS[kind] for kind in by_kind)), rows),
+        *origin(by_kind),
     ]
 
 
 def about_companions() -> list[str]:
     """Several planets, and a bright one."""
-    found = tables("companions")
-    if not found:
+    by_kind = tables("companions")
+    if not by_kind:
         return []
     rows = []
-    for kind, table in found.items():
+    for kind, table in by_kind.items():
         for scene, contrast in dict.fromkeys(zip(table["scene"], table["contrast"], strict=True)):
             part = table[(table["scene"] == scene) & (table["contrast"] == contrast)]
-            seen = part[part["found"]]
-            ratio = np.asarray(seen["measured"] / seen["contrast"])
-            pull = np.asarray((seen["measured"] - seen["contrast"]) / seen["error"])
+            detected = part[part["found"]]
+            ratio = np.asarray(detected["measured"] / detected["contrast"])
+            pull = np.asarray((detected["measured"] - detected["contrast"]) / detected["error"])
             rows.append(
                 (
                     KINDS[kind],
                     scene,
                     f"{contrast:g}",
-                    f"{len(seen)} of {len(part)}",
+                    f"{len(detected)} of {len(part)}",
                     str(int(part["false_candidates"].max())),
                     f"{np.mean(ratio):.3f} ({ratio.min():.3f} to {ratio.max():.3f})",
                     f"{np.mean(pull):+.2f} ± {len(pull) ** -0.5:.2f}",
@@ -194,20 +195,20 @@ def about_companions() -> list[str]:
         "told nothing about how many there are.",
         "",
         *markdown(header, rows),
-        *origin(found),
+        *origin(by_kind),
     ]
 
 
 def about_ring() -> list[str]:
     """A ring of known shape."""
-    found = tables("ring")
-    if not found:
+    by_kind = tables("ring")
+    if not by_kind:
         return []
     rows = []
-    for kind, table in found.items():
+    for kind, table in by_kind.items():
         ratio = np.asarray(table["measured"] / table["light"])
         pull = np.asarray((table["measured"] - table["light"]) / table["error"])
-        kept = np.asarray(table["kept_by_subtraction"], dtype=float)
+        throughput_of = np.asarray(table["kept_by_subtraction"], dtype=float)
         rows.append(
             (
                 KINDS[kind],
@@ -216,7 +217,7 @@ def about_ring() -> list[str]:
                 f"{np.mean(table['error'] / table['light']):.4f}",
                 f"{np.mean(pull):+.2f} ± {len(pull) ** -0.5:.2f}",
                 f"{np.std(pull):.2f}",
-                f"{np.mean(kept):.2f}",
+                f"{np.mean(throughput_of):.2f}",
             )
         )
     header = (
@@ -231,17 +232,17 @@ def about_ring() -> list[str]:
         "fit's wavefront), refines the star anew without the ring.",
         "",
         *markdown(header, rows),
-        *origin(found),
+        *origin(by_kind),
     ]
 
 
 def about_snapshots() -> list[str]:
     """Several frames."""
-    found = tables("snapshots")
-    if not found:
+    by_kind = tables("snapshots")
+    if not by_kind:
         return []
     rows = []
-    for kind, table in found.items():
+    for kind, table in by_kind.items():
         for count in sorted(set(table["snapshots"])):
             part = table[table["snapshots"] == count]
             gain, linked = (snapshots.gain(table, count, n) for n in ("error", "linked_error"))
@@ -268,17 +269,17 @@ def about_snapshots() -> list[str]:
         "what the prior allows.",
         "",
         *markdown(header, rows),
-        *origin(found),
+        *origin(by_kind),
     ]
 
 
 def about_failures() -> list[str]:
-    """What goes wrong, and whether it is said."""
-    found = tables("failures")
-    if not found:
+    """Cases in which calibration breaks, and the status of their fits."""
+    by_kind = tables("failures")
+    if not by_kind:
         return []
     rows = []
-    for kind, table in found.items():
+    for kind, table in by_kind.items():
         for case in dict.fromkeys(table["case"]):
             part = table[table["case"] == case]
             rows.append(
@@ -305,14 +306,14 @@ def about_failures() -> list[str]:
         "CONVERGED where the unscaled deviation is not.",
         "",
         *markdown(header, rows),
-        *origin(found),
+        *origin(by_kind),
     ]
 
 
 def about_speed() -> list[str]:
-    """Seconds, beside the paper's recipe."""
-    found = tables("speed")
-    if not found:
+    """Times, compared with the paper's recipe."""
+    by_kind = tables("speed")
+    if not by_kind:
         return []
     rows = [
         (
@@ -324,7 +325,7 @@ def about_speed() -> list[str]:
             ),
             "" if math.isnan(row["star_error"]) else f"{row['star_error']:.2f}",
         )
-        for table in found.values()
+        for table in by_kind.values()
         for row in table
     ]
     header = (
@@ -338,7 +339,7 @@ def about_speed() -> list[str]:
         "builds constants.",
         "",
         *markdown(header, rows),
-        *origin(found),
+        *origin(by_kind),
     ]
 
 

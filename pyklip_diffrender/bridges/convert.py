@@ -208,11 +208,11 @@ class Conversion:
         """Block means of an array that extends equally far beyond the pupil on all sides."""
         if self.block == 1:
             return array
-        beside = (len(array) - self.sampled) // 2
-        dropped = beside % self.block
-        count = self.npix + 2 * (beside // self.block)
-        kept = slice(dropped, dropped + count * self.block)
-        blocks = array[kept, kept].reshape(count, self.block, count, self.block)
+        border = (len(array) - self.sampled) // 2
+        dropped = border % self.block
+        count = self.npix + 2 * (border // self.block)
+        window = slice(dropped, dropped + count * self.block)
+        blocks = array[window, window].reshape(count, self.block, count, self.block)
         return np.asarray(blocks.mean(axis=(1, 3)))
 
     def _free_turn(self) -> float:
@@ -290,28 +290,28 @@ class Conversion:
         mask_parts = complement_box(optic, margin=2 * spacing)
         if mask_parts is None:
             return None
-        back = turn.inverse
+        to_plane = turn.inverse
         parts: list[MaskPart] = []
         for part in mask_parts:
             if part.box is None:
-                along_x = _turned_factor(part.along_x, part.along_y, back, 0)
-                along_y = _turned_factor(part.along_x, part.along_y, back, 1)
+                along_x = _turned_factor(part.along_x, part.along_y, to_plane, 0)
+                along_y = _turned_factor(part.along_x, part.along_y, to_plane, 1)
                 parts.append(SeparablePart(along_x, along_y, self.sampling))
                 continue
-            left, right, bottom, top = part.box
-            x, y = turn.positions(torch.tensor([left, right]), torch.tensor([bottom, top]))
+            low, high, bottom, top = part.box
+            x, y = turn.positions(torch.tensor([low, high]), torch.tensor([bottom, top]))
             box = (float(x.min()), float(x.max()), float(y.min()), float(y.max()))
-            parts.append(BoxPart(self._complement(part.optic, back), box))
+            parts.append(BoxPart(self._complement(part.optic, to_plane), box))
         return parts
 
     def _complement(
-        self, optic: Any, back: Orientation
+        self, optic: Any, to_plane: Orientation
     ) -> Callable[[Tensor, Tensor, float], Tensor]:
         diameter, oversample = self.diameter, self.osys.oversample
 
         def complement(x: Tensor, y: Tensor, wavelength: float) -> Tensor:
-            local_x, local_y = back.positions(*torch.broadcast_tensors(x, y))
-            transposed = back.matrix[0][0] == 0
+            local_x, local_y = to_plane.positions(*torch.broadcast_tensors(x, y))
+            transposed = to_plane.matrix[0][0] == 0
             if transposed:  # Optics expect x to grow along the second axis of the array.
                 local_x, local_y = local_x.T, local_y.T
             wave = ImageSamples(wavelength, diameter, oversample, local_x, local_y)
@@ -388,10 +388,10 @@ def _is_quarter_turn(optic: Any) -> bool:
 def _turned_factor(
     along_x: Callable[[Tensor], Tensor] | None,
     along_y: Callable[[Tensor], Tensor] | None,
-    back: Orientation,
+    to_plane: Orientation,
     axis: int,
 ) -> Callable[[Tensor], Tensor] | None:
     """The factor of a separable part along one axis of the final image."""
-    column = (back.matrix[0][axis], back.matrix[1][axis])
+    column = (to_plane.matrix[0][axis], to_plane.matrix[1][axis])
     factor, sign = (along_x, column[0]) if column[0] else (along_y, column[1])
     return None if factor is None else lambda positions: factor(sign * positions)

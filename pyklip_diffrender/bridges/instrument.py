@@ -64,16 +64,16 @@ def oversampling(recipe: Mapping[str, Any]) -> tuple[int, int]:
     recipe : mapping
         With "oversample", "fft_oversample" and "detector_oversample", each an int or None.
     """
-    both, fine, pixels = (
+    common, fine, pixels = (
         recipe[name] for name in ("oversample", "fft_oversample", "detector_oversample")
     )
-    if None not in (both, fine, pixels):
+    if None not in (common, fine, pixels):
         raise IncompatibleSetupError(
             "give oversample, or detector_oversample with fft_oversample, not all three"
         )
-    if both is None and fine is None and pixels is None:
-        both = 4
-    image, detector = both if fine is None else fine, both if pixels is None else pixels
+    if common is None and fine is None and pixels is None:
+        common = 4
+    image, detector = common if fine is None else fine, common if pixels is None else pixels
     if image is None or detector is None:
         raise IncompatibleSetupError(
             f"fft_oversample={fine}, detector_oversample={pixels}: give both, or oversample"

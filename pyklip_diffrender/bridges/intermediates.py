@@ -107,8 +107,8 @@ def _wave_of(
     field: Tensor, wavelength: float, diameter: float, arcsec: float | None
 ) -> poppy.Wavefront:
     """A field in a pupil, or on an image with samples of a given size."""
-    where = {} if arcsec is None else {"pixelscale": arcsec * u.arcsec / u.pix}
-    wave = poppy.Wavefront(wavelength=wavelength * u.m, npix=1, diam=diameter * u.m, **where)
+    sampling = {} if arcsec is None else {"pixelscale": arcsec * u.arcsec / u.pix}
+    wave = poppy.Wavefront(wavelength=wavelength * u.m, npix=1, diam=diameter * u.m, **sampling)
     wave.wavefront = _numpy(field)
     if arcsec is None:
         wave.pixelscale = diameter / len(field) * u.m / u.pix

@@ -239,7 +239,7 @@ def from_poppy(
     propagation : "auto", "compact", "fft", or mapping of plane name to one of these
         How to pass image planes. "compact" evaluates a mask only where it blocks light, which
         must be a bounded part of the image; "fft" uses FFTs padded as poppy's. "auto" takes
-        "compact" where that is possible; ``model.propagation`` says which was taken.
+        "compact" where that is possible; ``model.propagation`` records the choice.
     occulter_sampling : float, optional
         Samples per lambda/D in image planes; default ``osys.oversample``, with which the model
         and poppy agree to rounding either way. FFTs are padded by the next whole number.

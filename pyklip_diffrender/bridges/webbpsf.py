@@ -259,14 +259,14 @@ def _aberrations(osys: Any) -> Any:
     return None
 
 
-def _set_flip(plane: Any, wanted: bool | None) -> bool:
+def _set_flip(plane: Any, flip: bool | None) -> bool:
     """Flip the map of internal aberrations if wanted; return whether it is now flipped."""
     flipped = bool(getattr(plane, "_is_OPD_flipped_for_NRC_coron", False))
-    if wanted is None or wanted == flipped:
+    if flip is None or flip == flipped:
         return flipped
     # The map alone: focus and tilt, which depend on the wavelength, are added to it later.
     plane.opd = plane.opd[::-1].copy()
-    return wanted
+    return flip
 
 
 def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:

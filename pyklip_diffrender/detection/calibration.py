@@ -66,6 +66,6 @@ def _by_modes(templates: Templates, k: int, frame: LinearFrame, offset: Tensor) 
     assert basis is not None
     grid = PupilGrid.full(model.npix, model.diameter)
     image = templates.image(k, offset, basis.opd(modes * NANOMETRE, grid))
-    seen = image.detach() * frame.weight.to(image.device) ** 2
-    share = (seen * image).sum() / (seen * image.detach()).sum()
+    weighted = image.detach() * frame.weight.to(image.device) ** 2
+    share = (weighted * image).sum() / (weighted * image.detach()).sum()
     return torch.autograd.grad(share, modes)[0]

@@ -12,6 +12,9 @@ from scipy import stats
 
 __all__ = ["contrast_table", "small_sample_factor"]
 
+_SIGMAS = 5.0
+"""S/N of a contrast curve."""
+
 
 def small_sample_factor(
     separation: NDArray[np.float64], resolution: float, sigmas: float = 5.0
@@ -48,9 +51,8 @@ def contrast_table(
     errors: list[NDArray[np.float64]],
     photon: list[NDArray[np.float64]],
     resolution: float,
-    sigmas: float = 5.0,
 ) -> QTable:
-    """Make the table of a contrast curve.
+    """Make the table of a 5-sigma contrast curve.
 
     Parameters
     ----------
@@ -62,8 +64,6 @@ def contrast_table(
         The same for a known star.
     resolution : float
         lambda/D, arcsec.
-    sigmas : float
-        S/N of a detection.
 
     Returns
     -------
@@ -73,17 +73,19 @@ def contrast_table(
         applies where errors were scaled to the measured scatter.
     """
     rows = []
-    factor = small_sample_factor(separations, resolution, sigmas)
-    for separation, error, known, few in zip(separations, errors, photon, factor, strict=True):
+    factor = small_sample_factor(separations, resolution, _SIGMAS)
+    for separation, error, photon_error, correction in zip(
+        separations, errors, photon, factor, strict=True
+    ):
         if not len(error):
             continue
-        limit = sigmas * np.asarray(error)
+        limit = _SIGMAS * np.asarray(error)
         middle = float(np.median(limit))
-        bound = sigmas * float(np.median(known))
-        rows.append((separation, middle, limit.min(), limit.max(), bound, middle * few))
+        bound = _SIGMAS * float(np.median(photon_error))
+        rows.append((separation, middle, limit.min(), limit.max(), bound, middle * correction))
     names = ("separation", "contrast", "lowest", "highest", "known_star", "small_sample")
     table = QTable(rows=rows, names=names, dtype=(float,) * len(names))
     table["separation"].unit = u.arcsec
     table["separation"] = u.Quantity(table["separation"])
-    table.meta = {"sigmas": sigmas, "resolution_arcsec": resolution}
+    table.meta = {"sigmas": _SIGMAS, "resolution_arcsec": resolution}
     return table

@@ -26,9 +26,9 @@ _WINGS = 0.4
 def error_inflation(fits: Sequence[Refinement], groups: Sequence[Group], offsets: Tensor) -> float:
     """Square root of the reduced chi-squared with the light of sources removed, at least 1.
 
-    Unmodelled structure in the residuals biases planet fluxes, so it inflates their errors. The
-    light of planets is no such structure. A planet of S/N 20 that was not removed would increase
-    all errors by 3 %, so the sources are fitted together and removed first.
+    Unmodelled structure in the residuals biases planet fluxes, so it inflates their errors. Planets
+    are not part of it: one of S/N 20 that is not removed would increase all errors by 3 %.
+    Therefore the sources are fitted together and removed first.
 
     Parameters
     ----------
@@ -65,10 +65,10 @@ def snr_scatter(snr: Image, grid: Image, offsets: Tensor, inner: float) -> float
     inner : float
         Pixels closer to the star than this are ignored, arcsec.
     """
-    away = (separation_of(grid) >= inner) & np.isfinite(snr) & far_from(grid, offsets, _WINGS)
-    values = snr[away]
+    clear = (separation_of(grid) >= inner) & np.isfinite(snr) & far_from(grid, offsets, _WINGS)
+    values = snr[clear]
     deviation = 1.4826 * float(np.median(np.abs(values - np.median(values))))
-    # Sources that are not yet candidates must not raise the threshold above themselves.
+    # Clipped, so that sources that are not yet candidates do not raise their own threshold.
     return max(1.0, float(np.clip(values, -5 * deviation, 5 * deviation).std()))
 
 
@@ -88,7 +88,7 @@ def _reduced_chi2(groups: Sequence[Group], offsets: Tensor) -> float:
     for (linear, _), part in zip(groups, images, strict=True):
         light = {k: torch.tensordot(contrasts, each, dims=1)[None] for k, each in part.items()}
         cleaned = linear.clean(light)
-        chi2 += _chi2([whole - cleaned[k][0] for k, whole in enumerate(linear.cleaned)])
+        chi2 += _chi2([residual - cleaned[k][0] for k, residual in enumerate(linear.cleaned)])
     return chi2 / max(pixels - independent, 1)
 
 

@@ -104,9 +104,9 @@ def throughput(
     radius : float
         Pixels taken about the planet.
     """
-    near = _inside(_circle(position, radius), image.shape) & np.isfinite(image)
-    weight = planet[near] / noise[near] ** 2
-    return float((weight * image[near]).sum() / (weight * planet[near]).sum())
+    close = _inside(_circle(position, radius), image.shape) & np.isfinite(image)
+    weight = planet[close] / noise[close] ** 2
+    return float((weight * image[close]).sum() / (weight * planet[close]).sum())
 
 
 def star_model_error(

@@ -10,64 +10,43 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from astropy import units as u
-from astropy.io import fits
+from astropy.io.fits import HDUList, PrimaryHDU
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.detection.calibration import calibration_errors
-from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.field import Image, require_inside
-from pyklip_diffrender.detection.groups import Group, has_only_reference_stars, weigh
-from pyklip_diffrender.detection.relinearise import without_light
+from pyklip_diffrender.detection.candidates import Candidates, candidate_table
+from pyklip_diffrender.detection.field import Image
+from pyklip_diffrender.detection.groups import Group
+from pyklip_diffrender.detection.measurement import (
+    contrasts_at,
+    measured_shape,
+    subtracted_frames,
+)
+from pyklip_diffrender.detection.storage import (
+    MAPS,
+    candidates_of,
+    digest,
+    fit_beside,
+    groups_of_searched,
+    image_hdu,
+    maps_of,
+    table_facts,
+    table_of,
+)
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.files import replacing, write_fits
-from pyklip_diffrender.io.units import to_arcsec
-from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.refinement import FrameFit, Refinement
+from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.refinement.storage import (
+    image,
+    observation_hdus,
+    observation_of,
+    reading,
+    text_hdu,
+)
+from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["Detection", "contrasts_at"]
-
-_ROUNDS = 5
-"""Largest number of refinements of the star for a bright extended source."""
-
-_SETTLED = 0.2
-"""The refinements end when its amplitude changes by less than this many standard deviations."""
-
-
-def contrasts_at(groups: Sequence[Group], offsets: ArrayLike, scatter: float) -> QTable:
-    """Contrasts of point sources at given positions, one at a time; see `Detection.measure`."""
-    places = torch.from_numpy(np.atleast_2d(to_arcsec(offsets, "offsets")))
-    if places.ndim != 2 or places.shape[1] != 2:
-        raise ShapeError(f"offsets: got shape {tuple(places.shape)}, expected (k, 2)")
-    require_inside(places.numpy(), groups[0][1].grid)
-    products = weigh(groups, lambda templates: templates.at(places))
-    error = scatter / products.information.sqrt().numpy()
-    contrast = (products.numerator / products.information).numpy()
-    snr = contrast / error
-    calibration = scatter * calibration_errors(groups, places, torch.from_numpy(snr)).numpy()
-    return QTable(
-        {
-            "x": places[:, 0].numpy() * u.arcsec,
-            "y": places[:, 1].numpy() * u.arcsec,
-            "contrast": contrast,
-            "contrast_error": np.hypot(error, contrast * calibration),
-            "snr": snr,
-        }
-    )
-
-
-def _amplitude(linear: LinearModel, frame: int, shape: torch.Tensor) -> tuple[float, float]:
-    products = linear.weigh({frame: shape[None]})
-    information = float(products.information[0])
-    return float(products.numerator[0]) / information, information**-0.5
-
-
-def _less_star(frame: FrameFit) -> Image:
-    """Residual of a frame of a reference star that was fitted without the target."""
-    combined = frame.observation.combined()
-    return np.where(combined.valid[0], combined.data[0] - frame.star, np.nan)
+__all__ = ["Detection"]
 
 
 @dataclass(frozen=True)
@@ -80,9 +59,10 @@ class Detection:
     Attributes
     ----------
     fits : tuple of Refinement
-        Fits that were searched, after the last refinement.
+        Fits that were searched, after the last refinement; empty if the detection was read from a
+        file without them.
     groups : tuple of (LinearModel, Templates)
-        Linear model and templates of each fit of the target.
+        Linear model and templates of each fit of the target; empty without `fits`.
     contrast : ndarray, (ny, nx)
         Flux of a point source at every pixel over that of the star, before the coronagraph.
     error : ndarray, (ny, nx)
@@ -103,6 +83,8 @@ class Detection:
         See `contrast.contrast_table`.
     grid : ndarray, (ny, nx, 2)
         x, y of the pixels from the star, arcsec.
+    path : Path or None
+        File that the detection was read from.
     """
 
     fits: tuple[Refinement, ...]
@@ -117,6 +99,7 @@ class Detection:
     threshold: float
     contrast_curve: QTable
     grid: Image
+    path: Path | None = None
 
     def __repr__(self) -> str:
         return (
@@ -133,13 +116,18 @@ class Detection:
             for row in self.table
         ]
         title = "    separation             position angle     contrast               S/N"
-        none = [f"no candidate above S/N {self.threshold:g}"]
-        return "\n".join([title, *lines] if lines else none)
+        no_candidates = [f"no candidate above S/N {self.threshold:g}"]
+        return "\n".join([title, *lines] if lines else no_candidates)
+
+    @cached_property
+    def observation(self) -> Observation:
+        """The first frame; its integrations are averaged if the detection was read from a file."""
+        return self.fits[0].frames[0].observation
 
     @property
     def north(self) -> float:
         """Position angle of the first frame's +y axis, degrees east of north; 0 if not known."""
-        return self.fits[0].frames[0].observation.position_angle
+        return self.observation.position_angle
 
     @cached_property
     def table(self) -> QTable:
@@ -153,42 +141,8 @@ class Detection:
         `calibration.calibration_errors`). The S/N does not include them, because they do not
         change the significance of a source.
         """
-        candidates, scatter, count = self.candidates, self.scatter, len(self.candidates)
-        x, y = candidates.offsets.T.numpy()
-        contrast = candidates.contrasts.numpy()
-        errors = scatter * candidates.errors.numpy().reshape(-1, 3)
-        covariance = candidates.covariance.numpy().reshape(3, count, 3, count)
-        places = scatter**2 * np.einsum("akbk->kab", covariance)[:, 1:, 1:]
-        separation = np.hypot(x, y)
-        along = np.stack([x, y], axis=1) / separation[:, None]
-        across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-        radial, tangential = (
-            np.sqrt(np.einsum("ka,kab,kb->k", unit, places, unit)) for unit in (along, across)
-        )
-        angle = np.deg2rad(self.north) + np.arctan2(-x, y)
-        contrast_error = np.hypot(errors[:, 0], contrast * self._calibration_errors)
-        columns = {
-            "separation": (separation * u.arcsec, ".4f"),
-            "separation_error": (radial * u.arcsec, ".4f"),
-            "position_angle": (np.rad2deg(angle) % 360 * u.deg, ".2f"),
-            "position_angle_error": (np.rad2deg(tangential / separation) * u.deg, ".2f"),
-            "contrast": (contrast, ".3e"),
-            "contrast_error": (contrast_error, ".1e"),
-            "delta_mag": (-2.5 * np.log10(contrast) * u.mag, ".3f"),
-            "delta_mag_error": (2.5 / np.log(10) * contrast_error / contrast * u.mag, ".3f"),
-            "snr": (contrast / errors[:, 0], ".1f"),
-            "delta_ra": (separation * np.sin(angle) * u.arcsec, ".4f"),
-            "delta_dec": (separation * np.cos(angle) * u.arcsec, ".4f"),
-            "x": (x * u.arcsec, ".4f"),
-            "y": (y * u.arcsec, ".4f"),
-            "x_error": (errors[:, 1] * u.arcsec, ".4f"),
-            "y_error": (errors[:, 2] * u.arcsec, ".4f"),
-        }
-        table = QTable({name: values for name, (values, _) in columns.items()})
-        for name, (_, form) in columns.items():
-            table[name].info.format = form
-        table = table[np.argsort(-table["snr"])]
-        table.meta = self._provenance()
+        table = candidate_table(self.candidates, self.scatter, self._calibration_errors, self.north)
+        table.meta = dict(self._provenance)
         return table
 
     @cached_property
@@ -215,10 +169,11 @@ class Detection:
         Raises
         ------
         IncompatibleSetupError
-            For a position outside the field.
+            For a position outside the field, or if the detection was read from a file without its
+            fit; see `read`.
         NonFiniteError, ShapeError, UnitError
         """
-        return contrasts_at(self.groups, offsets, self.scatter)
+        return contrasts_at(self._searched[1], offsets, self.scatter)
 
     def measure_shape(self, image: ArrayLike, *, relinearise: float = 25.0) -> tuple[float, float]:
         """Measure an extended source of known shape in the first frame, such as a ring.
@@ -236,21 +191,10 @@ class Detection:
         -------
         amplitude, error : float
         """
-        shape = torch.as_tensor(np.asarray(image, dtype=float))
+        shape = np.asarray(image, dtype=float)
         if shape.shape != self.snr.shape:
-            raise ShapeError(f"image: got {tuple(shape.shape)}, expected {self.snr.shape}")
-        linear, scatter = self.groups[0][0], self.scatter
-        amplitude, error = _amplitude(linear, 0, shape)
-        total, bright = amplitude, amplitude > relinearise * error
-        alone = len(self.fits) == 1 and len(self.fits[0].frames) == 1
-        for _ in range(_ROUNDS if bright and alone else 0):
-            fit = without_light(self.fits[0], total * shape.numpy())
-            amplitude, error = _amplitude(fit.star_only, 0, shape)
-            total += amplitude
-            scatter = 1.0 if fit.status.calibrated else self.scatter
-            if abs(amplitude) < _SETTLED * error:
-                break
-        return total, scatter * error
+            raise ShapeError(f"image: got {shape.shape}, expected {self.snr.shape}")
+        return measured_shape(*self._searched, shape, self.scatter, relinearise)
 
     @cached_property
     def subtracted(self) -> tuple[Image, ...]:
@@ -261,23 +205,7 @@ class Detection:
         below the threshold do. Images (ny, nx) are in the order of `fits`, in the data's unit, and
         NaN where the data are masked; frames of one observation are averaged.
         """
-        images: list[Image] = []
-        groups = iter(self.groups)
-        for fit in self.fits:
-            if has_only_reference_stars(fit):
-                images += [_less_star(frame) for frame in fit.frames]
-                continue
-            linear, templates = next(groups)
-            light = self.candidates.light(templates)
-            # Candidates are removed before the star is estimated, and added again afterwards.
-            cleaned = linear.clean(light) if light else {}
-            for k, frame in enumerate(linear.frames):
-                left = linear.cleaned[k]
-                if cleaned:
-                    left = left - cleaned[k][0]
-                image = left / frame.weight + light.get(k, torch.zeros(1))[0]
-                images.append(torch.where(frame.weight > 0, image, torch.nan).numpy())
-        return tuple(images)
+        return subtracted_frames(self.fits, self.groups, self.candidates)
 
     @cached_property
     def left_out(self) -> tuple[Image, Image]:
@@ -289,6 +217,19 @@ class Detection:
         residual, deviation = self.groups[0][0].left_out(5, 0)
         return residual.numpy(), deviation.numpy()
 
+    @cached_property
+    def _searched(self) -> tuple[tuple[Refinement, ...], tuple[Group, ...]]:
+        """Fits and groups; if the detection was read without them, from the same folder."""
+        if self.path is None or self.groups:
+            return self.fits, self.groups
+        fits = (fit_beside(self.path),)
+        return fits, groups_of_searched(fits, self._digests, self.path)
+
+    @cached_property
+    def _digests(self) -> tuple[str, ...]:
+        return tuple(digest(fit) for fit in self.fits)
+
+    @cached_property
     def _provenance(self) -> dict[str, object]:
         from pyklip_diffrender import __version__
 
@@ -300,7 +241,7 @@ class Detection:
             "threshold": self.threshold,
             "orientation": (
                 "position angles counter-clockwise from +y of the first frame"
-                if self.fits[0].frames[0].observation.position_angles is None
+                if self.observation.position_angles is None
                 else "position angles east of north"
             ),
         }
@@ -325,34 +266,13 @@ class Detection:
         return plotting.plot_detection(self, ax)
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write maps (FITS), candidates and contrast curve (ECSV); returns the paths."""
+        """Write maps (FITS), candidates and contrast curve (ECSV); returns the paths.
+
+        `read` needs only the first file, detection.fits.
+        """
         folder = Path(folder)
-        primary = fits.PrimaryHDU()
-        for key, value in self._provenance().items():
-            text = ", ".join(value) if isinstance(value, list) else value
-            primary.header[f"HIERARCH {key}"] = text
-        unit = self.fits[0].frames[0].observation.unit.to_string("fits")
-        hdus = fits.HDUList([primary])
-        for name, image, image_unit in (
-            ("SNR", self.snr, ""),
-            ("RESIDUAL_SNR", self.residual_snr, ""),
-            ("CONTRAST", self.contrast, ""),
-            ("CONTRAST_ERROR", self.error, ""),
-            ("PHOTON_ERROR", self.photon_error, ""),
-            ("LEFT_OUT", self.left_out[0], unit),
-            ("LEFT_OUT_ERROR", self.left_out[1], unit),
-            ("OFFSET_X", self.grid[..., 0], "arcsec"),
-            ("OFFSET_Y", self.grid[..., 1], "arcsec"),
-        ):
-            hdu = fits.ImageHDU(image.astype(np.float32), name=name)
-            hdu.header["BUNIT"] = image_unit
-            hdus.append(hdu)
-        for k, image in enumerate(self.subtracted):
-            hdu = fits.ImageHDU(image.astype(np.float32), name="SUBTRACTED", ver=k + 1)
-            hdu.header["BUNIT"] = unit
-            hdus.append(hdu)
         maps = folder / "detection.fits"
-        write_fits(hdus, maps)
+        write_fits(self._hdus(), maps)
         written = [maps]
         for name, table in (("candidates", self.table), ("contrast", self.contrast_curve)):
             path = folder / f"{name}.ecsv"
@@ -360,3 +280,97 @@ class Detection:
                 table.write(temporary, format="ascii.ecsv", overwrite=True)
             written.append(path)
         return written
+
+    def _hdus(self) -> HDUList:
+        """The FITS extensions that `read` reads."""
+        primary = PrimaryHDU()
+        for key, value in self._provenance.items():
+            text = ", ".join(value) if isinstance(value, list) else value
+            primary.header[f"HIERARCH {key}"] = text
+        unit = self.observation.unit.to_string("fits")
+        about, data = observation_hdus(self.observation, 0)
+        facts = {
+            "scatter": self.scatter,
+            "threshold": self.threshold,
+            "candidates": vars(self.candidates),
+            "calibration_errors": self._calibration_errors,
+            "contrast_curve": table_facts(self.contrast_curve),
+            "observation": about,
+            "provenance": self._provenance,
+            "fits": self._digests,
+        }
+        return HDUList(
+            [
+                primary,
+                *(
+                    image_hdu(getattr(self, attribute), name, "")
+                    for name, attribute in MAPS.items()
+                ),
+                image_hdu(self.left_out[0], "LEFT_OUT", unit),
+                image_hdu(self.left_out[1], "LEFT_OUT_ERROR", unit),
+                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec"),
+                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec"),
+                *(
+                    image_hdu(each, "SUBTRACTED", unit, k)
+                    for k, each in enumerate(self.subtracted, 1)
+                ),
+                *data,
+                text_hdu("FACTS", facts),
+            ]
+        )
+
+    @classmethod
+    def read(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        fit: Refinement | Sequence[Refinement] | None = None,
+    ) -> Detection:
+        """Read a detection that `write` wrote.
+
+        Maps, tables and figures do not need the fit. `measure` and `measure_shape` do: they read
+        ``fit.fits`` from the same folder, where `Reduction.write` puts it, unless it is passed.
+
+        Parameters
+        ----------
+        path : path
+            The folder, or detection.fits in it.
+        fit : Refinement or sequence of Refinement, optional
+            The fits that were searched: the attribute `fits` of the detection that was written.
+
+        Raises
+        ------
+        CorruptFileError
+            If the file is missing, truncated, or was not written by `write`.
+        IncompatibleSetupError
+            For a fit other than the one that was searched.
+        """
+        path = Path(path)
+        path = path / "detection.fits" if path.is_dir() else path
+        fits = (fit,) if isinstance(fit, Refinement) else tuple(fit or ())
+        with reading(path, "Detection") as (hdus, facts):
+            stars = sum(hdu.name == "SUBTRACTED" for hdu in hdus)
+            # What a new detection computes from its fits.
+            computed = {
+                "observation": observation_of(hdus, facts["observation"], 0),
+                "subtracted": tuple(image(hdus, "SUBTRACTED", k) for k in range(stars)),
+                "left_out": (image(hdus, "LEFT_OUT", 0), image(hdus, "LEFT_OUT_ERROR", 0)),
+                "_calibration_errors": np.array(facts["calibration_errors"], dtype=float),
+                "_provenance": {
+                    key: list(value) if isinstance(value, tuple) else value
+                    for key, value in facts["provenance"].items()
+                },
+                "_digests": facts["fits"],
+            }
+            detection = cls(
+                fits=fits,
+                groups=groups_of_searched(fits, facts["fits"], path) if fits else (),
+                scatter=facts["scatter"],
+                threshold=facts["threshold"],
+                candidates=candidates_of(facts["candidates"]),
+                contrast_curve=table_of(facts["contrast_curve"]),
+                path=path,
+                **maps_of(hdus),
+            )
+        vars(detection).update(computed)
+        return detection

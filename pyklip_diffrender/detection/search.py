@@ -21,8 +21,9 @@ from pyklip_diffrender.detection.field import (
 )
 from pyklip_diffrender.detection.groups import Group, groups_of, weigh
 from pyklip_diffrender.detection.maps import Maps
+from pyklip_diffrender.detection.measurement import contrasts_at
 from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
-from pyklip_diffrender.detection.result import Detection, contrasts_at
+from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, to_arcsec
 from pyklip_diffrender.refinement import Refinement
@@ -190,8 +191,8 @@ def _measured(fits: Sequence[Refinement], offsets: ArrayLike, scatter: float | N
     table = contrasts_at(groups, offsets, 1.0 if scatter is None else scatter)
     if scatter is None:
         sources = _as_candidates(table[table["snr"] > _SOURCE])
-        known = Candidates.of_fit(fits[0])
-        factor = error_inflation(fits, groups, torch.cat([known.offsets, sources.offsets]))
+        companions = Candidates.of_fit(fits[0])
+        factor = error_inflation(fits, groups, torch.cat([companions.offsets, sources.offsets]))
         table["contrast_error"] *= factor
         table["snr"] /= factor
     return table
@@ -256,13 +257,13 @@ def contrast_curve(
 
 def _checked(fits: Fits) -> list[Refinement]:
     """Return the fits as a list; raise an exception if one of them failed."""
-    several = [fits] if isinstance(fits, Refinement) else list(fits)
-    if not several:
+    refinements = [fits] if isinstance(fits, Refinement) else list(fits)
+    if not refinements:
         raise IncompatibleSetupError("detect: got no fit, expected a Refinement")
-    for fit in several:
+    for fit in refinements:
         if not fit.status.usable:
             raise IncompatibleSetupError(f"detect: the fit {fit.status.message}")
-    return several
+    return refinements
 
 
 def _require_positive(**values: float | None) -> None:
@@ -283,7 +284,7 @@ def _search(
     """Candidates in the order in which they were found, and the factor for the errors."""
     groups, grid, pixel = maps.groups, maps.grid, pixel_width(maps.grid)
     explained = all(fit.status.calibrated for fit in fits)
-    real = fits[0].frames[0].observation.is_nircam
+    is_nircam = fits[0].frames[0].observation.is_nircam
     candidates = refine_candidates(groups, start, reach=pixel / 2)
     # A fit may have taken a residual for a companion while its wavefront was still wrong.
     while len(candidates) and _weakest(candidates)[1] < threshold:
@@ -299,10 +300,10 @@ def _search(
             if explained:
                 factor = error_inflation(fits, groups, candidates.offsets)
                 # Errors that neighbouring pixels share do not show in chi-squared per pixel.
-                if real and scattered > _CORRELATED * factor:
+                if is_nircam and scattered > _CORRELATED * factor:
                     factor = scattered
         peak = strongest_peak(
-            snr / factor, grid, candidates.offsets, threshold=threshold, inner=inner, apart=pixel
+            snr / factor, grid, candidates.offsets, threshold=threshold, inner=inner, distance=pixel
         )
         if peak is None or len(candidates) >= _MAX_CANDIDATES:
             # The factor may have grown since a candidate was accepted.

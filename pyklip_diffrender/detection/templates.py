@@ -1,4 +1,4 @@
-"""What a planet of contrast 1 looks like in the frames of a fit, wherever it is."""
+"""Images of planets of contrast 1 at any position in the frames of a fit."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ _ALIGNED = 1e-6
 class Templates:
     """Images of planets in frames that were refined together, in the data's unit.
 
-    Positions are x, y from the star in arcsec, as the first frame has them: the others may be
-    rolled, and have their stars elsewhere.
+    Positions are x, y from the star in arcsec, in the first frame. The other frames may be rolled
+    and have their stars at other positions.
 
     Parameters
     ----------
@@ -153,8 +153,10 @@ class Templates:
         inside = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)
         images = torch.zeros(len(offsets), ny, nx, dtype=torch.float32)
         for up, right in torch.unique(part[:, inside], dim=1).T.tolist():
-            chosen = torch.nonzero(inside & (part[0] == up) & (part[1] == right)).flatten()
-            images[chosen] = self._points(k, right, up).images(row[chosen], column[chosen]).cpu()
+            selected = torch.nonzero(inside & (part[0] == up) & (part[1] == right)).flatten()
+            images[selected] = (
+                self._points(k, right, up).images(row[selected], column[selected]).cpu()
+            )
         return images
 
     def at(self, offsets: Tensor, slopes: bool = False) -> dict[int, Tensor]:
@@ -197,9 +199,9 @@ class Templates:
         """
         frame = self.frames[k]
         star = self._star(frame) + self._turned(k, offset)
-        there = {**frame.optical_values, "star_offset": star}
+        values = {**frame.optical_values, "star_offset": star}
         opd = _as_tensor(frame.opd)
-        return frame.model(opd if change is None else opd + change, **there).double()
+        return frame.model(opd if change is None else opd + change, **values).double()
 
 
 def _as_tensor(opd: NDArray[np.float64]) -> Tensor:

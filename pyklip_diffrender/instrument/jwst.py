@@ -15,7 +15,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import embedded_table
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
 
-__all__ = ["TABULATED_GAP", "jwst_pupil", "jwst_segments", "maskrnd_openings"]
+__all__ = ["TABULATED_GAP", "is_jwst_pupil", "jwst_pupil", "jwst_segments", "maskrnd_openings"]
 
 TABULATED_GAP = 7.68e-3
 """Distance between neighbouring segments of the embedded outlines, m."""
@@ -44,6 +44,29 @@ def jwst_segments() -> dict[str, Tensor]:
 def maskrnd_openings() -> list[Tensor]:
     """Outlines of the 14 openings of the MASKRND Lyot stop, (vertices, 2) in m at the primary."""
     return list(_polygons("nircam_maskrnd_openings", "opening").values())
+
+
+@lru_cache(maxsize=4)
+def _mirror_coverage(grid: PupilGrid) -> Tensor:
+    return polygon_coverage(list(jwst_segments().values()), grid)
+
+
+def is_jwst_pupil(lit: Tensor, diameter: float) -> bool:
+    """Whether an aperture is JWST's primary mirror, up to struts and gaps.
+
+    Parameters
+    ----------
+    lit : Tensor of bool, (npix, npix)
+        Samples that transmit light.
+    diameter : float
+        Side of the array, m.
+    """
+    mirror = _mirror_coverage(PupilGrid.full(len(lit), diameter))
+    lit, full = lit.cpu(), mirror > 0.99
+    # Struts and gaps cover at most 4 % of the mirror. A round pupil that fills as much of it has at
+    # least 2 % of its light elsewhere, with 64 samples or more.
+    inside = int((lit & (mirror > 0)).sum()) > 0.99 * int(lit.sum())
+    return inside and int((lit & full).sum()) > 0.95 * int(full.sum())
 
 
 def jwst_pupil(npix: int, segment_gap: float | None = None, pupil: str = "design") -> Tensor:

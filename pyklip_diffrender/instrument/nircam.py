@@ -218,7 +218,7 @@ def nircam_coronagraph(
             f"npix: got {npix} samples across the pupil, whose image repeats inside the field of "
             f"{field:.3g} arcsec; expected npix at least {needed}, or a smaller field"
         )
-    where = torch.device(device)
+    torch_device = torch.device(device)
     planes: list[Plane] = []
     if image_mask is not None:
         planes.append(
@@ -228,13 +228,13 @@ def nircam_coronagraph(
                 occulter_sampling,
                 JWST_DIAMETER,
                 dtype,
-                where,
+                torch_device,
                 name=mask.name,
             )
         )
     if pupil_mask is not None:
         planes.append(
-            LyotStop(maskrnd_openings(), npix, JWST_DIAMETER, dtype, where, name=pupil_mask)
+            LyotStop(maskrnd_openings(), npix, JWST_DIAMETER, dtype, torch_device, name=pupil_mask)
         )
     if si_wfe is not False:
         coefficients = internal_wavefront_error(mask.name, flip_si_wfe)
@@ -247,14 +247,21 @@ def nircam_coronagraph(
         )
         planes.append(
             InternalAberration(
-                coefficients, JWST_DIAMETER, dtype, where, chromatic, name="NIRCam internal WFE"
+                coefficients,
+                JWST_DIAMETER,
+                dtype,
+                torch_device,
+                chromatic,
+                name="NIRCam internal WFE",
             )
         )
-    detector = Detector(shape, scale, oversample, dtype, where, shear)
+    detector = Detector(shape, scale, oversample, dtype, torch_device, shear)
     if crosstalk:
         effects = PixelCrosstalk(_IPC_NRCA5), PixelCrosstalk(_PPC_NRCA5)
-        detector = ChainDetector(shape, scale, oversample, dtype, where, shear, on_pixels=effects)
-    entrance = _pupil(npix, segment_gap, pupil).to(where)
+        detector = ChainDetector(
+            shape, scale, oversample, dtype, torch_device, shear, on_pixels=effects
+        )
+    entrance = _pupil(npix, segment_gap, pupil).to(torch_device)
     return OpticalSystem(
         EntrancePupil(entrance, JWST_DIAMETER, dtype, name="JWST pupil"),
         planes,

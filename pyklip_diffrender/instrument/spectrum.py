@@ -110,9 +110,9 @@ def filter_bandpass(
         photons = blackbody(to_number(source, u.K, "source", "positive"), middle)
     photons = (photons * np.interp(middle, wavelength, throughput)).reshape(nlambda, -1)
     weights = photons.sum(axis=1)
-    seen = weights > 0
-    if not seen.any():
+    detected = weights > 0
+    if not detected.any():
         raise IncompatibleSetupError(f"the spectrum has no light in the filter {name}")
-    weights, photons = weights[seen], photons[seen]
-    centres = (photons * middle.reshape(nlambda, -1)[seen]).sum(axis=1) / weights
+    weights, photons = weights[detected], photons[detected]
+    centres = (photons * middle.reshape(nlambda, -1)[detected]).sum(axis=1) / weights
     return Bandpass(tuple(centres.tolist()), tuple(weights.tolist()))

@@ -162,8 +162,8 @@ def require_shape(array: NDArray[Any], shape: tuple[int | None, ...], name: str,
         want is None or got == want for got, want in zip(array.shape, shape, strict=True)
     )
     if not good:
-        wanted = tuple("any" if n is None else n for n in shape)
-        raise ShapeError(f"{name}: got shape {tuple(array.shape)}, expected {wanted}. {fix}")
+        expected = tuple("any" if n is None else n for n in shape)
+        raise ShapeError(f"{name}: got shape {tuple(array.shape)}, expected {expected}. {fix}")
 
 
 def require_finite(array: NDArray[Any], name: str, where: NDArray[np.bool_] | None = None) -> None:

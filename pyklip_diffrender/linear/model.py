@@ -59,8 +59,8 @@ class Unknown(NamedTuple):
     frame: int = -1
 
     def __str__(self) -> str:
-        own = "" if self.frame < 0 else f" of frame {self.frame}"
-        return f"{self.name}[{self.component}]{own}"
+        suffix = "" if self.frame < 0 else f" of frame {self.frame}"
+        return f"{self.name}[{self.component}]{suffix}"
 
 
 @dataclass(frozen=True)
@@ -288,15 +288,15 @@ class LinearModel:
         total = len(next(iter(templates.values())))
         for start in range(0, total, _BATCH):
             part = {k: images[start : start + _BATCH] for k, images in templates.items()}
-            lost = (self.projected(part) ** 2).sum(dim=0)
-            numerator, photon = torch.zeros_like(lost), torch.zeros_like(lost)
+            absorbed = (self.projected(part) ** 2).sum(dim=0)
+            numerator, photon = torch.zeros_like(absorbed), torch.zeros_like(absorbed)
             for k, images in part.items():
                 whitened = (images * self.frames[k].weight.to(images.dtype)).double()
                 numerator += torch.tensordot(whitened, self.cleaned[k], dims=2)
                 photon += (whitened**2).sum(dim=(1, 2))
             if self.shares_pattern:
                 photon -= (self._summed(part) ** 2).sum(dim=1)
-            parts.append(TemplateProducts(numerator, photon - lost, photon))
+            parts.append(TemplateProducts(numerator, photon - absorbed, photon))
         return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
     def response(self, templates: Mapping[int, Tensor]) -> Tensor:
@@ -356,25 +356,25 @@ class LinearModel:
         for k, frame in enumerate(self.frames):
             rows = keeps[frame.rows]
             counts = frame.weight > 0
-            back = torch.as_tensor(light.get(k, 0.0), dtype=torch.float64)
+            companions = torch.as_tensor(light.get(k, 0.0), dtype=torch.float64)
             frames.append(
                 replace(
                     frame,
-                    residual=torch.where(counts, frame.residual + back, 0.0),
+                    residual=torch.where(counts, frame.residual + companions, 0.0),
                     jacobian=frame.jacobian[rows],
                     rows=place[frame.rows[rows]],
                     drift=place[frame.drift],
                     first_mode=frame.first_mode - int((~rows[: frame.first_mode]).sum()),
                 )
             )
-        kept = torch.nonzero(keeps).flatten()
+        remaining = torch.nonzero(keeps).flatten()
         return LinearModel(
-            tuple(self.unknowns[k] for k in kept.tolist()),
+            tuple(self.unknowns[k] for k in remaining.tolist()),
             tuple(frames),
-            self.vector[kept],
-            self.mean[kept],
-            self.deviation[kept],
-            self.curvature[kept][:, kept],
+            self.vector[remaining],
+            self.mean[remaining],
+            self.deviation[remaining],
+            self.curvature[remaining][:, remaining],
         )
 
     def left_out(self, size: int = 5, frame: int = 0) -> tuple[Tensor, Tensor]:
@@ -417,8 +417,8 @@ class LinearModel:
                 inverse = torch.diag(precision[window][counts]) - inside.T @ inside
                 covariance = torch.linalg.inv(inverse)
                 weight = part.weight[window][counts]
-                left = covariance @ self.cleaned[frame][window][counts] / weight
-                residual[window] = residual[window].masked_scatter(counts, left)
+                prediction_error = covariance @ self.cleaned[frame][window][counts] / weight
+                residual[window] = residual[window].masked_scatter(counts, prediction_error)
                 deviation[window] = deviation[window].masked_scatter(
                     counts, covariance.diagonal().sqrt() / weight
                 )

@@ -64,14 +64,14 @@ class Bandpass:
         if count == 1:
             middle = int(np.abs(np.array(self.wavelengths) - self.mean_wavelength).argmin())
             return (middle,), Bandpass((self.wavelengths[middle],), (1.0,))
-        kept = np.sort(order[np.round(np.linspace(0, total - 1, count)).astype(int)])
-        nodes = np.array(self.wavelengths)[kept]
+        indices = np.sort(order[np.round(np.linspace(0, total - 1, count)).astype(int)])
+        nodes = np.array(self.wavelengths)[indices]
         ascending = np.argsort(nodes)
         shares = [
             np.interp(self.wavelengths, nodes[ascending], unit[ascending]) for unit in np.eye(count)
         ]
         weights = np.array(shares) @ np.array(self.weights)
-        return tuple(kept.tolist()), Bandpass(tuple(nodes.tolist()), tuple(weights.tolist()))
+        return tuple(indices.tolist()), Bandpass(tuple(nodes.tolist()), tuple(weights.tolist()))
 
     @property
     def mean_wavelength(self) -> float:

@@ -1,4 +1,4 @@
-"""Tell tensors that are being differentiated from constants, whose results may be cached."""
+"""Distinguish differentiated tensors from constants, whose results may be cached."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
-__all__ = ["Position", "has_memory", "is_plain", "kept", "position_of"]
+__all__ = ["Position", "cached", "has_memory", "is_plain", "position_of"]
 
 Key = TypeVar("Key", bound=Hashable)
 Made = TypeVar("Made")
@@ -48,7 +48,7 @@ def position_of(values: Mapping[str, Tensor], names: Iterable[str]) -> Position 
     return tuple(position)
 
 
-def kept(
+def cached(
     store: dict[Key, tuple[Position, Made]],
     key: Key,
     position: Position | None,

@@ -1,6 +1,6 @@
 """Fraunhofer propagation between pupil and image by matrix products.
 
-Convention, written only here: with x, y angles on the image (radians, image orientation as in
+Convention, with x, y angles on the image (radians, image orientation as in
 stpsf) and xi, eta positions in the entrance-pupil orientation (m),
 
     E(x, y) = 1/lambda  sum  E(xi, eta) exp(+2 pi i (x xi - y eta) / lambda) d_xi d_eta

@@ -218,7 +218,7 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
     middle = (begin + finish) / 2
     column, row = torch.floor(middle.detach()).to(torch.int64).unbind(dim=1)
     height = -(finish - begin)[:, 1] * sense[edge]
-    # A piece left of the window fills its whole row, one on the right nothing.
+    # A piece to the left of the window fills its row, one to the right does not contribute.
     beyond = column < 0
     inside_x = torch.where(beyond, torch.zeros_like(height), middle[:, 0] - column)
     column = column.clamp(0, columns)

@@ -1,8 +1,8 @@
 """Image-plane masks of any shape: in a box, separable, or by FFTs of the padded pupil.
 
-All sample the image on the same lattice: multiples of ``lambda / diameter / sampling`` about the
-axis. The light that a mask removes is computed only where it removes any. The three methods differ
-in speed, but not in their result, apart from rounding.
+They all sample the image on the same lattice, multiples of ``lambda / diameter / sampling`` about
+the axis. The light that a mask removes is computed only where it removes any. The three methods
+differ in speed, but not in their result, apart from rounding.
 """
 
 from __future__ import annotations
@@ -93,8 +93,8 @@ class BoxPart:
     def removed(self, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
         """See `MaskPart`."""
         blocked = self.cells(wavefront, spacing)[2].to(wavefront.field)
-        taken = self.focal_field(wavefront, spacing) * blocked
-        return self._transform(wavefront, spacing, onto).inverse(taken, spacing**2)
+        removed = self.focal_field(wavefront, spacing) * blocked
+        return self._transform(wavefront, spacing, onto).inverse(removed, spacing**2)
 
 
 class SeparablePart:
@@ -201,7 +201,7 @@ class SampledOcculter:
                 field = part.focal_field(wavefront, spacing) * spacing
                 blocked = part.cells(wavefront, spacing)[2]
                 return field * (1 - blocked.to(field)), spacing
-        raise IncompatibleSetupError(f"{self.name} has no part in a box to look at")
+        raise IncompatibleSetupError(f"{self.name} has no part in a box, so no sample of its focus")
 
     def compact(
         self, wavelength: float, dtype: torch.dtype, device: torch.device
@@ -267,7 +267,7 @@ class FourierMask:
         self._latest: tuple[float, torch.dtype, Tensor] | None = None
 
     def window(self, values: Values) -> PupilGrid:
-        """The padded pupil, because light beside the pupil reaches the next mask."""
+        """The padded pupil, because light outside the pupil reaches the next mask."""
         return self.grid
 
     def _lattice_transmission(self, wavefront: Wavefront) -> Tensor:

@@ -12,16 +12,16 @@ the entrance pupil:
 
 A is the amplitude of the telescope's pupil, (x0, y0) the star, t the real amplitude transmission of
 the mask, L the stop, W the aberration behind it, w the weight of a wavelength. The mask changes
-light only within its disc, where 1 - t is not zero: F[E0] is needed there alone, and a matrix
-product gives it (R. Soummer et al., Opt. Express 15, 15935, 2007). Everything behind E0 is linear,
-with L, W and t the same on the way back: the adjoint of E0 -> Ed is
+light only within its disc, where 1 - t is not zero: F[E0] is needed only there, and computed as a
+matrix product (R. Soummer et al., Opt. Express 15, 15935, 2007). Everything behind E0 is linear,
+so that the adjoint of E0 -> Ed is
 g -> (1 - F^-1 (1 - t) F) L exp(-2 pi i W / lambda) F^-1 g.
 
 With S = L exp(2 pi i W / lambda), the last four lines are one, Ed = F[S E0] - F[S] * (1 - t) F[E0],
 where * is a convolution of small arrays: `optics.fast` computes that.
 
-A plane takes a `Wavefront` and gives the next. Values of free parameters come in by name; a plane
-uses those that it declares in `parameters`.
+A plane maps one `Wavefront` to the next. Values of free parameters are passed by name; a plane uses
+those that it declares in `parameters`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.differentiation import Position, kept, position_of
+from pyklip_diffrender.optics.differentiation import Position, cached, position_of
 from pyklip_diffrender.optics.fourier import MatrixFourier, centred, tilt_phases
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, transform_polygons
 from pyklip_diffrender.optics.zernike import zernike_basis
@@ -201,7 +201,7 @@ class LyotStop:
     def amplitude(self, values: Values) -> Tensor:
         """Transmission on the window, (rows, columns)."""
         position, grid = position_of(values, self.parameters), self.window(values)
-        return kept(self._latest, grid, position, lambda: self._coverage(values, grid))
+        return cached(self._latest, grid, position, lambda: self._coverage(values, grid))
 
     def _coverage(self, values: Values, grid: PupilGrid) -> Tensor:
         zero = torch.zeros(2, dtype=torch.float64)
@@ -292,7 +292,7 @@ class CompactOcculter:
     radius : float
         arcsec; `complement` vanishes beyond.
     sampling : float, optional
-        Cells per lambda / `diameter`; 4 unless given.
+        Cells per lambda / `diameter`; default 4.
     """
 
     parameters: tuple[str, ...] = ()

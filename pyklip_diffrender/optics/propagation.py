@@ -1,7 +1,7 @@
-"""`Propagation`: from a wavefront through the planes of a coronagraph to the image of a star.
+"""`Propagation`: the image of a star from the wavefront, through the planes of a coronagraph.
 
-At every wavelength the entrance pupil makes a field of the OPD, each plane takes it linearly to
-the next, and the detector samples it. The image is the weighted sum of the intensities.
+At every wavelength the entrance pupil converts the OPD to a field, the planes propagate it
+linearly, and the detector samples it. The image is the weighted sum of the intensities.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class Propagation:
             warn_of_rms(rms, "opd", stacklevel=5, small=False)
         return torch.from_numpy(array).to(self.device)
 
-    def values(self, given: Mapping[str, Value | None]) -> dict[str, Tensor]:
+    def values(self, parameters: Mapping[str, Value | None]) -> dict[str, Tensor]:
         """Check named parameter values and make them float64 tensors, (components,) each.
 
         Quantities are converted to the unit of the parameter table. Parameters that are missing or
@@ -169,7 +169,7 @@ class Propagation:
             For a Quantity of another kind.
         """
         checked = dict(self.defaults)
-        for name, value in given.items():
+        for name, value in parameters.items():
             if value is None:
                 continue
             if name not in self.parameters:

@@ -14,7 +14,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.optics.differentiation import Position, kept, position_of
+from pyklip_diffrender.optics.differentiation import Position, cached, position_of
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.orientation import Orientation
 from pyklip_diffrender.optics.planes import EntrancePupil, Values, Wavefront, phase_factor
@@ -134,12 +134,14 @@ class PupilOptic:
         full = PupilGrid(npix, diameter, (first, first + size), (first, first + size))
         used = torch.stack([p != 0 for p in {id(p): p for p in phasors.values()}.values()])
         self.grid = full.around(orientation.apply(used.any(dim=0)))
-        done: dict[int, Tensor] = {}
+        turned_phasors: dict[int, Tensor] = {}
         for phasor in phasors.values():
-            if id(phasor) not in done:
+            if id(phasor) not in turned_phasors:
                 turned = full.crop(orientation.apply(phasor), self.grid).contiguous()
-                done[id(phasor)] = turned.to(device, dtype.to_complex())
-        self._phasors = {wavelength: done[id(phasor)] for wavelength, phasor in phasors.items()}
+                turned_phasors[id(phasor)] = turned.to(device, dtype.to_complex())
+        self._phasors = {
+            wavelength: turned_phasors[id(phasor)] for wavelength, phasor in phasors.items()
+        }
         self._full, self._dtype = full, dtype
         self.opd: Tensor | None = None
         self.transmission: Tensor | None = None
@@ -197,7 +199,7 @@ class MovableStop(PupilOptic):
         window = self.window(values)
         field = wavefront.grid.crop(wavefront.field, window)
         phasor = self._phasors[wavefront.wavelength]
-        stop = kept(
+        stop = cached(
             self._latest,
             (id(phasor), window),
             position_of(values, self.parameters),

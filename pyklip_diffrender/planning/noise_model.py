@@ -14,7 +14,7 @@ from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.planning.choice import ModelError
 from pyklip_diffrender.scene.objects import Scene
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.wavefront.bases import default_basis
+from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = ["Drift", "NoiseModel", "RidgeResidual", "least_squares"]
@@ -122,20 +122,18 @@ class Drift:
     Parameters
     ----------
     prior : WavefrontPrior
-    cycles : float
-        Highest spatial frequency, cycles across the pupil.
+    basis : Basis
+        All modes.
     seed : int
 
     Attributes
     ----------
-    basis : Basis
-        All modes.
     deviation : Tensor, (modes,)
         Prior standard deviations, nm.
     """
 
-    def __init__(self, prior: WavefrontPrior, cycles: float, seed: int) -> None:
-        self.basis, self.seed = default_basis(cycles), seed
+    def __init__(self, prior: WavefrontPrior, basis: Basis, seed: int) -> None:
+        self.basis, self.seed = basis, seed
         scales = [prior.scales[name] for name in self.basis.groups]
         per_mode = torch.tensor(scales, dtype=torch.float64)[self.basis.group_index]
         self.deviation = per_mode * prior.shape(self.basis)
@@ -146,7 +144,7 @@ class Drift:
 
     def opd(self, which: int, cycles: float, grid: PupilGrid) -> Tensor:
         """Draw number `which`, with its modes up to a spatial frequency, (npix, npix), m."""
-        # Plans with different seeds must not share draws.
+        # Plans with different seeds need independent draws.
         generator = torch.Generator().manual_seed(1000 * self.seed + which)
         unit = torch.randn(len(self.basis), generator=generator, dtype=torch.float64)
         drawn = torch.where(self.basis.frequencies <= cycles, self.deviation * unit, 0.0)

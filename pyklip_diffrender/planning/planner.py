@@ -116,10 +116,10 @@ def plan(
             f"plan: got a {type(subject).__name__} to plan for, expected a Scene or an Observation"
         )
     pins = dict(keep or {})
-    known = [setting.name for setting in fields(Choice)]
-    if unknown := [name for name in pins if name not in known]:
+    names = [setting.name for setting in fields(Choice)]
+    if unknown := [name for name in pins if name not in names]:
         raise IncompatibleSetupError(
-            f"keep: got {unknown}, expected settings that a plan chooses: {', '.join(known)}"
+            f"keep: got {unknown}, expected settings that a plan chooses: {', '.join(names)}"
         )
     wavefront = np.ascontiguousarray(resample(as_opd_map(opd).data, model.npix))
     values = {name: value for name, value in (start or {}).items() if name in model.parameters}
@@ -204,16 +204,16 @@ def _verified(
         error = trial.verified(_choice(trial, picked))
         if error.inside(trial.budget):
             return picked, error, steps
-        tried = []
+        attempts = []
         for k, economy in enumerate(economies):
             after = economy.options[economy.options.index(picked[k]) + 1 :]
             finer = [option for option in after if option.error.rms <= picked[k].error.rms]
             if finer:
                 # Each is rendered, because the errors that the probes expect may be wrong.
-                other = [*picked[:k], finer[0], *picked[k + 1 :]]
-                tried.append((trial.verified(_choice(trial, other)).rms, k, other))
-        if not tried:
+                candidate = [*picked[:k], finer[0], *picked[k + 1 :]]
+                attempts.append((trial.verified(_choice(trial, candidate)).rms, k, candidate))
+        if not attempts:
             return picked, error, steps
-        _, k, picked = min(tried, key=lambda attempt: attempt[:2])
+        _, k, picked = min(attempts, key=lambda attempt: attempt[:2])
         steps.append(economies[k].name)
         _log.info("verification: %.3g sigma; finer: %s", error.rms, economies[k].name)

@@ -22,13 +22,13 @@ __all__ = ["PROBES"]
 Candidates = list[dict[str, Any]]
 
 _PAYS = 0.2
-"""Fraction of the time that an economy must be able to save to be worth measuring."""
+"""Fraction of the time that an economy must be able to save to be measured."""
 
 _FEW = 0.4
 """Fraction of all modes above which fitting them costs more than it can save."""
 
 _GOOD = 0.3
-"""Fraction of the budget below which nothing finer is measured."""
+"""Fraction of the budget below which finer options are not measured."""
 
 _RING = 2.0
 """Step between candidate spatial frequencies, cycles across the pupil."""
@@ -58,7 +58,7 @@ def _measured(
     fixed: str = "",
     monotonic: bool = False,
 ) -> Economy:
-    """Options with their errors; only the full model if nothing else would pay.
+    """Options with their errors; only the full model if no other option would save time.
 
     Options are measured from cheap to fine until one is good. If errors decrease with cost
     (`monotonic`), the first is the cheapest within the budget, found by bisection. `fixed` says
@@ -68,7 +68,8 @@ def _measured(
     options = _allowed([] if fixed else candidates, full, trial)
     pinned = not trial.pins.keys().isdisjoint(fields)
     if options == [full]:
-        return Economy(name, (Option(full),), "kept as asked" if pinned else fixed or "no choice")
+        reason = "kept as requested" if pinned else fixed or "no choice"
+        return Economy(name, (Option(full),), reason)
     seconds = [trial.seconds(replace(trial.likely, **option)) for option in options]
     now = trial.seconds(trial.likely)
     if not pinned and now - min(seconds) < _PAYS * now:

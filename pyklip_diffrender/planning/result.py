@@ -42,7 +42,7 @@ class Plan:
     seed : int
         Random seed of the drifts.
     pinned, steps : tuple of str
-        Settings kept by the caller, and economies that the verification made finer.
+        Settings fixed by the caller, and economies that the verification refined.
     final_error : ModelError, optional
         Of the refined star against the full model, at the fitted wavefront; only in the plan of a
         `Refinement`.
@@ -85,15 +85,15 @@ class Plan:
             f"error {self.error.rms:.3f} sigma expected, {self.verified_error.rms:.3f} verified "
             f"(worst pixel {self.verified_error.worst:.2f}), budget {self.budget:g}",
             f"about {self.seconds:.2g} s for a refinement on one core, "
-            f"as given {self.seconds_given:.2g} s",
+            f"{self.seconds_given:.2g} s with the full model",
         ]
         if self.steps:
-            lines.append(f"made finer by the verification: {', '.join(self.steps)}")
+            lines.append(f"refined by the verification: {', '.join(self.steps)}")
         if self.final_error is not None:
-            end = "the fit went on as given" if self.abandoned else "inside the budget"
+            end = "the fit continued with the full model" if self.abandoned else "inside the budget"
             lines.append(f"at the solution {self.final_error.rms:.3f} sigma: {end}")
         if self.pinned:
-            lines.append(f"kept as asked: {', '.join(self.pinned)}")
+            lines.append(f"kept as requested: {', '.join(self.pinned)}")
         return "\n".join(line.rstrip() for line in lines)
 
     def summary(self) -> dict[str, Any]:
@@ -126,7 +126,7 @@ def _why(trial: Trial, economy: Economy, option: Option) -> str:
     if economy.note:
         return economy.note
     if any(name in trial.pins for name in option.changes):
-        return "kept as asked"
+        return "kept as requested"
     place = economy.options.index(option)
     if place == 0:
         return "the cheapest is good enough"
@@ -141,15 +141,15 @@ def plan_table(trial: Trial, economies: Sequence[Economy], picked: Sequence[Opti
     """The table of a plan, see `Plan`; `picked` holds the option chosen of each economy."""
     rows = []
     for economy, option in zip(economies, picked, strict=True):
-        alone = replace(trial.finest, **option.changes)
+        choice = replace(trial.finest, **option.changes)
         rows.append(
             {
                 "what": economy.name,
-                "chosen": _label(economy.name, alone),
+                "chosen": _label(economy.name, choice),
                 "finest": _label(economy.name, trial.finest),
                 "error": option.error.rms,
                 "worst": option.error.worst,
-                "seconds": trial.seconds(alone) * u.s,
+                "seconds": trial.seconds(choice) * u.s,
                 "why": _why(trial, economy, option),
             }
         )

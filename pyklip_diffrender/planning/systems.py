@@ -66,11 +66,11 @@ class CheapSystem(OpticalSystem):
         they are used, and would be wrong for sources other than the star.
         """
         with torch.no_grad():
-            own = self.fields(opd, **values)
-            constants = [fine - coarse for fine, coarse in zip(fields, own, strict=True)]
-        other = copy.copy(self)
-        other._constants = dict(zip(self.bandpass.wavelengths, constants, strict=True))
-        return other
+            coarse_fields = self.fields(opd, **values)
+            constants = [fine - coarse for fine, coarse in zip(fields, coarse_fields, strict=True)]
+        shifted = copy.copy(self)
+        shifted._constants = dict(zip(self.bandpass.wavelengths, constants, strict=True))
+        return shifted
 
     def _field(self, opd: Tensor, wavelength: float, values: Values) -> Tensor:
         field = super()._field(opd, wavelength, values)

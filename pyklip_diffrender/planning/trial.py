@@ -95,9 +95,9 @@ class Trial:
         # The grid of the derivatives resolves the field; a fixed model keeps its own grid.
         self.grids = [npix for npix in halves if npix >= self.response_npix]
         waves = self.finest.wavelengths
-        few = min(_ROUGH_WAVELENGTHS, waves) if "bandpass" in model.adjustable else waves
+        wavelengths = min(_ROUGH_WAVELENGTHS, waves) if "bandpass" in model.adjustable else waves
         npix = next((npix for npix in self.grids if npix >= _ROUGH_NPIX), model.npix)
-        self.rough = replace(self.finest, npix=npix, wavelengths=few)
+        self.rough = replace(self.finest, npix=npix, wavelengths=wavelengths)
         self._systems: dict[Choice, OpticalSystem] = {self.finest.system: model}
         self._images: dict[tuple[Choice, int], Tensor] = {}
         self._fields: dict[int, list[Tensor]] = {}
@@ -105,7 +105,7 @@ class Trial:
         image = model.image_of(self._fine_fields(waves), self.values).double()
         self._images[self.finest, START] = image
         self.noise = NoiseModel.of(self.subject, image, self.model_error)
-        self.drift = Drift(self.prior, self.cycles, self.seed)
+        self.drift = Drift(self.prior, default_basis(self.cycles, model.entrance), self.seed)
         self.drift.deviation *= self._misfit()
 
     def _misfit(self) -> float:
@@ -203,7 +203,7 @@ class Trial:
         """From now on, measure errors of fewer modes after a fit of the modes up to `cycles`."""
         if self._ridge is None:
             fine, fields = self._few_wavelengths()
-            basis, npix = default_basis(cycles), self.response_npix
+            basis, npix = default_basis(cycles, self.model.entrance), self.response_npix
             response = WavefrontResponse(fine, basis, self.opd0, self.values, npix=npix)
             slopes = self.noise.in_sigma(response.image(fields, self.values).double())
             prior = self.drift.deviation[: len(basis)].to(slopes.device)

@@ -1,4 +1,4 @@
-"""Whole figures: the demo, a subtraction and a detection with everything that they made."""
+"""Complete figures of the demo, a subtraction and a detection."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.instrument.jwst import maskrnd_openings
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
-from pyklip_diffrender.plotting.panels import INK, draw_image
+from pyklip_diffrender.plotting.panels import INK, draw_image, extent_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,7 +23,7 @@ __all__ = ["draw_demo", "draw_detection", "draw_subtraction"]
 
 
 def draw_demo(result: DemoResult) -> Figure:
-    """The demo in one figure: frame, four subtractions in units of the noise, wavefronts."""
+    """Draw the demo: the frame, four subtractions in units of the noise, and wavefronts."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
@@ -31,12 +31,12 @@ def draw_demo(result: DemoResult) -> Figure:
     axes = figure.subplots(2, 4)
     scale = result.model.detector.pixelscale[0]
     frame = result.observation.data[0]
-    shown = draw_image(
+    artist = draw_image(
         axes[0, 0], np.maximum(frame, 1), scale, limits=(0, 1), cmap="magma",
         norm=LogNorm(float(np.percentile(frame, 2)), float(frame.max())),
         title="The frame: the occulted star\nhides the planet (circle)",
     )  # fmt: skip
-    figure.colorbar(shown, ax=axes[0, 0], label="photons", shrink=0.85)
+    figure.colorbar(artist, ax=axes[0, 0], label="photons", shrink=0.85)
 
     planet = result.scene.planets[0]
     axes[0, 0].plot(*planet.offset, "o", mfc="none", mec="white", ms=13, mew=1.2)
@@ -51,58 +51,58 @@ def draw_demo(result: DemoResult) -> Figure:
         ax = axes[row, column]
         facts = result.table[list(result.table["star model"]).index(name)]
         share = 100 * facts["planet throughput"]
-        # Where the star is left over, the planet's share of the light means nothing.
-        kept = f", planet light kept {share:.0f} %" if facts["star error"] < 20 else ""
-        shown = draw_image(
+        # Where residuals of the star dominate, the share of the planet's light has no meaning.
+        light_fraction = f", planet light kept {share:.0f} %" if facts["star error"] < 20 else ""
+        artist = draw_image(
             ax, result.images[name] / result.noise, scale, limits=(-6, 6), cmap="RdBu_r",
-            title=f"{titles[name]}\nSNR {facts['annulus SNR']:.1f}{kept}",
+            title=f"{titles[name]}\nSNR {facts['annulus SNR']:.1f}{light_fraction}",
         )  # fmt: skip
         ax.plot(*planet.offset, "o", mfc="none", mec=INK, ms=13, mew=1.2, clip_on=True)
-        figure.colorbar(shown, ax=ax, label="residual / noise", shrink=0.85)
+        figure.colorbar(artist, ax=ax, label="residual / noise", shrink=0.85)
 
     grid = PupilGrid.full(result.model.npix, result.model.diameter)
     stop = polygon_coverage(maskrnd_openings(), grid).numpy() > 0.5
     true_change = 1e9 * (result.true_opd - result.measured.data)
-    found_change = 1e9 * (result.fit.wavefront - result.measured.data)
+    fitted_change = 1e9 * (result.fit.wavefront - result.measured.data)
     limit = float(np.percentile(np.abs(true_change[stop]), 99.5))
     for ax, change, title in (
         (axes[1, 1], true_change, "True change of the wavefront\nseen through the Lyot stop"),
-        (axes[1, 2], found_change, "Change found from one frame\n(prior, no reference star)"),
+        (axes[1, 2], fitted_change, "Change found from one frame\n(prior, no reference star)"),
     ):
-        seen = np.where(stop, change - change[stop].mean(), np.nan)
-        shown = draw_image(
-            ax, seen, grid.spacing, limits=(-limit, limit), cmap="PuOr_r", title=title
+        change_in_stop = np.where(stop, change - change[stop].mean(), np.nan)
+        artist = draw_image(
+            ax, change_in_stop, grid.spacing, limits=(-limit, limit), cmap="PuOr_r", title=title
         )
         ax.set_xlabel("m", fontsize=8)
-        figure.colorbar(shown, ax=ax, label="nm", shrink=0.85)
+        figure.colorbar(artist, ax=ax, label="nm", shrink=0.85)
 
-    _draw_found(axes[1, 3], figure, result)
+    _draw_candidates(axes[1, 3], figure, result)
     for ax in (*axes[0], axes[1, 0], axes[1, 3]):
         ax.set_xlabel("arcsec", fontsize=8)
     return figure
 
 
-def _draw_found(ax: Axes, figure: Figure, result: DemoResult) -> None:
-    """S/N of point sources, and what the candidates are."""
-    found, planet = result.detection, result.scene.planets[0]
+def _draw_candidates(ax: Axes, figure: Figure, result: DemoResult) -> None:
+    """Draw the S/N map of point sources, with the strongest candidate in the title."""
+    detection, planet = result.detection, result.scene.planets[0]
     scale = result.model.detector.pixelscale[0]
-    table = found.table
+    table = detection.table
     facts = "nothing above 5 sigma"
     if len(table):
         facts = (
             f"S/N {table['snr'][0]:.1f}, flux {table['contrast'][0] / planet.contrast:.2f} "
             f"± {table['contrast_error'][0] / planet.contrast:.2f} of true"
         )
-    shown = draw_image(
-        ax, found.snr, scale, limits=(-6, 6), cmap="RdBu_r",
+    artist = draw_image(
+        ax, detection.snr, scale, limits=(-6, 6), cmap="RdBu_r",
         title=f"Wavefront integrated out:\n{facts}",
     )  # fmt: skip
     ax.plot(*planet.offset, "o", mfc="none", mec=INK, ms=13, mew=1.2)
-    figure.colorbar(shown, ax=ax, label="S/N of a point source", shrink=0.85)
+    figure.colorbar(artist, ax=ax, label="S/N of a point source", shrink=0.85)
 
 
 def draw_subtraction(fit: Refinement) -> Figure:
-    """A fit to real frames: data, star, what is left, and what is left in units of the noise."""
+    """Draw a fit to real frames: data, star, residual, and residual in units of the noise."""
     from matplotlib.colors import SymLogNorm
     from matplotlib.figure import Figure
 
@@ -130,48 +130,45 @@ def draw_subtraction(fit: Refinement) -> Figure:
         star = star + frame.values.get(name, np.zeros(2))
     for ax, (image, style, title, label) in zip(axes, panels, strict=True):
         settings: dict[str, Any] = {"limits": (0.0, 1.0), **style}
-        shown = draw_image(ax, image, scale, title=title, **settings)
-        figure.colorbar(shown, ax=ax, label=label, shrink=0.8)
+        artist = draw_image(ax, image, scale, title=title, **settings)
+        figure.colorbar(artist, ax=ax, label=label, shrink=0.8)
         ax.set_xlabel("arcsec from the middle of the array", fontsize=8)
         for _, x, y in fit.companions:
             ax.plot(star[0] + x, star[1] + y, "o", mfc="none", mec="#2f9e44", ms=16, mew=1.4)
     return figure
 
 
-def draw_detection(found: Detection) -> Figure:
-    """The frame less the star, S/N map, the same without the candidates, contrast curve."""
+def draw_detection(detection: Detection) -> Figure:
+    """Draw the star-subtracted frame, S/N maps with and without candidates, and the contrast."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(18.5, 4.4), layout="constrained")
-    frame, left, middle, right = figure.subplots(1, 4)
-    noise = found.fits[0].frames[0].observation.combined().error[0]
-    (x0, y0), (x1, y1) = found.grid[0, 0], found.grid[-1, -1]
-    pixel = found.fits[0].model.detector.pixelscale
-    extent = (x0 - pixel[0] / 2, x1 + pixel[0] / 2, y0 - pixel[1] / 2, y1 + pixel[1] / 2)
-    table = found.table
-    above = f"{len(table)} above {found.threshold:g}"
+    frame, snr_axes, middle, right = figure.subplots(1, 4)
+    noise = detection.observation.combined().error[0]
+    extent, table = extent_of(detection.grid[0, :, 0], detection.grid[:, 0, 1]), detection.table
+    above = f"{len(table)} above {detection.threshold:g}"
     for ax, image, title, label in (
-        (frame, found.subtracted[0] / noise, "First frame less the star", "light / noise"),
-        (left, found.snr, f"S/N of a point source, {above}", "S/N"),
-        (middle, found.residual_snr, "S/N once those are taken out", "S/N"),
+        (frame, detection.subtracted[0] / noise, "First frame, star subtracted", "light / noise"),
+        (snr_axes, detection.snr, f"S/N of a point source, {above}", "S/N"),
+        (middle, detection.residual_snr, "S/N, candidates removed", "S/N"),
     ):
-        shown = ax.imshow(image, origin="lower", extent=extent, cmap="RdBu_r", vmin=-8, vmax=8)
-        figure.colorbar(shown, ax=ax, shrink=0.85, label=label)
+        artist = ax.imshow(image, origin="lower", extent=extent, cmap="RdBu_r", vmin=-8, vmax=8)
+        figure.colorbar(artist, ax=ax, shrink=0.85, label=label)
         ax.plot(0, 0, "+", color=INK, ms=9)
         ax.plot(table["x"].value, table["y"].value, "o", mfc="none", mec="#2f9e44", ms=15, mew=1.4)
         ax.set_title(title, fontsize=10, color=INK, loc="left")
         ax.set_xlabel("arcsec from the star", fontsize=8)
-    curve = found.contrast_curve
+    curve = detection.contrast_curve
     separation = curve["separation"].value
     right.fill_between(
         separation, curve["lowest"], curve["highest"], color="#5b3f95", alpha=0.15, lw=0
     )
-    right.semilogy(separation, curve["contrast"], color="#5b3f95", label="wavefront free")
-    if found.scatter > 1:
+    right.semilogy(separation, curve["contrast"], color="#5b3f95", label="wavefront marginalised")
+    if detection.scatter > 1:
         right.semilogy(
-            separation, curve["small_sample"], ":", color="#5b3f95", label="with few elements"
+            separation, curve["small_sample"], ":", color="#5b3f95", label="small-sample corrected"
         )
-    right.semilogy(separation, curve["known_star"], "--", color=INK, label="star known")
+    right.semilogy(separation, curve["known_star"], "--", color=INK, label="star known exactly")
     right.semilogy(
         table["separation"].value, table["contrast"], "o", mfc="none", mec="#2f9e44", ms=9
     )

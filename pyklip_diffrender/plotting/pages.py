@@ -38,15 +38,15 @@ _LIMIT = 5.0
 """Of the scale for residuals, standard deviations."""
 
 
-def draw_search(found: Detection) -> list[Figure]:
+def draw_search(detection: Detection) -> list[Figure]:
     """The S/N map with the candidates, and the contrast curve."""
     figures, axes = _panels(2)
-    plot_detection(found, axes)
+    plot_detection(detection, axes)
     return figures
 
 
-def draw_star(found: Detection, frame: int = 0) -> list[Figure]:
-    """A frame, its star model, and what is left, with the candidates' light kept.
+def draw_star(detection: Detection, frame: int = 0) -> list[Figure]:
+    """Draw a frame, the model of its star, and the residual, in which candidates are kept.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def draw_star(found: Detection, frame: int = 0) -> list[Figure]:
     frame : int
         Which of the frames of the first fit.
     """
-    part, first = found.fits[0].frames[frame], found.fits[0].frames[0].observation
+    part, first = detection.fits[0].frames[frame], detection.fits[0].frames[0].observation
     observation = part.observation.combined()
     valid, noise = observation.valid[0], observation.error[0]
     data = np.where(valid, observation.data[0], np.nan)
@@ -67,10 +67,11 @@ def draw_star(found: Detection, frame: int = 0) -> list[Figure]:
     show(axes[0], data, extent, title="Data", **light)
     show(axes[1], part.star, extent, title="Model of the star", **light)
     show(
-        axes[2], found.subtracted[frame] / noise, extent, bar="standard deviations of the noise",
-        title="Residual", cmap="RdBu_r", vmin=-_LIMIT, vmax=_LIMIT,
+        axes[2], detection.subtracted[frame] / noise, extent,
+        bar="standard deviations of the noise", title="Residual",
+        cmap="RdBu_r", vmin=-_LIMIT, vmax=_LIMIT,
     )  # fmt: skip
-    places = np.stack([found.table["x"].value, found.table["y"].value], axis=1)
+    places = np.stack([detection.table["x"].value, detection.table["y"].value], axis=1)
     mark(axes[2], turned(places, observation, first))
     for ax in axes:
         label_sky(ax)

@@ -47,7 +47,7 @@ __all__ = [
 
 INK = "#1b1f24"
 ACCENT = "#0b6e4f"
-"""A green dark enough to be told from both ends of the red and blue maps by everybody."""
+"""A dark green, distinct from both ends of the red and blue maps."""
 
 _COMPASS = 30.0
 """From the tail of an arrow to its letter, points."""
@@ -86,7 +86,7 @@ def draw_image(
     AxesImage
     """
     half_y, half_x = (n * pixelscale / 2 for n in image.shape)
-    shown = ax.imshow(
+    artist = ax.imshow(
         image,
         origin="lower",
         extent=(-half_x, half_x, -half_y, half_y),
@@ -96,11 +96,11 @@ def draw_image(
     )
     ax.set_title(title, fontsize=10, color=INK, loc="left")
     ax.tick_params(labelsize=8, colors=INK)
-    return shown
+    return artist
 
 
 def axes_for(ax: Any, count: int) -> Sequence[Axes]:
-    """The axes that were given, or those of a new figure with one row.
+    """Return the axes of the caller, or those of a new figure with one row.
 
     Raises
     ------
@@ -112,12 +112,12 @@ def axes_for(ax: Any, count: int) -> Sequence[Axes]:
 
         size = (4.6 * count, 4.0)
         ax = pyplot.subplots(1, count, figsize=size, layout="compressed")[1]
-    given: list[Axes] = list(np.ravel(ax))
-    if len(given) != count:
+    axes: list[Axes] = list(np.ravel(ax))
+    if len(axes) != count:
         raise IncompatibleSetupError(
-            f"ax: got {len(given)} axes, expected {count}, such as pyplot.subplots(1, {count})[1]"
+            f"ax: got {len(axes)} axes, expected {count}, such as pyplot.subplots(1, {count})[1]"
         )
-    return given
+    return axes
 
 
 def extent_of(x: NDArray[np.float64], y: NDArray[np.float64]) -> Extent:
@@ -137,7 +137,7 @@ def detector_extent(detector: Detector, values: Values) -> Extent:
 
 
 def label_sky(*axes: Axes) -> None:
-    """Axes from the star, which gets a cross."""
+    """Label axes whose origin is the star, and mark the star with a cross."""
     for ax in axes:
         ax.plot(0, 0, "+", color=INK, ms=11, mew=1.6, label="star", path_effects=halo())
         ax.set_xlabel("x from the star (arcsec)")
@@ -145,7 +145,7 @@ def label_sky(*axes: Axes) -> None:
 
 
 def turned(places: ArrayLike, frame: Observation, first: Observation) -> NDArray[np.float64]:
-    """Places (k, 2) on the sky as a frame shows them, from where they are in the first frame."""
+    """Rotate positions (k, 2) from the orientation of the first frame to that of another frame."""
     turn = np.deg2rad(frame.roll_from(first))
     matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     return np.reshape(places, (-1, 2)) @ matrix.T
@@ -162,18 +162,18 @@ def show(
     **style: Any,
 ) -> AxesImage:
     """Show an image, y up, with a colour bar as high as it; NaN is grey."""
-    shown = ax.imshow(image, origin="lower", extent=extent, interpolation="nearest", **style)
+    artist = ax.imshow(image, origin="lower", extent=extent, interpolation="nearest", **style)
     ax.set_facecolor("0.75")
     ax.set_title(title, color=INK, loc="left")
-    # An inset follows the image, whose box is not that of the axes; a stolen strip does not.
+    # An inset follows the image, whose box differs from that of the axes.
     strip = ax.inset_axes((1.03, 0.0, 0.05, 1.0))
-    low, high = np.array(shown.get_clim(), dtype=float)
+    low, high = np.array(artist.get_clim(), dtype=float)
     extend = ("neither", "max", "min", "both")[
         2 * bool(np.nanmin(image) < low) + bool(np.nanmax(image) > high)
     ]
     form = None if ticks is None else "%g"
-    ax.figure.colorbar(shown, cax=strip, label=bar, extend=extend, ticks=ticks, format=form)
-    return shown
+    ax.figure.colorbar(artist, cax=strip, label=bar, extend=extend, ticks=ticks, format=form)
+    return artist
 
 
 def light_norm(image: NDArray[np.float64], noise: NDArray[np.float64]) -> Any:
@@ -193,7 +193,7 @@ def halo() -> list[Any]:
 
 
 def mark(ax: Axes, places: ArrayLike, labels: Sequence[str] = ()) -> None:
-    """Circles around places (k, 2), and what is said about them."""
+    """Draw circles around positions (k, 2), with labels."""
     x, y = np.reshape(places, (-1, 2)).T
     ax.plot(
         x, y, "o", mfc="none", mec=INK, ms=15, mew=1.6, label="companions", path_effects=halo()

@@ -1,6 +1,6 @@
-"""What the `plot` methods of observations, systems, refinements and detections draw.
+"""Implementations of the `plot` methods of observations, systems, refinements and detections.
 
-Red and blue, and the maps for light, are told apart by readers with colour vision deficiencies.
+The colour maps can be distinguished by readers with colour vision deficiencies.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def plot_system(system: OpticalSystem, ax: Any = None, *, opd: Any = None) -> ND
 
 def plot_refinement(fit: Refinement, ax: Any = None, *, frame: int = 0) -> NDArray[Any]:
     """See `Refinement.plot`."""
-    left, middle, right = axes_for(ax, 3)
+    data_axes, middle, right = axes_for(ax, 3)
     part = fit.frames[frame]
     observation = part.observation.combined()
     valid, noise = observation.valid[0], observation.error[0]
@@ -121,44 +121,44 @@ def plot_refinement(fit: Refinement, ax: Any = None, *, frame: int = 0) -> NDArr
     extent = detector_extent(part.model.detector, part.optical_values)
     unit = unit_label(observation.unit)
     norm = light_norm(data, noise[valid])
-    show(left, data, extent, bar=unit, title="data", cmap=_LIGHT, norm=norm)
+    show(data_axes, data, extent, bar=unit, title="data", cmap=_LIGHT, norm=norm)
     show(middle, part.star, extent, bar=unit, title="star model", cmap=_LIGHT, norm=norm)
     show(
         right, (data - part.star) / noise, extent, bar="standard deviations",
         title="residual / noise", cmap=_SIGNED, vmin=-_LIMIT, vmax=_LIMIT,
     )  # fmt: skip
-    label_sky(left, middle, right)
+    label_sky(data_axes, middle, right)
     if len(fit.companions) and not observation.reference:
         mark(right, turned(fit.companions[:, 1:], observation, fit.frames[0].observation))
     if observation.position_angles is not None:
-        draw_compass(left, observation.position_angle)
-    return np.array([left, middle, right])
+        draw_compass(data_axes, observation.position_angle)
+    return np.array([data_axes, middle, right])
 
 
-def plot_detection(found: Detection, ax: Any = None) -> NDArray[Any]:
+def plot_detection(detection: Detection, ax: Any = None) -> NDArray[Any]:
     """See `Detection.plot`."""
-    left, right = axes_for(ax, 2)
-    extent, table = extent_of(found.grid[0, :, 0], found.grid[:, 0, 1]), found.table
+    snr_axes, right = axes_for(ax, 2)
+    extent, table = extent_of(detection.grid[0, :, 0], detection.grid[:, 0, 1]), detection.table
     plural = "" if len(table) == 1 else "s"
-    title = f"{len(table)} candidate{plural} above S/N {found.threshold:g}"
+    title = f"{len(table)} candidate{plural} above S/N {detection.threshold:g}"
     show(
-        left, found.snr, extent, bar="S/N of a point source", title=title, cmap=_SIGNED,
-        norm=_snr_norm(found.snr), ticks=_SNR_TICKS,
+        snr_axes, detection.snr, extent, bar="S/N of a point source", title=title, cmap=_SIGNED,
+        norm=_snr_norm(detection.snr), ticks=_SNR_TICKS,
     )  # fmt: skip
-    label_sky(left)
+    label_sky(snr_axes)
     places = np.stack([table["x"].value, table["y"].value], axis=1)
-    mark(left, places, [f"S/N {snr:.1f}" for snr in table["snr"]])
-    if found.fits[0].frames[0].observation.position_angles is not None:
-        draw_compass(left, found.north)
+    mark(snr_axes, places, [f"S/N {snr:.1f}" for snr in table["snr"]])
+    if detection.observation.position_angles is not None:
+        draw_compass(snr_axes, detection.north)
 
-    curve = found.contrast_curve
+    curve = detection.contrast_curve
     separation = curve["separation"].value
     right.fill_between(
         separation, curve["lowest"], curve["highest"], color=ACCENT, alpha=0.15, lw=0,
         label="range of angles",
     )  # fmt: skip
     right.semilogy(separation, curve["contrast"], color=ACCENT, label="median")
-    if found.scatter > 1:
+    if detection.scatter > 1:
         right.semilogy(
             separation, curve["small_sample"], ":", color=ACCENT, label="median, few samples"
         )
@@ -172,7 +172,7 @@ def plot_detection(found: Detection, ax: Any = None) -> NDArray[Any]:
     right.set_xlabel("separation (arcsec)")
     right.set_ylabel(f"contrast at {curve.meta['sigmas']:g} sigma")
     right.legend(frameon=False)
-    return np.array([left, right])
+    return np.array([snr_axes, right])
 
 
 def _snr_norm(snr: NDArray[np.float64]) -> Any:

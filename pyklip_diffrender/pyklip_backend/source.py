@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import merged_header
 from pyklip_diffrender.scene.detector_pixels import first_pixel
-from pyklip_diffrender.scene.observation import BAD_PIXEL_BITS, Observation
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
+from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
     "ATTRIBUTE",

@@ -132,7 +132,7 @@ class Annealing:
                 if bright:
                     state = self._with_companions(state, bright)
                 elif gain < _ALIGNED and settings.wavefront:
-                    # Damping of the alignment is no guide to that of the wavefront.
+                    # The damping of the alignment does not apply to the wavefront.
                     aligned, modes, solver.damping = state, self._modes_for(kappa), 0.0
                 elif settled:
                     status = _status_of(chi2)
@@ -143,10 +143,10 @@ class Annealing:
             if bright:
                 # Near the solution the model is linear, so that further steps remove the bias of
                 # the wavefront. Otherwise the fit starts again from the alignment.
-                near = error < _NEAR
-                best = state = self._with_companions(state if near else aligned, bright)
+                is_close = error < _NEAR
+                best = state = self._with_companions(state if is_close else aligned, bright)
                 best_error, remaining = (math.inf, math.inf), settings.max_iterations
-                if not near:
+                if not is_close:
                     solver.scales, solver.damping, modes = first_scales, 0.0, 0
                     kappa = max(self.objective.model_error(state), floor)
                 continue
@@ -176,9 +176,9 @@ class Annealing:
 
     def _modes_for(self, kappa: float) -> int:
         """Number of leading modes to fit while the model error is kappa."""
-        several = len(self.problems) > 1
+        joint_fit = len(self.problems) > 1
         amplitude = len(self.solver.amplitude_deviation) > 0
-        everything = self.settings.min_model_error > 0 or amplitude or several
+        everything = self.settings.min_model_error > 0 or amplitude or joint_fit
         return len(self.basis) if everything or kappa <= _COARSE else self._few_modes
 
     def _new_companions(self, state: State, kappa: float, stalled: bool) -> list[Planet]:

@@ -1,7 +1,7 @@
 """Bright companions in the residual of a fit.
 
 A companion as bright as the speckles of the star biases the fitted wavefront. A companion that
-stands out of the residual therefore gets parameters of its own. Faint planets are left to the
+is significant in the residual therefore gets its own parameters. Faint planets are found by the
 detection, which marginalises the wavefront.
 """
 
@@ -48,10 +48,10 @@ def bright_companions(
     list of Planet
         Highest S/N first, at the positions of pixels, in the orientation of the first frame.
     """
-    shown = [layout.shows_companions for layout in state.joint.frames]
-    if most < 1 or True not in shown:
+    has_companions = [layout.shows_companions for layout in state.joint.frames]
+    if most < 1 or True not in has_companions:
         return []
-    k = shown.index(True)
+    k = has_companions.index(True)
     point, forward = state.points[k], objective.forwards[k]
     layout, problem, model = point.unknowns, forward.problem, forward.coarse
     residual = torch.where(problem.valid, problem.data - point.total, 0.0).cpu().numpy()
@@ -60,8 +60,12 @@ def bright_companions(
     star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu()
     axis = values.get("detector_shift", torch.zeros(2, dtype=torch.float64)).cpu()
     # The template is an image in the middle of the array of a source beyond the occulter.
-    away = torch.tensor([1.5, 0.0], dtype=torch.float64)
-    centred = {**values, "star_offset": star + away, "detector_shift": -(star + away)}
+    displacement = torch.tensor([1.5, 0.0], dtype=torch.float64)
+    centred = {
+        **values,
+        "star_offset": star + displacement,
+        "detector_shift": -(star + displacement),
+    }
     with torch.no_grad():
         image = model(forward.coarse_opd(point), **centred).double().cpu().numpy()
     template = layout.level("flux", point.vector) * image[::-1, ::-1]
@@ -80,8 +84,8 @@ def bright_companions(
         )
     )
     allowed = (np.hypot(x, y) > _INNER) & np.isfinite(sigma)
-    known = layout.sources(point.vector)[:, 1:] @ layout.turn.T
-    for x_known, y_known in known.tolist():
+    positions = layout.sources(point.vector)[:, 1:] @ layout.turn.T
+    for x_known, y_known in positions.tolist():
         allowed &= np.hypot(x - x_known, y - y_known) > _APART
     scatter = 1.4826 * float(np.median(np.abs(snr[allowed] - np.median(snr[allowed]))))
     return [

@@ -67,7 +67,7 @@ def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Un
 def _with_scales(prior: WavefrontPrior, scales: Mapping[str, float], label: str) -> WavefrontPrior:
     """Replace the scales of a prior by those of a fit; other groups keep theirs."""
     return replace(
-        prior, scales={n: scales.get(label.format(n), own) for n, own in prior.scales.items()}
+        prior, scales={n: scales.get(label.format(n), scale) for n, scale in prior.scales.items()}
     )
 
 
@@ -95,21 +95,22 @@ def fit_with_growing_basis(
     progress : bool
         Show progress bars.
     """
+    pupil = problems[0].model.entrance
     if settings.basis is not None or not settings.cycles:
-        basis = settings.basis or default_basis()
+        basis = settings.basis or default_basis(pupil=pupil)
         return Annealing(problems, settings, basis, warm, progress).run(seed)
     # With an assumed model error the residual need not be missing modes. The number of modes that
     # drift is fixed.
     grows = settings.wavefront and settings.min_model_error == 0 and settings.drift is None
-    tried = settings.cycles if grows else settings.cycles[:1]
+    cycles_to_try = settings.cycles if grows else settings.cycles[:1]
     fit: Refinement | None = None
-    for k, cycles in enumerate(tried):
-        chosen = replace(settings, cycles=settings.cycles[k:])
+    for k, cycles in enumerate(cycles_to_try):
+        adapted = replace(settings, cycles=settings.cycles[k:])
         if fit is not None:
             _log.info("residuals have structure: adding modes up to %g cycles per pupil", cycles)
-            chosen, warm = continue_from(fit, cycles=settings.cycles[k:])
+            adapted, warm = continue_from(fit, cycles=settings.cycles[k:])
         earlier = fit
-        fit = Annealing(problems, chosen, default_basis(cycles), warm, progress).run(seed)
+        fit = Annealing(problems, adapted, default_basis(cycles, pupil), warm, progress).run(seed)
         if earlier is not None:
             fit = replace(
                 fit,

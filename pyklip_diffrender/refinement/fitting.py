@@ -111,21 +111,21 @@ def refine(
     observations = [observation] if isinstance(observation, Observation) else list(observation)
     if not observations:
         raise NoValidPixelsError("observation: got an empty sequence, expected at least one")
-    chosen = settings_for(observations[0]) if settings is None else settings
-    if isinstance(chosen, GaussNewton) and chosen.free == GaussNewton().free:
+    adapted = settings_for(observations[0]) if settings is None else settings
+    if isinstance(adapted, GaussNewton) and adapted.free == GaussNewton().free:
         # A system without a Lyot stop has no parameters of one.
-        known = (*model.parameters, "flux", "background")
-        chosen = replace(chosen, free=tuple(name for name in chosen.free if name in known))
-    if not isinstance(chosen, GaussNewton | Adam):
+        available = (*model.parameters, "flux", "background")
+        adapted = replace(adapted, free=tuple(name for name in adapted.free if name in available))
+    if not isinstance(adapted, GaussNewton | Adam):
         raise IncompatibleSetupError(
-            f"settings: got a {type(chosen).__name__}, expected GaussNewton or Adam"
+            f"settings: got a {type(adapted).__name__}, expected GaussNewton or Adam"
         )
     wavefront = as_opd_map(opd)
     problems = [
         Problem(model, each, wavefront, _with_position(model, each, begin), systematics)
         for each, begin in zip(observations, _one_by_one(start, len(observations)), strict=True)
     ]
-    if isinstance(chosen, Adam):
+    if isinstance(adapted, Adam):
         if len(problems) > 1:
             raise IncompatibleSetupError(
                 f"settings: Adam takes one observation, got {len(problems)}; several are fitted "
@@ -133,15 +133,15 @@ def refine(
             )
         if isinstance(plan, Plan):
             raise IncompatibleSetupError(
-                'plan: the Adam recipe uses the model as given; pass plan="off"'
+                'plan: the Adam recipe uses the full model; pass plan="off"'
             )
         if systematics is not None:
             raise IncompatibleSetupError(
-                "systematics: the Adam recipe has no place for them; use GaussNewton"
+                "systematics: the Adam recipe does not support them; use GaussNewton"
             )
-        return adam(problems[0], chosen, seed=seed, progress=progress)
-    planned = choose_plan(plan, problems, chosen, seed)
-    return fit_problems(problems, chosen, planned, seed=seed, progress=progress)
+        return adam(problems[0], adapted, seed=seed, progress=progress)
+    planned = choose_plan(plan, problems, adapted, seed)
+    return fit_problems(problems, adapted, planned, seed=seed, progress=progress)
 
 
 def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start]:
@@ -160,7 +160,7 @@ def _with_position(model: OpticalSystem, observation: Observation, start: Start)
     if observation.star_offset is not None and "star_offset" in model.parameters:
         start = {"star_offset": observation.star_offset, **start}
     ny, nx = observation.shape
-    away = observation.center[0] - np.array([(nx - 1) / 2, (ny - 1) / 2])
-    if "detector_shift" in start or np.abs(away).max() <= 1e-9:
+    displacement = observation.center[0] - np.array([(nx - 1) / 2, (ny - 1) / 2])
+    if "detector_shift" in start or np.abs(displacement).max() <= 1e-9:
         return dict(start)
-    return {**start, "detector_shift": away * np.array(model.detector.pixelscale)}
+    return {**start, "detector_shift": displacement * np.array(model.detector.pixelscale)}

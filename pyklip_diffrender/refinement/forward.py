@@ -109,11 +109,11 @@ class Forward:
             model = self.full_model
             full = opd if model.npix == self.model.npix else self.opd(unknowns, vector, model)
             for source in unknowns.sources(vector):
-                there = self._towards(values, unknowns.turn @ source[1:])
-                # Neither the plan's model nor the coarse copy will do: an error of a percent shows
-                # for a companion of S/N 1000.
+                source_values = self._towards(values, unknowns.turn @ source[1:])
+                # The full model is needed: an error of a percent is significant for a companion of
+                # S/N 1000.
                 with torch.no_grad():
-                    total = total + flux * source[0] * model(full, **there).double()
+                    total = total + flux * source[0] * model(full, **source_values).double()
         return Point(unknowns, vector, opd, fields, image, light, star, total)
 
     @staticmethod
@@ -150,11 +150,11 @@ class Forward:
         if not unknowns.shows_companions:
             rows[companions] = 0.0
         for k, source in enumerate(unknowns.sources(vector) if unknowns.shows_companions else ()):
-            there = self._towards(values, unknowns.turn @ source[1:])
+            source_values = self._towards(values, unknowns.turn @ source[1:])
             first = companions.start + 3 * k
             with torch.no_grad():
-                rows[first] = (flux * self.coarse(opd, **there)).cpu()
-            moved = parameter_jacobian(self.coarse, opd, there, ("star_offset",)).double()
+                rows[first] = (flux * self.coarse(opd, **source_values)).cpu()
+            moved = parameter_jacobian(self.coarse, opd, source_values, ("star_offset",)).double()
             turned = torch.tensordot(unknowns.turn.T, moved.cpu(), dims=1)
             rows[first + 1 : first + 3] = flux * source[0] * turned
         if response is not None:
@@ -166,6 +166,6 @@ class Forward:
         return rows
 
     def _response_at(self, point: Point) -> WavefrontResponse:
-        """The field's response to the wavefront, from where the wavefront was much the same."""
+        """The response of the field, computed at nearly the same wavefront."""
         values = point.unknowns.values(point.vector)
         return self.responses.near(point.opd, values, point.unknowns.optical)

@@ -160,7 +160,7 @@ class FrameFit:
             {name: np.atleast_1d(value).astype(float) for name, value in facts[key].items()}
             for key in ("values", "errors")
         )
-        known = ("COEFFICIENTS", k + 1) in hdus
+        has_coefficients = ("COEFFICIENTS", k + 1) in hdus
         return cls(
             model=model,
             observation=observation_of(hdus, facts["observation"], k),
@@ -171,5 +171,5 @@ class FrameFit:
             values=values,
             errors=errors,
             gain=image(hdus, "GAIN", k),
-            coefficients=image(hdus, "COEFFICIENTS", k) if known else None,
+            coefficients=image(hdus, "COEFFICIENTS", k) if has_coefficients else None,
         )

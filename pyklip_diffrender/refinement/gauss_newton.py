@@ -136,15 +136,15 @@ class Solver:
         # With photon-noise weights the faint pixels would dominate this first estimate.
         flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
         deviations = dict(self.settings.deviations)
-        known = "flux" in deviations
-        if known and "flux" not in problem.start:
+        is_known = "flux" in deviations
+        if is_known and "flux" not in problem.start:
             raise IncompatibleSetupError(
                 "deviations has 'flux', but start does not: how bright is the star? Give "
                 "start={'flux': stellar_flux(...)}"
             )
-        unknown = tuple(name for name in layout.linear if not (known and name == "flux"))
+        unknown = tuple(name for name in layout.linear if not (is_known and name == "flux"))
         flux, level = problem.flux_and_background(problem.gain * image, flat, unknown)
-        if known:
+        if is_known:
             deviations["flux"] *= flux
         layout.deviations = deviations
         layout.start["flux"] = torch.tensor([flux], dtype=torch.float64)
@@ -183,7 +183,7 @@ class Solver:
         self.scales = update.scales
         expected = self._predicted_gain(layout, equations, update.step)
         if expected < self.settings.tolerance * objective.pixels:
-            # The gain is not worth another linearisation.
+            # The gain is too small for another linearisation.
             return state, expected / objective.pixels
         before = self._cost(state, weights)
         for _ in range(_TRIES):
@@ -256,21 +256,21 @@ class Solver:
         if modes:
             fixed = torch.cat([fixed, self.amplitude_deviation])
         # Unknowns differ by many powers of ten, so the system is solved in scaled units.
-        own = torch.ones(len(curvature), dtype=torch.float64)
-        own[: len(fixed)] = curvature.diagonal()[: len(fixed)].clamp(min=1e-300) ** -0.5
+        unit = torch.ones(len(curvature), dtype=torch.float64)
+        unit[: len(fixed)] = curvature.diagonal()[: len(fixed)].clamp(min=1e-300) ** -0.5
         update = solve_with_evidence(
-            (curvature * own[:, None]).mul_(own),
-            equations.gradient * own,
+            (curvature * unit[:, None]).mul_(unit),
+            equations.gradient * unit,
             self.shape[:modes],
             self.group[:modes],
             self.scales,
-            fixed / own[: len(fixed)],
+            fixed / unit[: len(fixed)],
             iterations=1 if fit_scales and modes else 0,
             damping=damping,
-            current=equations.current / own,
+            current=equations.current / unit,
             errors=errors,
         )
-        return update.in_units(own)
+        return update.in_units(unit)
 
     def _cost(self, state: State, weights: Sequence[Weights]) -> float:
         """Penalised chi-squared.
@@ -278,8 +278,8 @@ class Solver:
         With weights that were made robust about the state before a step, a step that lowers it also
         lowers Cauchy's loss.
         """
-        away = (state.vector - state.joint.initial()) / self.prior_deviation(state.joint)
-        return self.objective.chi2(state, weights) + float((away**2).sum())
+        offset = (state.vector - state.joint.initial()) / self.prior_deviation(state.joint)
+        return self.objective.chi2(state, weights) + float((offset**2).sum())
 
     def _predicted_gain(
         self, layout: JointLayout, equations: NormalEquations, step: Tensor

@@ -109,11 +109,11 @@ def linearise(
         if len(state.points) == 1:
             curvature, gradient = product, pulled
             continue
-        own = slice(first, first + len(drift))
-        for to, which in ((rows, slice(None)), (drift, own)):
+        leading = slice(first, first + len(drift))
+        for to, which in ((rows, slice(None)), (drift, leading)):
             gradient.index_add_(0, to, pulled[which])
-            for onto, other in ((rows, slice(None)), (drift, own)):
-                curvature[to[:, None], onto] += product[which, other]
+            for onto, selection in ((rows, slice(None)), (drift, leading)):
+                curvature[to[:, None], onto] += product[which, selection]
     if objective.shares_pattern:
         summed = (
             torch.stack([frame.summed(frame.residual) for frame in frames]).sum(dim=0).flatten()

@@ -87,13 +87,14 @@ def _make_plan(problems: Sequence[Problem], settings: GaussNewton, seed: int) ->
 
 
 def _require_plan_for(model: OpticalSystem, planned: Plan) -> None:
-    other = planned.given
+    original = planned.given
     ours, theirs = (
-        (each.npix, each.detector.shape, each.bandpass, each.parameters) for each in (model, other)
+        (each.npix, each.detector.shape, each.bandpass, each.parameters)
+        for each in (model, original)
     )
     if ours != theirs:
         raise IncompatibleSetupError(
-            f"plan: it was made for {other!r}, the model is {model!r}. Make one for it with "
+            f"plan: it was made for {original!r}, the model is {model!r}. Make one for it with "
             "plan(model, observation, opd)"
         )
 
@@ -130,10 +131,10 @@ def fit_problems(
         return fit_with_growing_basis(problems, settings, warm, seed=seed, progress=progress)
     began = time.perf_counter()
     cheap = [problem.with_model(planned.model) for problem in problems]
-    chosen = settings
+    adapted = settings
     if settings.basis is None and warm is None:
-        chosen = replace(settings, cycles=planned.refine_options["cycles"])
-    fit = fit_with_growing_basis(cheap, chosen, warm, seed=seed, progress=progress)
+        adapted = replace(settings, cycles=planned.refine_options["cycles"])
+    fit = fit_with_growing_basis(cheap, adapted, warm, seed=seed, progress=progress)
     finished = [_on_full_model(fit, k, each, settings.free) for k, each in enumerate(problems)]
     error = ModelError.largest(change for _, change in finished)
     if planned.allows(error) or not fit.status.usable:
@@ -182,8 +183,8 @@ def _on_full_model(
         image, problem.sigma, linear, data=before - problem.pedestal, start=start
     )
     star = flux * image + level + problem.pedestal
-    away = ((star - before) / problem.sigma)[problem.valid].abs()
-    error = ModelError(float(away.square().mean().sqrt()), float(away.max()))
+    difference = ((star - before) / problem.sigma)[problem.valid].abs()
+    error = ModelError(float(difference.square().mean().sqrt()), float(difference.max()))
     fitted = {**frame.values, "flux": np.array([flux]), "background": np.array([level])}
     return replace(frame, model=model, opd=opd, star=star.cpu().numpy(), values=fitted), error
 

@@ -110,16 +110,16 @@ class Problem:
         )
         missing = [parameter(name) for name in names if name not in starts]
         others = self.model.values({p.name: np.full(p.size, p.start) for p in missing})
-        # `values` fills in the model's defaults, which must not replace what was given.
+        # `values` fills in the model's defaults, which must not replace explicit values.
         return {**others, **starts}
 
     def require_parameters(self, names: Iterable[str], argument: str = "free") -> None:
         """Raise `IncompatibleSetupError` for a name that is no parameter of this problem."""
-        known = (*self.model.parameters, "flux", "background")
+        available = (*self.model.parameters, "flux", "background")
         for name in names:
-            if name not in known:
+            if name not in available:
                 raise IncompatibleSetupError(
-                    f"{argument}: {name!r} is not a parameter of this model, which has {known}"
+                    f"{argument}: {name!r} is not a parameter of this model, which has {available}"
                 )
 
     def flux_and_background(
@@ -157,36 +157,37 @@ class Problem:
                 (scaled * weight.flatten()) @ scaled.T,
                 (scaled * weight.flatten()) @ target.flatten(),
             )
-            found = (solution / length).tolist()
-            flux = found[0] if "flux" in names else flux
-            level = found[-1] if "background" in names else level
+            values = (solution / length).tolist()
+            flux = values[0] if "flux" in names else flux
+            level = values[-1] if "background" in names else level
         return flux, level
 
 
 def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
-    """Compare filter, masks, module and pixel scale, where both sides say what theirs are.
+    """Compare filter, masks, module and pixel scale of a model with those of the frames.
 
-    Of the model, what its `setup` says: a system that is not an instrument's says nothing.
+    Settings that are unknown on either side, such as those of a system that is not an instrument,
+    are not compared.
 
     Raises
     ------
     IncompatibleSetupError
     """
     setup, header = model.setup, observation.header
-    stated = (
+    setups = (
         ("filter", setup.get("filter"), observation.filter),
         ("image mask", setup.get("image_mask"), header.get("CORONMSK")),
         ("pupil mask", setup.get("pupil_mask"), header.get("PUPIL")),
         ("module", setup.get("module"), header.get("MODULE")),
     )
-    for what, made, taken in stated:
-        if not isinstance(made, str) or not isinstance(taken, str):
+    for aspect, expected, actual in setups:
+        if not isinstance(expected, str) or not isinstance(actual, str):
             continue
         # Headers name the module with the mask.
-        if taken.strip().upper().replace("MASKA", "MASK") != made.upper():
+        if actual.strip().upper().replace("MASKA", "MASK") != expected.upper():
             raise IncompatibleSetupError(
-                f"{observation.name}: these frames have {what} {taken}, the model has {made}. Make "
-                "the model for the frames, with nircam_coronagraph or from_webbpsf"
+                f"{observation.name}: these frames have {aspect} {actual}, the model {expected}. "
+                "Make the model for the frames, with nircam_coronagraph or from_webbpsf"
             )
     ours, theirs = np.array(model.detector.pixelscale), np.array(observation.pixelscale)
     if (np.abs(theirs / ours - 1) > _SCALE_TOLERANCE).any():

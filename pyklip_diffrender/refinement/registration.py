@@ -1,7 +1,7 @@
 """Find which pixels of the detector frames show, from the pattern of the flat field itself.
 
-Frames that were moved without a record of it do not say where their pixels are on the detector.
-What a fit leaves of the star does: it correlates with the known pattern at one place only.
+The detector pixels of frames that were shifted without a record are unknown.
+The residual of a fit does: it correlates with the known pattern at only one position.
 """
 
 from __future__ import annotations
@@ -32,60 +32,60 @@ _COARSE, _FINE = 0.25, 0.05
 _SIGNIFICANT = 6.0
 """Height of the peak in units of the correlation's scatter elsewhere."""
 
-_BESIDE = 1.5
-"""Pixels from the peak beyond which the correlation is elsewhere."""
+_SEPARATE = 1.5
+"""Distance from the peak beyond which the correlation measures its scatter, pixels."""
 
 _MODEL_ERROR = 0.05
 """Error of the ratio of residual and star that the pattern does not explain."""
 
 _INNER = 0.3
-"""arcsec, inside which the ratio says little."""
+"""Smallest separation used, arcsec. Closer in, the ratio is dominated by errors of the model."""
 
 
-def register(fit: Refinement, known: Systematics) -> Observation | None:
+def register(fit: Refinement, pattern: Systematics) -> Observation | None:
     """Move the frames of a fit onto the pixels of the detector that a pattern was measured on.
 
     Parameters
     ----------
     fit : Refinement
         Of one observation, without a pattern.
-    known : Systematics
+    pattern : Systematics
         With `first_pixel`.
 
     Returns
     -------
     Observation or None
-        Shifted by less than a pixel, with `first_pixel`; None where the pattern is not seen.
+        Shifted by less than a pixel, with `first_pixel`; None if the pattern is not detected.
     """
     frame, (measured,) = fit.frames[0], measure_patterns(fit)
     observation = frame.observation
-    if known.first_pixel is None:
+    if pattern.first_pixel is None:
         return None
-    start = np.round(np.subtract(measured.center, known.center)).astype(int)
-    column, row = np.subtract(known.first_pixel, start).tolist()
-    pattern = known.at(replace(observation, first_pixel=(column, row)))[0]
-    y, x = np.indices(pattern.shape)
+    start = np.round(np.subtract(measured.center, pattern.center)).astype(int)
+    column, row = np.subtract(pattern.first_pixel, start).tolist()
+    expected = pattern.at(replace(observation, first_pixel=(column, row)))[0]
+    y, x = np.indices(expected.shape)
     scale_x, scale_y = frame.model.detector.pixelscale
-    away = np.hypot((x - measured.center[0]) * scale_x, (y - measured.center[1]) * scale_y)
-    weight = np.where(away > _INNER, 1 / (measured.variance + _MODEL_ERROR**2), 0.0)
+    distance = np.hypot((x - measured.center[0]) * scale_x, (y - measured.center[1]) * scale_y)
+    weight = np.where(distance > _INNER, 1 / (measured.variance + _MODEL_ERROR**2), 0.0)
     steps = np.arange(-_REACH, _REACH + _COARSE / 2, _COARSE)
-    coarse = _correlation(measured.value, pattern, weight, steps, steps)
+    coarse = _correlation(measured.value, expected, weight, steps, steps)
     row, column = np.unravel_index(int(coarse.argmax()), coarse.shape)
     best = np.array([steps[column], steps[row]])
-    elsewhere = np.hypot(*np.meshgrid(steps - best[0], steps - best[1])) > _BESIDE
+    elsewhere = np.hypot(*np.meshgrid(steps - best[0], steps - best[1])) > _SEPARATE
     scatter = float(coarse[elsewhere].std())
     _log.info("pattern seen at %s pixels, correlation %.2f, elsewhere %.3f",
               best, coarse.max(), scatter)  # fmt: skip
     if coarse.max() < _SIGNIFICANT * scatter:
         return None
-    near = np.arange(-_COARSE, _COARSE + _FINE / 2, _FINE)
-    fine = _correlation(measured.value, pattern, weight, best[0] + near, best[1] + near)
+    nearby = np.arange(-_COARSE, _COARSE + _FINE / 2, _FINE)
+    fine = _correlation(measured.value, expected, weight, best[0] + nearby, best[1] + nearby)
     row, column = np.unravel_index(int(fine.argmax()), fine.shape)
-    moved = start + best + (near[column], near[row])
-    whole = np.round(moved).astype(int)
-    shift = np.broadcast_to(whole - moved, (len(observation), 2))
-    column, row = np.subtract(known.first_pixel, whole).tolist()
-    # Masked pixels hold nothing of the star; left so, they would ring into their neighbours.
+    moved = start + best + (nearby[column], nearby[row])
+    pixels = np.round(moved).astype(int)
+    shift = np.broadcast_to(pixels - moved, (len(observation), 2))
+    column, row = np.subtract(pattern.first_pixel, pixels).tolist()
+    # Masked pixels are filled in, because empty ones would ring into their neighbours.
     valid = observation.valid
     data = shift_frames(np.where(valid, observation.data, frame.star), shift)
     typical = np.median(observation.error[valid])

@@ -17,8 +17,8 @@ from astropy.time import Time
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
-from pyklip_diffrender.io.files import open_fits, write_fits
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -32,8 +32,8 @@ from pyklip_diffrender.refinement.storage import (
     linear_of,
     model_facts,
     model_of,
+    reading,
     text_hdu,
-    text_of,
 )
 from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.objects import Planet
@@ -167,8 +167,9 @@ class Refinement:
         """
         if self.linear is None:
             raise IncompatibleSetupError(
-                f"a fit by method {self.method!r} has no linear model of its unknowns; use "
-                "refine(settings=GaussNewton()), the default"
+                f"this fit (method {self.method!r}) has no linear model of its unknowns. Use "
+                "refine(settings=GaussNewton()), the default, and do not write the fit with "
+                "linear=False"
             )
         if not len(self.companions):
             return self.linear
@@ -265,41 +266,28 @@ class Refinement:
             If the model is needed but missing.
         """
         name = Path(path).name
-        with open_fits(path) as hdus:
-            if "FACTS" not in hdus:
-                raise CorruptFileError(
-                    f"{name}: no FACTS extension, only {[h.name for h in hdus]}; expected a file "
-                    "written by Refinement.write"
-                )
-            try:
-                facts = text_of(hdus, "FACTS")
-                system = model_of(facts["model"], name) if model is None else model
-                frames = tuple(
-                    FrameFit.from_hdus(hdus, about, system, k)
-                    for k, about in enumerate(facts["frames"])
-                )
-                label, sha256, date = facts["initial"]
-                plain: dict[str, Any] = {key: facts[key] for key in _PLAIN}
-                plain |= {key: np.reshape(facts[key], (-1, 3)).astype(float) for key in _ARRAYS}
-                return cls(
-                    frames=frames,
-                    initial=OPDMap(
-                        native_float64(hdus["INITIAL_OPD"].data),
-                        None if date is None else Time(date),
-                        label,
-                        sha256,
-                    ),
-                    status=Status[facts["status"]],
-                    linear=linear_of(hdus, len(frames), name) if "UNKNOWNS" in hdus else None,
-                    systematics=Systematics.from_hdus(hdus) if "PATTERN" in hdus else None,
-                    **plain,
-                )
-            except (KeyError, TypeError, ValueError) as error:
-                if isinstance(error, DiffrenderError):
-                    raise
-                raise CorruptFileError(
-                    f"{name}: not a complete refinement ({error}). Write the fit again"
-                ) from error
+        with reading(path, "Refinement") as (hdus, facts):
+            system = model_of(facts["model"], name) if model is None else model
+            frames = tuple(
+                FrameFit.from_hdus(hdus, about, system, k)
+                for k, about in enumerate(facts["frames"])
+            )
+            label, sha256, date = facts["initial"]
+            plain: dict[str, Any] = {key: facts[key] for key in _PLAIN}
+            plain |= {key: np.reshape(facts[key], (-1, 3)).astype(float) for key in _ARRAYS}
+            return cls(
+                frames=frames,
+                initial=OPDMap(
+                    native_float64(hdus["INITIAL_OPD"].data),
+                    None if date is None else Time(date),
+                    label,
+                    sha256,
+                ),
+                status=Status[facts["status"]],
+                linear=linear_of(hdus, len(frames), name) if "UNKNOWNS" in hdus else None,
+                systematics=Systematics.from_hdus(hdus) if "PATTERN" in hdus else None,
+                **plain,
+            )
 
     def plot(self, ax: Any = None, *, frame: int = 0) -> NDArray[Any]:
         """Draw the data, the star model and the residual over the noise of a frame.

@@ -38,7 +38,8 @@ class GaussNewton:
         Highest spatial frequencies of the default basis, in cycles across the pupil. The first
         one is fitted; the next one is tried while the data are not explained.
     basis : Basis, optional
-        Wavefront modes, in place of the default basis (segment motions and Fourier modes).
+        Wavefront modes, in place of the default basis: Fourier modes and, for JWST, the motions of
+        its segments.
     deviations : mapping of str to float or Quantity
         Prior standard deviations of free parameters about their starting values, where they
         differ from those of the parameter table. That of "flux" is relative, and takes a starting
@@ -55,10 +56,10 @@ class GaussNewton:
         Companions with free contrast and position from the start; positions relative to the star,
         in the orientation of the first frame.
     max_companions : int
-        Largest number of companions that the fit may add by itself, if they stand out of the
+        Largest number of companions that the fit may add if they are significant in the
         residual of the alignment fit.
     companion_threshold : float
-        How far such companions must stand out, in units of the matched filter's scatter.
+        Smallest S/N of such companions, in units of the scatter of the matched filter.
     response_npix : int
         Pupil samples of the coarse copy of the model that computes derivatives.
     response_wavelengths : int
@@ -170,12 +171,12 @@ class GaussNewton:
 
     @classmethod
     def nircam(cls, **changes: Any) -> GaussNewton:
-        """Return the settings for real NIRCam frames, where the model is not the telescope.
+        """Return the settings for real NIRCam frames, for which the model is not exact.
 
-        The prior's scales are held, the pupil's amplitude is free as well, the alignment stays
-        near what is known of it in flight, a percent of the star stays as model error, outliers
-        lose their weight, and one companion that stands out of the alignment fit gets parameters
-        of its own.
+        The prior's scales are fixed, the pupil's amplitude is free as well, the alignment has a
+        prior about its values in flight, the model error is at least a percent of the star,
+        outliers are down-weighted, and one companion that is significant after the alignment fit
+        gets its own parameters.
 
         A wider prior (20 and 18 nm, alignment free) fits real frames a little more closely, but
         by way of a star far off the mask and of a wavefront that outshines the measured one: the
@@ -218,10 +219,10 @@ class GaussNewton:
             relinearise=0.3,
             tolerance=5e-4,
         )
-        # What is said to be held needs no prior.
+        # Parameters that are not free need no prior.
         free = changes.get("free", preset.free)
-        known = {name: value for name, value in preset.deviations.items() if name in free}
-        return replace(preset, **{"deviations": known, **changes})
+        deviations = {name: value for name, value in preset.deviations.items() if name in free}
+        return replace(preset, **{"deviations": deviations, **changes})
 
 
 @dataclass(frozen=True)

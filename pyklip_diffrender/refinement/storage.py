@@ -1,11 +1,14 @@
-"""Parts of a refinement as FITS extensions and JSON text, and back."""
+"""Convert parts of results to FITS extensions and JSON text, and back."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +18,9 @@ from astropy.io import fits
 from astropy.time import Time
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearFrame, LinearModel, Unknown
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -35,8 +39,8 @@ __all__ = [
     "model_of",
     "observation_hdus",
     "observation_of",
+    "reading",
     "text_hdu",
-    "text_of",
 ]
 
 _DATACLASSES = {each.__name__: each for each in (GaussNewton, Adam, WavefrontPrior, Planet)}
@@ -44,7 +48,7 @@ _DTYPES = {"torch.float64": torch.float64, "torch.float32": torch.float32}
 
 
 def encoded(value: Any) -> Any:
-    """Convert settings to types that JSON knows.
+    """Convert settings to JSON types.
 
     Raises
     ------
@@ -59,12 +63,12 @@ def encoded(value: Any) -> Any:
         return {"mapping": {str(key): encoded(each) for key, each in value.items()}}
     if isinstance(value, tuple | list):
         return [encoded(each) for each in value]
+    if isinstance(value, u.Quantity):  # Itself an array.
+        return {"quantity": encoded(value.value), "unit": value.unit.to_string()}
     if isinstance(value, np.ndarray | torch.Tensor):
         return encoded(native_float64(value).tolist())
     if isinstance(value, np.generic):
         return encoded(value.item())
-    if isinstance(value, u.Quantity):
-        return {"quantity": encoded(value.value), "unit": value.unit.to_string()}
     if isinstance(value, torch.dtype):
         return {"dtype": str(value)}
     if isinstance(value, torch.device):
@@ -119,6 +123,41 @@ def text_of(hdus: fits.HDUList, name: str) -> dict[str, Any]:
     return {key: decoded(value) for key, value in content.items()}
 
 
+@contextmanager
+def reading(
+    path: str | os.PathLike[str], kind: str
+) -> Iterator[tuple[fits.HDUList, dict[str, Any]]]:
+    """Open a result of this package, with the content of its FACTS extension.
+
+    Parameters
+    ----------
+    path : path
+    kind : str
+        Name of the class that wrote the file.
+
+    Raises
+    ------
+    CorruptFileError
+        If the file is missing or truncated, was not written by that class, or if a part that is
+        read inside the block is missing or malformed.
+    """
+    name = Path(path).name
+    with open_fits(path) as hdus:
+        if "FACTS" not in hdus:
+            raise CorruptFileError(
+                f"{name}: no FACTS extension, only {[h.name for h in hdus]}; expected a file "
+                f"written by {kind}.write"
+            )
+        try:
+            yield hdus, text_of(hdus, "FACTS")
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            if isinstance(error, DiffrenderError):
+                raise
+            raise CorruptFileError(
+                f"{name}: not a complete {kind} ({error}). Write it again"
+            ) from error
+
+
 def model_facts(model: OpticalSystem) -> dict[str, Any] | None:
     """Arguments of `nircam_coronagraph` that make the model; None for other models."""
     return dict(model.recipe) if model.maker is nircam_coronagraph else None
@@ -134,8 +173,8 @@ def model_of(facts: dict[str, Any] | None, name: str) -> OpticalSystem:
     """
     if facts is None:
         raise IncompatibleSetupError(
-            f"{name}: the model of this fit was not made by nircam_coronagraph, so the file does "
-            "not say how to make it. Pass the model: Refinement.read(path, model=model)"
+            f"{name}: the model of this fit was not made by nircam_coronagraph, so it "
+            "cannot be made from the file. Pass the model: Refinement.read(path, model=model)"
         )
     return nircam_coronagraph(**facts)
 
@@ -147,7 +186,8 @@ def image(hdus: fits.HDUList, name: str, frame: int) -> NDArray[np.float64]:
 
 def observation_hdus(observation: Observation, frame: int) -> tuple[dict[str, Any], list[Any]]:
     """Return metadata and extensions of an observation, with its frames averaged."""
-    combined = observation.combined()
+    # An average of one frame rounds differently.
+    combined = observation if len(observation) == 1 else observation.combined()
     facts = {
         "unit": combined.unit.to_string(),
         "pixelscale": combined.pixelscale,
@@ -172,6 +212,7 @@ def observation_hdus(observation: Observation, frame: int) -> tuple[dict[str, An
 def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Observation:
     """Make an observation from the metadata and extensions of `observation_hdus`."""
     angles, date = facts["position_angles"], facts["date"]
+    offset, first_pixel = facts.get("star_offset"), facts.get("first_pixel")
     return Observation.from_arrays(
         image(hdus, "DATA", frame),
         image(hdus, "ERROR", frame),
@@ -184,8 +225,8 @@ def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Obs
         position_angles=None if angles is None else np.array(angles),
         name=facts["name"],
         reference=facts["reference"],
-        star_offset=facts.get("star_offset") and tuple(facts["star_offset"]),
-        first_pixel=facts.get("first_pixel") and tuple(facts["first_pixel"]),
+        star_offset=None if offset is None else tuple(offset),
+        first_pixel=None if first_pixel is None else tuple(first_pixel),
         header=fits.Header.fromstring(facts["header"], sep="\n"),
     )
 

@@ -1,4 +1,4 @@
-"""What a reduction shows, as a page for people and a summary for programs."""
+"""The report on a reduction, as an HTML page and as a JSON summary."""
 
 from pyklip_diffrender.report.summary import summarise
 from pyklip_diffrender.report.write import write_report

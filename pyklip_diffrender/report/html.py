@@ -1,4 +1,4 @@
-"""The report as one HTML page that loads nothing from anywhere."""
+"""The report as a self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ $sections
 """)
 
 _PRODUCTS = {
-    "detection.fits": "S/N, contrast and error maps, and the frames without the star",
+    "detection.fits": "maps, star-subtracted frames and candidates, for Detection.read",
     "candidates.ecsv": "the candidates with all columns",
     "contrast.ecsv": "the contrast curve",
-    "fit.fits": "the fit, which Refinement.read makes again",
+    "fit.fits": "the fit, for Refinement.read",
     "systematics.fits": "the pattern of the model's error, for other reductions",
-    "summary.json": "what this page says, for programs",
+    "summary.json": "the content of this page, for programs",
     "report.html": "this page",
 }
 
@@ -180,8 +180,8 @@ def _candidates(summary: Mapping[str, Any]) -> str:
     note = (
         "Contrast is relative to the star without coronagraph; errors are standard deviations. The "
         "false-alarm probability is that of noise alone making such a peak anywhere in the field; "
-        "errors of the star model are not Gaussian and can be more frequent. Whether a candidate "
-        "is bound or in the background, one epoch does not tell."
+        "errors of the star model are not Gaussian and can be more frequent. One epoch does "
+        "not show whether a candidate is bound or in the background."
     )
     return "<h3>Candidates</h3>" + _table(header, rows) + _note(note)
 
@@ -273,12 +273,12 @@ def _provenance(summary: Mapping[str, Any], files: Sequence[str]) -> str:
         [name, "none" if value is None else str(value)]
         for name, value in summary["settings"].items()
     ]
-    known = [[name, _PRODUCTS.get(name, "")] for name in files]
+    products = [[name, _PRODUCTS.get(name, "")] for name in files]
     parts = [_facts(facts), _facts(long, "facts long")]
-    if known:
+    if products:
         parts += [
             "<h3>Files written with this page</h3>",
-            _table(["Name", "Content"], known, wrap=1),
+            _table(["Name", "Content"], products, wrap=1),
         ]
     parts += [
         "<details><summary>Settings of the fit</summary>",

@@ -1,4 +1,4 @@
-"""The pictures of the report, with what they show in words."""
+"""The pictures of the report, with descriptions."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Picture:
 
 def search_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Picture]:
     """The S/N map and the contrast curve."""
-    found = reduction.detection
-    count, threshold = len(found.table), found.threshold
+    detection = reduction.detection
+    count, threshold = len(detection.table), detection.threshold
     candidates = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {threshold:g}"
     places = "; ".join(
         f"S/N {row['snr']:.1f} at {row['separation_arcsec']:.2f} arcsec"
@@ -46,25 +46,25 @@ def search_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Pi
     )
     circles = "Circles mark the candidates. " if count else ""
     compass = "N and E point to north and east. " if summary["oriented"] else ""
-    scaled = f"Errors were multiplied by {found.scatter:.2f}, " + (
+    scaled = f"Errors were multiplied by {detection.scatter:.2f}, " + (
         "the square root of the reduced chi-squared without the candidates."
         if summary["status"]["calibrated"]
         else "so that S/N away from candidates has a standard deviation of 1."
     )
-    if found.scatter == 1:
+    if detection.scatter == 1:
         scaled = "Errors are those of the fit, not scaled."
     limits = "; ".join(
         f"{row['contrast']:.1e} at {row['separation_arcsec']:.3g} arcsec"
         for row in summary["limits"]
     )
     sigmas = summary["contrast_curve"]["sigmas"]
-    few = (
+    small_sample = (
         " Dotted: the median, corrected for the small number of resolution elements near the star."
-        if found.scatter > 1
+        if detection.scatter > 1
         else ""
     )
     return _pictures(
-        draw_search(found),
+        draw_search(detection),
         (
             f"Map of the signal-to-noise ratio of a point source, {candidates}"
             f"{': ' if places else ''}{places}.",
@@ -76,24 +76,24 @@ def search_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Pi
             f"{': ' if limits else ''}{limits}.",
             f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "
             "median of all position angles and their range. Dashed: the same if the image of the "
-            f"star were known exactly.{few}",
+            f"star were known exactly.{small_sample}",
         ),
     )
 
 
 def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
     """Data, model and residual of a frame."""
-    found = reduction.detection
-    observation = found.fits[0].frames[frame].observation
+    detection = reduction.detection
+    observation = detection.fits[0].frames[frame].observation
     unit, count = unit_label(observation.unit), len(observation)
-    kept = (
+    subtracted = (
         " The star was estimated together with the candidates (circles), whose light is kept."
-        if len(found.table)
+        if len(detection.table)
         else ""
     )
     mean = f", the mean of {count} integrations" if count > 1 else ""
     return _pictures(
-        draw_star(found, frame),
+        draw_star(detection, frame),
         (
             f"Image of {observation.target} behind the coronagraph, in {unit}.",
             f"What was observed{mean}. The scale is linear near 0 and logarithmic in bright parts; "
@@ -101,12 +101,12 @@ def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
         ),
         (
             f"Modelled image of {observation.target}, in {unit}.",
-            "What the fit says the star and the background look like, on the same scale.",
+            "The fitted star and background, on the same scale.",
         ),
         (
-            f"What is left of the image of {observation.target} without the star, in standard "
+            f"The residual image of {observation.target} without the star, in standard "
             "deviations of the noise.",
-            f"Data without the star, over the noise of each pixel.{kept}",
+            f"Data without the star, over the noise of each pixel.{subtracted}",
         ),
     )
 

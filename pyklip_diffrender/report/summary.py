@@ -1,4 +1,4 @@
-"""Everything worth saying about a reduction, as plain values that go into JSON."""
+"""Summary of a reduction, as plain values for JSON."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def summarise(reduction: Reduction) -> dict[str, Any]:
     dict
         Keys end in the unit of their values; None stands for what is not known.
     """
-    sequence, found = reduction.sequence, reduction.detection
+    sequence, detection = reduction.sequence, reduction.detection
     # What was searched: a bright companion is fitted once more, with the star.
-    fit = found.fits[0]
+    fit = detection.fits[0]
     first = sequence.science[0]
     dates = [each.date for each in sequence.science if each.date is not None]
     summary = {
@@ -54,7 +54,7 @@ def summarise(reduction: Reduction) -> dict[str, Any]:
         "program": first.header.get("PROGRAM"),
         "first_date": min(dates).isot if dates else None,
         "last_date": max(dates).isot if dates else None,
-        "threshold_snr": found.threshold,
+        "threshold_snr": detection.threshold,
         "oriented": first.position_angles is not None,
         "status": {
             "name": fit.status.name,
@@ -67,13 +67,13 @@ def summarise(reduction: Reduction) -> dict[str, Any]:
             "reduced_chi2": fit.reduced_chi2,
             "chi2_per_pixel": fit.chi2_per_pixel,
             "model_error": fit.model_error,
-            "error_factor": found.scatter,
+            "error_factor": detection.scatter,
         },
         "wavefront_map": _wavefront_map(fit, first),
         "systematics": _systematics(reduction),
-        "candidates": _candidates(found),
-        "limits": _limits(found),
-        "contrast_curve": _curve(found),
+        "candidates": _candidates(detection),
+        "limits": _limits(detection),
+        "contrast_curve": _curve(detection),
         "frames": [
             *(_frame(each, "target") for each in sequence.science),
             *(_frame(each, "reference") for each in sequence.references),
@@ -128,45 +128,45 @@ def _systematics(reduction: Reduction) -> dict[str, Any] | None:
     used = reduction.systematics
     if used is None:
         return None
-    known = {key: used.provenance.get(key, []) for key in ("stars", "frames")}
-    return {"name": used.name, **known}
+    provenance = {key: used.provenance.get(key, []) for key in ("stars", "frames")}
+    return {"name": used.name, **provenance}
 
 
-def _candidates(found: Detection) -> list[dict[str, Any]]:
+def _candidates(detection: Detection) -> list[dict[str, Any]]:
     """The table of candidates, with the unit in the names and the probability of a false alarm."""
-    table, rows = found.table, []
+    table, rows = detection.table, []
     for row in table:
         values = {}
         for name in table.colnames:
             unit = table[name].unit
-            # The names of magnitudes say what they are.
+            # The names of magnitudes include their unit.
             label = name if unit in (None, u.mag) else f"{name}_{unit}"
             values[label] = getattr(row[name], "value", row[name])
-        chance = _false_alarm(found, float(row["snr"]), row["separation"].to_value("arcsec"))
+        chance = _false_alarm(detection, float(row["snr"]), row["separation"].to_value("arcsec"))
         rows.append({**values, "false_alarm_probability": chance})
     return rows
 
 
-def _false_alarm(found: Detection, snr: float, separation: float) -> float:
+def _false_alarm(detection: Detection, snr: float, separation: float) -> float:
     """Probability that noise alone makes a peak of this S/N anywhere in the field.
 
     Gaussian noise where the fit explains its data; Student's t, as in the small-sample column of
     the contrast curve, where the errors were scaled to the scatter of the S/N.
     """
-    resolution = found.contrast_curve.meta["resolution_arcsec"]
+    resolution = detection.contrast_curve.meta["resolution_arcsec"]
     elements = math.floor(2 * math.pi * separation / resolution)
     single = stats.norm.sf(snr)
-    if not found.fits[0].status.calibrated and elements >= 3:
+    if not detection.fits[0].status.calibrated and elements >= 3:
         single = stats.t.sf(snr / math.sqrt(1 + 1 / (elements - 1)), elements - 2)
-    pixel = abs(found.grid[0, 1, 0] - found.grid[0, 0, 0]) * abs(
-        found.grid[1, 0, 1] - found.grid[0, 0, 1]
+    pixel = abs(detection.grid[0, 1, 0] - detection.grid[0, 0, 0]) * abs(
+        detection.grid[1, 0, 1] - detection.grid[0, 0, 1]
     )
-    trials = max(1.0, np.isfinite(found.snr).sum() * pixel / resolution**2)
+    trials = max(1.0, np.isfinite(detection.snr).sum() * pixel / resolution**2)
     return float(-math.expm1(trials * math.log1p(-single)))
 
 
-def _curve(found: Detection) -> dict[str, Any]:
-    curve = found.contrast_curve
+def _curve(detection: Detection) -> dict[str, Any]:
+    curve = detection.contrast_curve
     columns = {name: np.asarray(curve[name]) for name in curve.colnames if name != "separation"}
     return {
         "sigmas": curve.meta["sigmas"],
@@ -175,22 +175,22 @@ def _curve(found: Detection) -> dict[str, Any]:
     }
 
 
-def _limits(found: Detection) -> list[dict[str, Any]]:
+def _limits(detection: Detection) -> list[dict[str, Any]]:
     """The contrast curve at a few separations, or at its end if it reaches none of them."""
-    curve = found.contrast_curve
+    curve = detection.contrast_curve
     if not len(curve):
         return []
     separation = curve["separation"].to_value("arcsec")
     inside = [s for s in _LIMITS if separation[0] - 1e-6 <= s <= separation[-1] + 1e-6]
     rows = []
-    for wanted in inside or [separation[-1]]:
+    for separation_arcsec in inside or [separation[-1]]:
         values = {
-            name: float(np.exp(np.interp(wanted, separation, np.log(curve[name]))))
+            name: float(np.exp(np.interp(separation_arcsec, separation, np.log(curve[name]))))
             for name in ("contrast", "lowest", "highest", "known_star", "small_sample")
         }
         rows.append(
             {
-                "separation_arcsec": float(wanted),
+                "separation_arcsec": float(separation_arcsec),
                 "delta_mag": -2.5 * math.log10(values["contrast"]),
                 **values,
             }
@@ -199,12 +199,12 @@ def _limits(found: Detection) -> list[dict[str, Any]]:
 
 
 def _frame(observation: Observation, use: str) -> dict[str, Any]:
-    known = observation.position_angles is not None
+    oriented = observation.position_angles is not None
     return {
         "use": use,
         "star": observation.target,
         "date": None if observation.date is None else observation.date.isot,
-        "position_angle_deg": observation.position_angle if known else None,
+        "position_angle_deg": observation.position_angle if oriented else None,
         "integrations": len(observation),
         "exposure_s": observation.header.get("EFFEXPTM"),
         "pixels_used": observation.valid.mean(),

@@ -40,11 +40,11 @@ def write_report(
     """
     html, data = (Path(folder) / name for name in ("report.html", "summary.json"))
     summary = summarise(reduction)
-    shown = range(min(len(reduction.detection.fits[0].frames), MOST_FRAMES))
+    frames = range(min(len(reduction.detection.fits[0].frames), MOST_FRAMES))
     text = page(
         summary,
         search_pictures(reduction, summary),
-        [star_pictures(reduction, frame) for frame in shown],
+        [star_pictures(reduction, frame) for frame in frames],
         wavefront_pictures(reduction, summary),
         [path.name for path in (*files, html, data)],
     )

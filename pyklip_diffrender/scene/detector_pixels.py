@@ -1,4 +1,4 @@
-"""Back onto the detector's own pixels: undoing the shift of aligned frames.
+"""Undo the shifts of aligned frames, so that their pixels are those of the detector.
 
 A flat-field error belongs to a pixel of the detector. spaceKLIP's alignment moves frames by
 fractions of a pixel (IMSHIFTS), by a Fourier shift, after which a pixel of the array is a mixture
@@ -30,8 +30,8 @@ def net_shifts(
 ) -> NDArray[np.float64]:
     """How far the light of every frame is from where it fell on the detector.
 
-    A file says by how much its frames were shifted (IMSHIFTS), but not by how many whole pixels
-    they were cut or padded afterwards. Those follow from where the star must have been: within
+    A file records by how much its frames were shifted (IMSHIFTS), but not by how many whole pixels
+    they were cut or padded afterwards. Those follow from the position of the star, which was within
     half a pixel of the centre of the mask.
 
     Parameters
@@ -41,7 +41,7 @@ def net_shifts(
     center : ndarray, (frames, 2)
         x, y of the star in the array, 0-indexed.
     header : Header
-        APERNAME and FILTER say where the mask is imaged.
+        APERNAME and FILTER determine the position of the mask.
     name : str
         The file's, for messages.
 
@@ -65,7 +65,7 @@ def first_pixel(header: fits.Header, whole: NDArray[np.int64], name: str) -> tup
     Parameters
     ----------
     header : Header
-        SUBSTRT1 and SUBSTRT2 say where the subarray begins, 1-indexed.
+        SUBSTRT1 and SUBSTRT2 are the first column and row of the subarray, 1-indexed.
     whole : ndarray, (2,)
         Whole pixels, x and y, by which the frames have been moved since.
     name : str
@@ -74,7 +74,7 @@ def first_pixel(header: fits.Header, whole: NDArray[np.int64], name: str) -> tup
     Returns
     -------
     tuple of int or None
-        None if the header does not say it.
+        None if the header does not have them.
     """
     start = [header_number(header, key, name) for key in ("SUBSTRT1", "SUBSTRT2")]
     if None in start:

@@ -105,7 +105,7 @@ class Star:
 
 @dataclass(frozen=True)
 class Planet:
-    """A point source beside the star.
+    """A point source near the star.
 
     Every value may be a Quantity.
 

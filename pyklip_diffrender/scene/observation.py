@@ -1,11 +1,9 @@
-"""Frames to be explained: pixel values, their errors, what is masked, where the star is."""
+"""Observed frames: pixel values, errors, masks, and the position of the star."""
 
 from __future__ import annotations
 
 import os
-import warnings
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,15 +13,11 @@ from astropy.time import Time
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import (
-    CorruptFileError,
-    DiffrenderWarning,
     IncompatibleSetupError,
     NoValidPixelsError,
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.io.headers import header_date, header_number, header_text, merged_header
 from pyklip_diffrender.io.units import (
     native_float64,
     require_finite,
@@ -32,20 +26,10 @@ from pyklip_diffrender.io.units import (
     to_pair,
     to_unit,
 )
-from pyklip_diffrender.scene.detector_pixels import first_pixel, net_shifts, shift_frames
+from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints
 from pyklip_diffrender.scene.noise import calibrated_errors
 
-__all__ = ["BAD_PIXEL_BITS", "Observation"]
-
-BAD_PIXEL_BITS = 1 | 2 | 512 | 1024
-"""JWST data-quality bits that take a pixel out of the fit: DO_NOT_USE, SATURATED, NON_SCIENCE,
-DEAD. A jump (4) that the ramp fit has repaired, or a hot pixel (2048) that was dark-subtracted,
-may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
-
-
-def _usable(quality: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether the data-quality flags let a pixel into the fit."""
-    return np.asarray((np.asarray(quality).astype(np.uint32) & BAD_PIXEL_BITS) == 0)
+__all__ = ["Observation"]
 
 
 def _spread(array: NDArray[np.float64], shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
@@ -78,9 +62,9 @@ class Observation:
     position_angles : ndarray, (frames,)
         Degrees.
     star_offset : tuple of float or None
-        x, y of the star relative to the occulter as the file says, arcsec; a fit starts there.
+        x, y of the star relative to the occulter from the file, arcsec; the start of a fit.
     reference : bool
-        Another star, whose frames show the wavefront but none of the target's companions.
+        Whether this is a reference star, whose frames have no companions of the target.
     first_pixel : tuple of int or None
         Column and row of the array's first pixel on the full detector, 0-indexed; None where it is
         not known, or where the array's pixels are not the detector's.
@@ -135,22 +119,22 @@ class Observation:
         Raises
         ------
         ShapeError
-            Shapes that do not go together, or no frames.
+            Inconsistent shapes, or no frames.
         UnitError
-            A unit that is not known, or does not convert.
+            A unit that is unknown or does not convert.
         NonFiniteError
             A star position that is not a number.
         IncompatibleSetupError
             A pixel scale that is not a positive number.
         NoValidPixelsError
-            A frame in which nothing is left.
+            A frame without valid pixels.
         """
         name = details.get("name", "observation")
         try:
             unit = u.Unit(unit)
         except (ValueError, TypeError) as reason:
             raise UnitError(
-                f"{name}: got the unit {unit!r}, expected one that astropy knows, such as 'MJy/sr'"
+                f"{name}: got the unit {unit!r}, expected an astropy unit such as 'MJy/sr'"
             ) from reason
         values = to_unit(data, unit, f"{name}: data")
         values = values[None] if values.ndim == 2 else values
@@ -163,10 +147,10 @@ class Observation:
         require_shape(sigma, values.shape, f"{name}: error", "Give one error for every pixel")
         good = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
         if valid is not None:
-            given = np.asarray(valid, dtype=bool)
-            given = given[None] if given.ndim == 2 else given
-            require_shape(given, values.shape, f"{name}: valid", "Say it for every pixel")
-            good &= given
+            mask = np.asarray(valid, dtype=bool)
+            mask = mask[None] if mask.ndim == 2 else mask
+            require_shape(mask, values.shape, f"{name}: valid", "Give one value for every pixel")
+            good &= mask
         empty = np.flatnonzero(~good.any(axis=(1, 2)))
         if len(empty):
             raise NoValidPixelsError(
@@ -179,8 +163,8 @@ class Observation:
             angles = to_unit(details["position_angles"], u.deg, "position_angles")
             details["position_angles"] = _spread(angles, (len(values),), f"{name}: position_angles")
         frames, ny, nx = values.shape
-        where = native_float64([(nx - 1) / 2, (ny - 1) / 2] if center is None else center)
-        require_finite(where, f"{name}: center")
+        position = native_float64([(nx - 1) / 2, (ny - 1) / 2] if center is None else center)
+        require_finite(position, f"{name}: center")
         scale = _spread(to_arcsec(pixelscale, "pixelscale"), (2,), f"{name}: pixelscale")
         if not (np.isfinite(scale) & (scale > 0)).all():
             raise IncompatibleSetupError(
@@ -193,7 +177,7 @@ class Observation:
             good,
             unit,
             (float(scale[0]), float(scale[1])),
-            _spread(where, (frames, 2), f"{name}: center"),
+            _spread(position, (frames, 2), f"{name}: center"),
             **details,
         )
 
@@ -218,135 +202,22 @@ class Observation:
         ShapeError, NoValidPixelsError
             As `from_arrays`.
         """
-        path = Path(path)
-        with open_fits(path) as hdus:
-            if "SCI" not in hdus:
-                raise CorruptFileError(
-                    f"{path.name}: no SCI extension, only {[h.name for h in hdus]}; expected a "
-                    "JWST calints file"
-                )
-            science = hdus["SCI"]
-            header = merged_header(hdus[0].header, science.header, path.name)
-            for hdu in hdus:
-                if hdu.name in ("SCI", "ERR", "DQ") and not hdu.is_image:
-                    raise CorruptFileError(f"{path.name}: {hdu.name} is a table, not an image")
-                if hdu.name in ("SCI", "ERR", "DQ") and hdu.data is None:
-                    raise CorruptFileError(f"{path.name}: {hdu.name} has no data, so no frames")
-            data = native_float64(science.data)
-            if "ERR" not in hdus:
-                raise CorruptFileError(f"{path.name}: no ERR extension; the fit needs errors")
-            error = native_float64(hdus["ERR"].data)
-            if "DQ" in hdus:
-                quality = np.asarray(hdus["DQ"].data)
-                if quality.dtype.kind not in "iu":
-                    raise CorruptFileError(
-                        f"{path.name}: DQ holds {quality.dtype.name}, expected integers (flags)"
-                    )
-            else:
-                warnings.warn(
-                    f"{path.name}: no DQ extension; only NaN pixels are masked",
-                    DiffrenderWarning,
-                    stacklevel=2,
-                )
-                quality = np.zeros(data.shape, dtype=np.uint32)
-            mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
-            shifts = hdus["IMSHIFTS"].data if "IMSHIFTS" in hdus else None
-        observation = cls.from_jwst(data, error, quality, header, name=path.name)
+        arguments, shifts = read_calints(path)
+        observation = cls.from_arrays(**arguments)
         if shifts is not None:
-            observation = observation._on_detector_pixels(data, error, quality, shifts)
-        elif "STARCENX" not in header:
-            origin = first_pixel(header, np.zeros(2, dtype=np.int64), path.name)
-            observation = replace(observation, first_pixel=origin)
-        if observation.is_nircam:
-            errors = calibrated_errors(
-                observation.data, observation.error, observation.valid, observation.center,
-                observation.pixelscale, path.name,
-            )  # fmt: skip
-            observation = replace(observation, error=errors)
-        if mask is None:
+            changes = on_detector_pixels(arguments, observation.center, shifts)
+            observation = replace(observation, **changes)
+        if not observation.is_nircam:
             return observation
-        # spaceKLIP says where the mask is from the star, in pixels, for every integration.
-        away = -native_float64(mask).reshape(-1, 2).mean(axis=0) * observation.pixelscale
-        return replace(observation, star_offset=(float(away[0]), float(away[1])))
-
-    @classmethod
-    def from_jwst(
-        cls,
-        data: NDArray[Any],
-        error: NDArray[Any],
-        quality: NDArray[Any],
-        header: fits.Header,
-        name: str,
-    ) -> Observation:
-        """Make an observation of JWST arrays and their merged header; see `from_fits`."""
-
-        def number(key: str, default: float) -> float:
-            found = header_number(header, key, name)
-            return default if found is None else found
-
-        unit = header_text(header, "BUNIT", name)
-        if unit is None:
-            raise UnitError(f"{name}: SCI has no BUNIT; expected one such as 'MJy/sr'")
-        frames = 1 if np.ndim(data) == 2 else len(data)
-        star = [
-            number(key, number(fallback, np.nan)) for key, fallback in
-            (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
-        ]  # fmt: skip
-        angle = number("ROLL_REF", 0.0) - number("V3I_YANG", 0.0) * number("VPARITY", -1)
-        area = number("PIXAR_A2", 0.0)
-        if area == 0:
-            raise UnitError(f"{name}: the header has no PIXAR_A2 (pixel area, arcsec^2)")
-        if area < 0:
-            raise CorruptFileError(
-                f"{name}: PIXAR_A2 is {area}, expected a pixel area in arcsec^2, such as 0.0039. "
-                "Correct the header, or fetch the file again"
-            )
-        return cls.from_arrays(
-            data,
-            error,
-            valid=_usable(quality),
-            unit=unit,
-            pixelscale=area**0.5,
-            center=None if np.isnan(star).any() else np.array(star) - 1,
-            filter=header_text(header, "FILTER", name),
-            date=header_date(header, ("DATE-BEG", "DATE-OBS"), name),
-            position_angles=np.full(frames, angle),
-            name=name,
-            header=header,
+        errors = calibrated_errors(
+            observation.data,
+            observation.error,
+            observation.valid,
+            observation.center,
+            observation.pixelscale,
+            observation.name,
         )
-
-    def _on_detector_pixels(
-        self, data: NDArray[Any], error: NDArray[Any], quality: NDArray[Any], shifts: Any
-    ) -> Observation:
-        """Undo the shifts (IMSHIFTS) by which frames were aligned, up to whole pixels.
-
-        The arguments are the file's arrays. The alignment leaves DQ where it was.
-        """
-        if np.shape(shifts) != (len(self), 2):
-            raise ShapeError(
-                f"{self.name}: IMSHIFTS: got shape {np.shape(shifts)}, expected ({len(self)}, 2), "
-                "x and y for every frame"
-            )
-        require_finite(native_float64(shifts), f"{self.name}: IMSHIFTS")
-        net = net_shifts(shifts, self.center, self.header, self.name)
-        whole = np.round(net.mean(axis=0)).astype(np.int64)
-        shape = self.data.shape
-        back = [
-            shift_frames(np.nan_to_num(native_float64(a).reshape(shape)), whole - net)
-            for a in (data, error)
-        ]
-        known = np.isfinite(data).reshape(shape) & np.isfinite(error).reshape(shape)
-        usable = _usable(quality).reshape(shape)
-        usable = np.roll(usable, (whole[1], whole[0]), axis=(1, 2))
-        good = known & usable & (back[1] > 0)
-        return replace(
-            self,
-            data=np.where(good, back[0], 0.0),
-            error=np.where(good, back[1], 1.0),
-            valid=good,
-            center=self.center + whole - net,
-            first_pixel=first_pixel(self.header, whole, self.name),
-        )
+        return replace(observation, error=errors)
 
     def __len__(self) -> int:
         return len(self.data)
@@ -384,19 +255,19 @@ class Observation:
         return other.position_angle - self.position_angle
 
     def cutout(self, size: int) -> Observation:
-        """The `size` x `size` pixels about the star (whole pixels, so nothing is resampled).
+        """The `size` x `size` pixels about the star (whole pixels, without resampling).
 
         Raises
         ------
         ShapeError
-            If that sticks out of the frame.
+            If the square is not inside the frame.
         """
         corners = np.round(self.center - (size - 1) / 2).astype(int)
         ny, nx = self.shape
         if corners.min() < 0 or (corners + size > (nx, ny)).any():
             raise ShapeError(
                 f"{self.name}: {size} x {size} pixels about {tuple(self.center[0])} do not fit "
-                f"into {nx} x {ny}. Ask for fewer"
+                f"into {nx} x {ny}. Choose a smaller size"
             )
 
         def cut(stack: NDArray[Any]) -> NDArray[Any]:
@@ -442,17 +313,17 @@ class Observation:
 
         Only for frames that see the star at the same place under the same wavefront.
         """
-        # What is masked may be anything where somebody has replaced data, NaN too.
+        # Masked pixels may have any value if the data were replaced, also NaN.
         weight = np.where(self.valid, np.where(self.valid, self.error, 1.0) ** -2, 0.0)
         total = weight.sum(axis=0)
-        seen = total > 0
-        safe = np.where(seen, total, 1.0)
+        covered = total > 0
+        safe = np.where(covered, total, 1.0)
         light = np.where(self.valid, self.data, 0.0)
         return replace(
             self,
             data=((weight * light).sum(axis=0) / safe)[None],
-            error=np.where(seen, safe**-0.5, 1.0)[None],
-            valid=seen[None],
+            error=np.where(covered, safe**-0.5, 1.0)[None],
+            valid=covered[None],
             center=self.center.mean(axis=0, keepdims=True),
             position_angles=None if self.position_angles is None else self.position_angles[:1],
         )

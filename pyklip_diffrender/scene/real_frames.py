@@ -59,11 +59,11 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
     }
     if observation.is_nircam:
         # Headers name the module with the mask: MASKA335R.
-        stated = str(observation.header.get("CORONMSK", "MASK335R")).strip().upper()
-        name = overrides.get("image_mask") or stated.replace("MASKA", "MASK")
+        mask_name = str(observation.header.get("CORONMSK", "MASK335R")).strip().upper()
+        name = overrides.get("image_mask") or mask_name.replace("MASKA", "MASK")
         if name not in ROUND_MASKS:
             raise IncompatibleSetupError(
-                f"{observation.name}: these frames have image mask {stated}, expected one of "
+                f"{observation.name}: these frames have image mask {mask_name}, expected one of "
                 f"{', '.join(ROUND_MASKS)}. Other masks come through from_webbpsf"
             )
         mask = ROUND_MASKS[name]
@@ -85,13 +85,13 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
     defaults = arguments.pop("defaults", None)
     items = tuple(sorted(arguments.items()))
     try:
-        return _made_once(observation.filter, items, tuple(sorted((defaults or {}).items())))
+        return _cached_model(observation.filter, items, tuple(sorted((defaults or {}).items())))
     except TypeError:  # An argument that cannot be a key, such as a spectrum in arrays.
-        return _made(observation.filter, items, tuple((defaults or {}).items()))
+        return _model(observation.filter, items, tuple((defaults or {}).items()))
 
 
-def _made(name: str, items: Items, defaults: Items) -> OpticalSystem:
+def _model(name: str, items: Items, defaults: Items) -> OpticalSystem:
     return nircam_coronagraph(name, **dict(items), defaults=dict(defaults))
 
 
-_made_once = lru_cache(maxsize=4)(_made)
+_cached_model = lru_cache(maxsize=4)(_model)

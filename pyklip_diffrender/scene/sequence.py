@@ -163,9 +163,9 @@ class Sequence:
 
 
 def _paths(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
-    several = [files] if isinstance(files, str | os.PathLike) else list(files)
+    entries = [files] if isinstance(files, str | os.PathLike) else list(files)
     paths: list[Path] = []
-    for each in map(Path, several):
+    for each in map(Path, entries):
         if each.is_dir():
             inside = sorted(p for p in each.iterdir() if p.name.endswith(_SUFFIXES))
             if not inside:
@@ -178,24 +178,24 @@ def _paths(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> 
     return paths
 
 
-def _the_only(what: str, wanted: str | None, values: abc.Sequence[str | None]) -> str:
-    """The value that was asked for, or the only one there is."""
-    known = Counter(str(value) for value in values)
-    if wanted is not None:
-        if not any(_same(wanted, value) for value in known):
-            raise IncompatibleSetupError(f"{what}: got {wanted!r}, the files have {sorted(known)}")
-        return wanted
-    if len(known) > 1:
+def _the_only(key: str, choice: str | None, values: abc.Sequence[str | None]) -> str:
+    """Return the requested value, or the only one in the files."""
+    counts = Counter(str(value) for value in values)
+    if choice is not None:
+        if not any(_same(choice, value) for value in counts):
+            raise IncompatibleSetupError(f"{key}: got {choice!r}, the files have {sorted(counts)}")
+        return choice
+    if len(counts) > 1:
         raise IncompatibleSetupError(
-            f"{what}: the files have {', '.join(f'{n} ({c})' for n, c in known.items())}; say "
-            f"which one to use with {what}=..."
+            f"{key}: the files have {', '.join(f'{n} ({c})' for n, c in counts.items())}; choose "
+            f"one with {key}=..."
         )
-    return next(iter(known))
+    return next(iter(counts))
 
 
-def _same(one: str | None, other: str | None) -> bool:
-    """Whether two names are the same but for case and separators."""
-    return _plain(one) == _plain(other)
+def _same(first: str | None, second: str | None) -> bool:
+    """Whether two names differ only in case and separators."""
+    return _plain(first) == _plain(second)
 
 
 def _plain(name: str | None) -> str:

@@ -59,7 +59,7 @@ def simulate(
     Returns
     -------
     Observation
-        In photons. The error is what an observer would know, sqrt(counts + read noise^2), from
+        In photons. The error is the observer's estimate, sqrt(counts + read noise^2), from
         the frame itself.
     """
     expected = expected_photons(model, scene, opd)

@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.jwst import TABULATED_GAP, jwst_segments
+from pyklip_diffrender.instrument.jwst import TABULATED_GAP, is_jwst_pupil, jwst_segments
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
+from pyklip_diffrender.optics.planes import EntrancePupil
 
 __all__ = ["Basis", "FourierModes", "JointBasis", "SegmentMotions", "default_basis"]
 
@@ -95,9 +96,8 @@ def _sampled_segments(grid: PupilGrid) -> list[tuple[PupilGrid, Tensor]]:
     reach = max(float(outline.abs().max()) for outline in jwst_segments().values())
     if 2 * reach > 1.01 * grid.diameter:
         raise IncompatibleSetupError(
-            f"the pupil array is {grid.diameter:.3g} m wide, but JWST's segments, whose motions "
-            f"are modes by default, span {2 * reach:.3g} m. For another telescope use "
-            "GaussNewton(basis=FourierModes(24)), from pyklip_diffrender.wavefront.bases"
+            f"SegmentMotions: the pupil array is {grid.diameter:.3g} m wide, but JWST's segments "
+            f"span {2 * reach:.3g} m. Use FourierModes for another telescope"
         )
     # Half the gap on every side, so that each point of the gaps belongs to a segment.
     return [
@@ -168,9 +168,9 @@ class FourierModes:
             waves.append(math.sqrt(2) ** 0.5 * torch.complex(torch.cos(angle), torch.sin(angle)))
         # A plane wave is a product of waves in x and y, which saves trigonometry on the full grid.
         product = waves[1][:, :, None] * waves[0][:, None, :]
-        both = torch.stack([product.real, product.imag], dim=1)
+        stacked = torch.stack([product.real, product.imag], dim=1)
         first = 2 * (start // 2)
-        return both.flatten(0, 1)[start - first : stop - first]
+        return stacked.flatten(0, 1)[start - first : stop - first]
 
     def opd(self, coefficients: Tensor, grid: PupilGrid) -> Tensor:
         # sum c cos + s sin = Re sum (c - i s) exp(i ...): two small matrix products.
@@ -229,6 +229,21 @@ class JointBasis:
         return total
 
 
-def default_basis(max_cycles: float = 24.0) -> JointBasis:
-    """Segment motions and Fourier modes: 1,846 modes up to 24 cycles."""
-    return JointBasis([SegmentMotions(), FourierModes(max_cycles)])
+def default_basis(max_cycles: float = 24.0, pupil: EntrancePupil | None = None) -> Basis:
+    """Return the wavefront modes of a fit that was not given any.
+
+    For JWST they are segment motions and Fourier modes, 1,846 modes up to 24 cycles. Other
+    telescopes get the Fourier modes alone, whatever their segments are.
+
+    Parameters
+    ----------
+    max_cycles : float
+        Highest spatial frequency, cycles across the pupil.
+    pupil : EntrancePupil, optional
+        Pupil of the telescope; default that of JWST. It is JWST's if its aperture is, see
+        `is_jwst_pupil`.
+    """
+    fourier = FourierModes(max_cycles)
+    if pupil is None or is_jwst_pupil(pupil.lit, pupil.full.diameter):
+        return JointBasis([SegmentMotions(), fourier])
+    return fourier

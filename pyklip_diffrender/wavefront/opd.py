@@ -154,9 +154,9 @@ def _inside(npix: int) -> NDArray[np.bool_]:
     return inside
 
 
-def _checked(given: OPDMap) -> OPDMap:
+def _checked(raw: OPDMap) -> OPDMap:
     """A square map with a plausible rms, and zeros where values outside the pupil are NaN."""
-    data, name = given.data, given.name
+    data, name = raw.data, raw.name
     if data.ndim != 2 or data.shape[0] != data.shape[1] or not data.size:
         raise ShapeError(f"{name}: got shape {data.shape}, expected a square map")
     pupil = _inside(data.shape[0])
@@ -169,7 +169,7 @@ def _checked(given: OPDMap) -> OPDMap:
         )
     data = np.where(bad, 0.0, data)
     warn_of_rms(float(data[pupil].std()), name, stacklevel=4)
-    return replace(given, data=data)
+    return replace(raw, data=data)
 
 
 def drift(before: Any, after: Any, hours: float, interval: float = 86.0) -> NDArray[np.float64]:

@@ -42,7 +42,7 @@ zero; without a ceiling, a bright companion that is missing from the model makes
 that the equations cannot be solved."""
 
 _ENOUGH_MODES = 20.0
-"""Number of determined modes below which nothing can be said about the scale of a group."""
+"""Smallest number of determined modes that constrain the scale of a group."""
 
 
 @dataclass(frozen=True)

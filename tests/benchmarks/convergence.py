@@ -98,13 +98,13 @@ def main() -> None:
         cells = (f"{largest(images[key][r], truth[r]):.1e}" for key in images)
         lines.append(f'| {r:g}" | {truth[r].max():.2e} | ' + " | ".join(cells) + " |")
 
-    both = [k for k in arguments.sampling if k in arguments.poppy_oversample]
+    common = [k for k in arguments.sampling if k in arguments.poppy_oversample]
     same = [
-        "| star at | " + " | ".join(str(k) for k in both) + " |",
-        "|---" * (1 + len(both)) + "|",
+        "| star at | " + " | ".join(str(k) for k in common) + " |",
+        "|---" * (1 + len(common)) + "|",
     ]
     for r in SEPARATIONS:
-        cells = (f"{largest(images['ours', k][r], images['poppy', k][r]):.1e}" for k in both)
+        cells = (f"{largest(images['ours', k][r], images['poppy', k][r]):.1e}" for k in common)
         same.append(f'| {r:g}" | ' + " | ".join(cells) + " |")
 
     weight = torch.from_numpy(np.random.default_rng(335).standard_normal((80, 80)))

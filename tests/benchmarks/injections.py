@@ -97,8 +97,8 @@ def klip_limits(fit: dr.Refinement, files: Sequence[Path], others: Sequence[Path
                 added[k] += 3e-5 * planet(frame, rolls[k], offset, shift)
         for m, image in enumerate(images(added)):
             for s, offset in enumerate(offsets):
-                near = np.hypot(x - SIZE / 2 - offset[0] / PIXEL, y - SIZE / 2 - offset[1] / PIXEL)
-                response[m, s] += (image - plain[m])[near < 1.5].max() / 3e-5 / trials
+                close = np.hypot(x - SIZE / 2 - offset[0] / PIXEL, y - SIZE / 2 - offset[1] / PIXEL)
+                response[m, s] += (image - plain[m])[close < 1.5].max() / 3e-5 / trials
     limits = np.zeros_like(response)
     for s, separation in enumerate(SEPARATIONS):
         ring = np.abs(distance - separation) < 0.07
@@ -124,9 +124,9 @@ def subtraction(
                            + [each[zone] for each in references])  # fmt: skip
         subtracted = klip_math(frame[zone], library, np.array(MODES))
         for m in range(len(MODES)):
-            left = np.zeros((SIZE, SIZE))
-            left[zone] = subtracted[:, m]
-            total[m] += rotate(left, -rolls[k], center) / len(science)
+            residual = np.zeros((SIZE, SIZE))
+            residual[zone] = subtracted[:, m]
+            total[m] += rotate(residual, -rolls[k], center) / len(science)
     return [np.nan_to_num(each) for each in total]
 
 
@@ -146,14 +146,16 @@ def recovered(
             light = sum(1.6 * c * planet(frame, roll, o, shift)
                         for c, o in zip(limit, offsets, strict=True))  # fmt: skip
             science.append(replace(each, data=each.data + light))
-        again = replace(base.sequence, science=tuple(science))
-        result = dr.reduce(again, opd, systematics=base.systematics or "off")
+        injected = replace(base.sequence, science=tuple(science))
+        result = dr.reduce(injected, opd, systematics=base.systematics or "off")
         table = result.detection.measure(offsets)
         for s, row in enumerate(table):
-            known = result.detection.table
-            near = [float(np.hypot(*(np.array([r["x"].value, r["y"].value]) - offsets[s]))) < 0.1
-                    for r in known]  # fmt: skip
-            best = known[near.index(True)] if any(near) else row
+            candidates = result.detection.table
+            distances = np.hypot(
+                candidates["x"].value - offsets[s][0], candidates["y"].value - offsets[s][1]
+            )
+            is_close = (distances < 0.1).tolist()
+            best = candidates[is_close.index(True)] if any(is_close) else row
             rows.append(
                 {
                     "separation": SEPARATIONS[s],
@@ -161,7 +163,7 @@ def recovered(
                     "contrast": float(best["contrast"]),
                     "error": float(best["contrast_error"]),
                     "snr": float(best["snr"]),
-                    "detected": any(near),
+                    "detected": any(is_close),
                 }
             )
         print(f"trial {trial}: {result.fit.status.name}, scatter {result.detection.scatter:.3f}",
@@ -183,24 +185,26 @@ def main() -> None:
     files = [options.frames / each.name for each in sequence.science]
     began = time.perf_counter()
     base = dr.reduce(replace(sequence, references=()), options.opd)
-    away = np.hypot(base.detection.grid[..., 0], base.detection.grid[..., 1]) > 0.3
+    distant = np.hypot(base.detection.grid[..., 0], base.detection.grid[..., 1]) > 0.3
     print(base)
     print(
         f"{time.perf_counter() - began:.0f} s; chi2 {base.fit.chi2_per_pixel:.3f}, errors scaled "
         f"by {base.detection.scatter:.3f}, S/N beyond 0.3 arcsec: deviation "
-        f"{np.nanstd(base.detection.residual_snr[away]):.3f}, "
-        f"{np.nanmin(base.detection.residual_snr[away]):.1f} to "
-        f"{np.nanmax(base.detection.residual_snr[away]):.1f}",
+        f"{np.nanstd(base.detection.residual_snr[distant]):.3f}, "
+        f"{np.nanmin(base.detection.residual_snr[distant]):.1f} to "
+        f"{np.nanmax(base.detection.residual_snr[distant]):.1f}",
         flush=True,
     )
     curve = base.detection.contrast_curve
-    ours, known = (
+    ours, star_known = (
         np.interp(SEPARATIONS, curve["separation"].value, curve[name])
         for name in ("contrast", "known_star")
     )
     theirs = klip_limits(base.fit, files, others)
     print("separation, ours, KLIP, ratio, star known, ours / star known")
-    for row in zip(SEPARATIONS, ours, theirs, theirs / ours, known, ours / known, strict=True):
+    for row in zip(
+        SEPARATIONS, ours, theirs, theirs / ours, star_known, ours / star_known, strict=True
+    ):
         print("{:.1f}  {:.2e}  {:.2e}  {:.2f}  {:.2e}  {:.2f}".format(*row), flush=True)
     print(f"median ratio {np.median(theirs / ours):.2f}")
     rows = recovered(sequence, base, options.opd, options.trials)

@@ -93,9 +93,9 @@ def against_poppy(npix: int) -> list[str]:
     lines = []
     for propagation in ("fft", "compact"):
         image = image_of(from_poppy(system, 4.5e-6, propagation=propagation))
-        found = float(np.linalg.norm(image - truth) / np.linalg.norm(truth))
-        what = f"image, relative L2, path {propagation!r}"
-        lines.append(line("poppy, plain FFT, oversample 4", what, 1e-12, found))
+        error = float(np.linalg.norm(image - truth) / np.linalg.norm(truth))
+        quantity = f"image, relative L2, path {propagation!r}"
+        lines.append(line("poppy, plain FFT, oversample 4", quantity, 1e-12, error))
     return lines
 
 
@@ -107,14 +107,14 @@ def against_stpsf(folder: Path, npix: int, oversample: int) -> list[str]:
         call = {**parity.CALL, "fft_oversample": oversample, "detector_oversample": 1, **changes}
         instrument = parity.nircam(folder, npix, **options)
         truth = instrument.calc_psf(**call)
-        found = largest(image_of(from_webbpsf(instrument, **call)), truth["DET_SAMP"].data)
+        error = largest(image_of(from_webbpsf(instrument, **call)), truth["DET_SAMP"].data)
         most = "reported" if limit is None else f"{limit:g}"
         whose = f"stpsf, fft_oversample {call['fft_oversample']}"
-        lines.append(line(whose, f"image / peak, {words}", most, found))
+        lines.append(line(whose, f"image / peak, {words}", most, error))
         if case in ("ND squares", "pupil shift, rotation, offset"):
             distorted = image_of(from_webbpsf(instrument, add_distortion=True, **call))
-            found = largest(distorted, truth["DET_DIST"].data)
-            lines.append(line("stpsf, DET_DIST", f"image / peak, {words}", "1e-05", found))
+            error = largest(distorted, truth["DET_DIST"].data)
+            lines.append(line("stpsf, DET_DIST", f"image / peak, {words}", "1e-05", error))
     return lines
 
 
@@ -123,9 +123,9 @@ def oversampled_chain(folder: Path, npix: int) -> str:
     instrument = parity.nircam(folder, npix)
     call = {"monochromatic": 4.5e-6, "fov_pixels": 80, "oversample": 4}
     image = image_of(from_webbpsf(instrument, add_distortion=True, **call))
-    found = largest(image, instrument.calc_psf(**call)["DET_DIST"].data)
-    what = "image / peak, calc_psf's defaults (oversample 4)"
-    return line("stpsf, DET_DIST", what, "1e-05", found)
+    error = largest(image, instrument.calc_psf(**call)["DET_DIST"].data)
+    quantity = "image / peak, calc_psf's defaults (oversample 4)"
+    return line("stpsf, DET_DIST", quantity, "1e-05", error)
 
 
 def precision(folder: Path, npix: int) -> list[str]:
@@ -154,9 +154,9 @@ def wavefront_sensing(folder: Path, npix: int) -> str:
     instrument = parity.nircam(folder, npix)
     instrument.load_wss_opd(str(path), verbose=False)
     loaded = load_wss_opd(path, npix=npix)
-    found = float(np.abs(loaded.data - instrument.pupilopd[0].data).max())
+    error = float(np.abs(loaded.data - instrument.pupilopd[0].data).max())
     instrument.pupilopd.close()
-    return line("stpsf, load_wss_opd", "OPD, m", "1e-12", found)
+    return line("stpsf, load_wss_opd", "OPD, m", "1e-12", error)
 
 
 def on_official_files(folder: Path) -> list[str]:
@@ -225,12 +225,12 @@ def speed(folder: Path, npix: int, oversample: int) -> list[str]:
             image, ours = run(model)
             torch.set_num_threads(1)
             with torch.no_grad():
-                alone = processor_time(model, 7)
+                single = processor_time(model, 7)
             torch.set_num_threads(os.cpu_count() or 1)
             squares_word = "on" if squares else "off"
             lines.append(
                 line(squares_word, str(sampling), largest(image, truth), wall, ours)[:-1]
-                + line(f"{wall / ours:.0f}", busy, alone, f"{busy / alone:.0f}")
+                + line(f"{wall / ours:.0f}", busy, single, f"{busy / single:.0f}")
             )
     return lines
 

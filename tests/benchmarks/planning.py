@@ -70,19 +70,21 @@ def row(case: Case, seed: int) -> str:
     measured = random_opd(seed).data
     opd = measured + random_drift(seed + 1000, 40.0).data
     observation = simulate(model, scene, opd, seed=seed)
-    true = star_photons(model, replace(scene, planets=()), opd)
-    noise = np.sqrt(true + scene.background + scene.read_noise**2)
+    star = star_photons(model, replace(scene, planets=()), opd)
+    noise = np.sqrt(star + scene.background + scene.read_noise**2)
 
-    given, slow = timed(lambda: dr.refine(model, observation, measured, plan="off"))
+    full, slow = timed(lambda: dr.refine(model, observation, measured, plan="off"))
     planned, fast = timed(lambda: dr.refine(model, observation, measured))
     assert planned.plan is not None
-    _, again = timed(lambda: dr.refine(model, observation, measured, plan=planned.plan))
-    frames = [fit.frames[0] for fit in (given, planned)]
+    _, reused = timed(lambda: dr.refine(model, observation, measured, plan=planned.plan))
+    frames = [fit.frames[0] for fit in (full, planned)]
     stars = [frame.star - float(frame.values["background"][0]) for frame in frames]
-    errors = [float(np.sqrt(np.mean(((image - true) / noise) ** 2))) for image in stars]
-    apart = float(np.sqrt(np.mean(((stars[1] - stars[0]) / noise) ** 2)))
-    found = [dr.measure(fit, [planet.offset])[0] for fit in (given, planned)]
-    moved = (found[1]["contrast"] - found[0]["contrast"]) / found[0]["contrast_error"]
+    errors = [float(np.sqrt(np.mean(((image - star) / noise) ** 2))) for image in stars]
+    difference = float(np.sqrt(np.mean(((stars[1] - stars[0]) / noise) ** 2)))
+    measured_planets = [dr.measure(fit, [planet.offset])[0] for fit in (full, planned)]
+    moved = (measured_planets[1]["contrast"] - measured_planets[0]["contrast"]) / measured_planets[
+        0
+    ]["contrast_error"]
     choice = planned.plan.choice
     grid = f"{choice.npix}{' for differences' if choice.multifidelity else ''}"
     cells = (
@@ -90,13 +92,13 @@ def row(case: Case, seed: int) -> str:
         f"{choice.cycles:g} cycles, {grid}, {choice.wavelengths} wavelengths",
         f"{slow:.1f}",
         f"{fast:.1f} ({slow / fast:.1f})",
-        f"{again:.1f} ({slow / again:.1f})",
+        f"{reused:.1f} ({slow / reused:.1f})",
         f"{errors[0]:.3f}",
         f"{errors[1]:.3f}",
-        f"{apart:.3f}",
+        f"{difference:.3f}",
         f"{moved:+.2f}",
-        f"{found[0]['snr']:.2f}",
-        f"{found[1]['snr']:.2f}",
+        f"{measured_planets[0]['snr']:.2f}",
+        f"{measured_planets[1]['snr']:.2f}",
     )
     return "| " + " | ".join(cells) + " |"
 

@@ -70,15 +70,15 @@ def main() -> None:
     for name, (model_changes, fit_changes) in VARIANTS.items():
         model = model_for(observation, **model_changes)
         settings = GaussNewton.nircam(**fit_changes)
-        for seen in (0, 1) if name == "as published here" else (0,):
-            fit = refine(model, one_frame(observation, seen), opd, settings=settings, plan="off")
+        for fitted in (0, 1) if name == "as published here" else (0,):
+            fit = refine(model, one_frame(observation, fitted), opd, settings=settings, plan="off")
             keep = away_from_companions(fit)
             frames = observation.data - fit.frames[0].companion_image
             shares = [
                 100 * residual_share(frame, fit.frames[0].star, keep)
-                for frame in (frames[seen], frames[1 - seen], frames.mean(axis=0))
+                for frame in (frames[fitted], frames[1 - fitted], frames.mean(axis=0))
             ]
-            rows.append((name, seen, *shares, fit.chi2_per_pixel, fit.status.name, fit.seconds))
+            rows.append((name, fitted, *shares, fit.chi2_per_pixel, fit.status.name, fit.seconds))
             print(rows[-1], flush=True)  # As they come: a fit takes a minute or more.
     table = Table(
         rows=rows,

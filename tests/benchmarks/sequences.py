@@ -47,21 +47,21 @@ def main() -> None:
     parser.add_argument("--filter", default="F444W")
     options = parser.parse_args()
     sequence = dr.Sequence.from_files(options.frames, target=options.target, filter=options.filter)
-    chosen = [each for each in sequence.references if each.target in options.references]
-    sequence = replace(sequence, references=tuple(chosen))
+    references = [each for each in sequence.references if each.target in options.references]
+    sequence = replace(sequence, references=tuple(references))
     began = time.perf_counter()
-    result = dr.reduce(sequence, options.opd, systematics="references" if chosen else "auto")
+    result = dr.reduce(sequence, options.opd, systematics="references" if references else "auto")
     seconds = time.perf_counter() - began
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(f"{result}\n{seconds:.0f} s, {memory:.1f} GB")
-    found = result.detection
-    away = np.hypot(found.grid[..., 0], found.grid[..., 1]) > INNER
-    print(f"S/N beyond {INNER} arcsec: deviation {np.nanstd(found.residual_snr[away]):.3f}")
-    print(f"errors scaled by {found.scatter:.3g}, model error {result.fit.model_error:.3g}")
+    detection = result.detection
+    distant = np.hypot(detection.grid[..., 0], detection.grid[..., 1]) > INNER
+    print(f"S/N beyond {INNER} arcsec: deviation {np.nanstd(detection.residual_snr[distant]):.3f}")
+    print(f"errors scaled by {detection.scatter:.3g}, model error {result.fit.model_error:.3g}")
     for name, fits in (("references", result.references), ("target", (result.fit,))):
         for fit in fits:
             print(name, fit, [np.round(ring_chi2(frame), 2).tolist() for frame in fit.frames])
-    found.contrast_curve["separation", "contrast", "known_star"].pprint_all()
+    detection.contrast_curve["separation", "contrast", "known_star"].pprint_all()
 
 
 if __name__ == "__main__":

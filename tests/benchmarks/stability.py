@@ -92,10 +92,10 @@ def fits_table() -> list[str]:
     for row in fits.FITS:
         fit, error = row.run(torch.float64)
         single, _ = row.run(torch.float32)
-        apart = abs((single.frames[0].star - fit.frames[0].star) / fits.noise()).max()
+        difference = abs((single.frames[0].star - fit.frames[0].star) / fits.noise()).max()
         lines.append(
             f"| {row.case} | {row.trouble} | {fit.status.name} | {fit.chi2_per_pixel:.3g} | "
-            f"{error:.2g} | {apart:.1e} | {row.sees} |"
+            f"{error:.2g} | {difference:.1e} | {row.sees} |"
         )
     return lines
 

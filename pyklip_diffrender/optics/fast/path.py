@@ -17,9 +17,9 @@ from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.differentiation import (
     Position,
+    cached,
     has_memory,
     is_plain,
-    kept,
     position_of,
 )
 from pyklip_diffrender.optics.fast.occulter import DEFAULT_SAMPLING, OcculterLattice, finest_spacing
@@ -114,7 +114,7 @@ class LatticeRoute:
 
         A shift of the detector is included as a tilt, so that nothing else depends on it.
         """
-        return kept(
+        return cached(
             self._stops,
             wavelength,
             position_of(values, self._moving),
@@ -142,7 +142,7 @@ class LatticeRoute:
         return replace(stop, field=stop.field * factors[0][None, :] * factors[1][:, None])
 
     def _kernel(self, stop: Wavefront, values: Values) -> Tensor:
-        return kept(
+        return cached(
             self._kernels,
             stop.wavelength,
             position_of(values, self._moving),
@@ -200,7 +200,7 @@ class LatticeRoute:
         if varied and (opd.is_complex() or opd.shape[-1] < _LARGE):
             return None
         with torch.no_grad():
-            star = kept(
+            star = cached(
                 self._stars,
                 wavelength,
                 position_of(values, self._moving),
@@ -209,11 +209,11 @@ class LatticeRoute:
             if not varied:
                 return star.field(star.products(opd, offset))
 
-        def again(opd: Tensor, offset: Tensor | None) -> Tensor:
+        def recompute(opd: Tensor, offset: Tensor | None) -> Tensor:
             moved = dict(values) if offset is None else {**values, "star_offset": offset}
             return self.field(entrance.field(opd, wavelength, offset), moved, onto)
 
-        field: Tensor = _ReverseMode.apply(opd, offset, star, again)
+        field: Tensor = _ReverseMode.apply(opd, offset, star, recompute)
         return field
 
     def _streamed(
@@ -297,7 +297,7 @@ class _ReverseMode(torch.autograd.Function):
         opd: Tensor,
         offset: Tensor | None,
         star: _StreamedStar,
-        again: Callable[[Tensor, Tensor | None], Tensor],
+        recompute: Callable[[Tensor, Tensor | None], Tensor],
     ) -> Tensor:
         products = star.products(opd, offset)
         with torch.enable_grad():
@@ -305,22 +305,24 @@ class _ReverseMode(torch.autograd.Function):
             products = [product.requires_grad_() for product in products]
             field = star.field(products)
         ctx.save_for_backward(opd, offset)
-        ctx.star, ctx.again, ctx.kept = star, again, (products, field)
+        ctx.star, ctx.recompute, ctx.products = star, recompute, (products, field)
         return field.detach()
 
     @staticmethod
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         opd, offset = ctx.saved_tensors
         if not torch.is_grad_enabled():
-            products, field = ctx.kept
+            products, field = ctx.products
             along_x = torch.autograd.grad(field, products, slope, retain_graph=True)
             by_opd, by_offset = ctx.star.slopes(opd, offset, along_x)
             return by_opd.to(opd.dtype), by_offset, None, None
-        # For second derivatives, use operations that autograd knows.
-        both = opd, offset
-        wanted = [t for t in both if t is not None and t.requires_grad]
+        # Second derivatives need the differentiable operations.
+        inputs = opd, offset
+        differentiated = [t for t in inputs if t is not None and t.requires_grad]
         by_each = iter(
-            torch.autograd.grad(ctx.again(opd, offset), wanted, slope, create_graph=True)
+            torch.autograd.grad(
+                ctx.recompute(opd, offset), differentiated, slope, create_graph=True
+            )
         )
-        slopes = [next(by_each) if t is not None and t.requires_grad else None for t in both]
+        slopes = [next(by_each) if t is not None and t.requires_grad else None for t in inputs]
         return slopes[0], slopes[1], None, None

@@ -169,10 +169,10 @@ class PointSources:
         shape = (len(rows), *self.model.detector.shape)
         images = torch.empty(shape, dtype=torch.float32, device=self.model.device)
         with torch.no_grad():
-            near = self._near(self.positions(rows, columns))
+            needs_double = self._needs_double(self.positions(rows, columns))
             for double in (False, True):
-                chosen = torch.nonzero(near == double).flatten()
-                for part in chosen.split(self._batch(double)) if len(chosen) else ():
+                selected = torch.nonzero(needs_double == double).flatten()
+                for part in selected.split(self._batch(double)) if len(selected) else ():
                     images[part] = self._batch_of_images(rows[part], columns[part], double)
         return images
 
@@ -189,7 +189,7 @@ class PointSources:
             raise ShapeError(f"got {len(pair[0])} rows and {len(pair[1])} columns")
         return pair[0], pair[1]
 
-    def _near(self, positions: Tensor) -> Tensor:
+    def _needs_double(self, positions: Tensor) -> Tensor:
         """Whether positions need double precision, (k,)."""
         radius = self._radius if self.model.dtype == torch.float64 else 0.0
         return positions.norm(dim=-1) < _NEAR * radius
@@ -274,14 +274,16 @@ class _Wave:
         """Size of the largest array that a source needs."""
         if occulter is not None:
             lattice = OcculterLattice(occulter, detector, stop.wavelength, sampling)
-            both = (lattice.x, lattice.y)
-            self._per_pixel = [k * axis.cells // axis.phases for axis in both]
+            lattice_axes = (lattice.x, lattice.y)
+            self._per_pixel = [k * axis.cells // axis.phases for axis in lattice_axes]
             last = [float(axis[-k:].mean()) for axis in axes]
             # Cells minus sources.
             differences = [
                 torch.arange(2 * axis.half + 1 + (n - 1) * q, dtype=torch.float64) * axis.spacing
                 - (axis.half * axis.spacing + pixel)
-                for axis, n, q, pixel in zip(both, counts, self._per_pixel, last, strict=True)
+                for axis, n, q, pixel in zip(
+                    lattice_axes, counts, self._per_pixel, last, strict=True
+                )
             ]
             focus = self._transform(front.field, front, differences, detector.shear)
             kernel = lattice.kernel(stop, axes)

@@ -1,8 +1,8 @@
-"""Error beside time, always in one run, for this package and for others.
+"""Measure durations and errors of this package and of others in the same run.
 
-A row is something to be done (one image, one image with its derivative, a refinement ...); its
-cases are ways of doing it. All cases of a row are timed in turns, in one process, warm, and the
-shortest duration counts; the answer that is timed is also the one whose error is taken.
+A row is a task (one image, one image with its derivative, a refinement ...); its cases are ways of
+performing it. All cases of a row are timed in turns, in one process after a warm-up, and the
+shortest duration counts. Errors are those of the timed results.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from astropy.table import Table
 
 from pyklip_diffrender.io.files import replacing
 from tests.benchmarks.provenance import processor
-from tests.benchmarks.speed.case import Case, Found
+from tests.benchmarks.speed.case import Accuracy, Case
 from tests.benchmarks.speed.memory import peak_memory
 from tests.benchmarks.speed.page import write_page
-from tests.benchmarks.speed.rows import ROWS, Row, chosen_rows
+from tests.benchmarks.speed.rows import ROWS, Row, select_rows
 from tests.benchmarks.speed.scaling import SCALING, limits
 from tests.benchmarks.speed.setting import Setting
 from tests.benchmarks.speed.timing import exponent, interleaved
@@ -36,7 +36,7 @@ __all__ = ["ROWS", "Setting", "run_bench", "write_page", "write_table"]
 _log = logging.getLogger(__name__)
 
 _ONCE = 3
-"""What takes longer than so many budgets is not called again: its first call counts."""
+"""Cases that take longer than this many budgets are called only once."""
 
 _COLUMNS = {
     "row": str,
@@ -56,14 +56,14 @@ _COLUMNS = {
 
 
 def run_bench(
-    here: Setting,
+    setting: Setting,
     rows: Sequence[str] | None = None,
     *,
     budget: float = 2.0,
     memory: bool = True,
     command: str = "",
 ) -> Table:
-    """Measure.
+    """Run the benchmark.
 
     Parameters
     ----------
@@ -71,36 +71,36 @@ def run_bench(
     rows : sequence of str, optional
         Beginnings of names of `ROWS`; default all.
     budget : float
-        Seconds for the repetitions of each case. What takes more than three times as long is
-        called once.
+        Seconds for the repetitions of each case. Cases that take more than three times as long
+        are called once.
     memory : bool
-        Also the memory of those cases for which it is asked, in processes of their own.
+        Also measure the memory of the cases that request it, in separate processes.
     command : str
         For the provenance.
 
     Returns
     -------
     Table
-        One row a case: seconds (for the whole: where `times` is not 1, of a piece times that
-        number), how many times faster than the row's reference (`ratio`), `error` (see `ROWS`),
-        `sigma` (rms in units of the paper scene's noise), `memory` (bytes), `size` (for scaling).
-        What could not be measured has a NaN and a note. In `meta`: provenance, the reference of
-        every row, exponents, and the machine's limits.
+        One row for each case: seconds (of the timed piece times `times`), the duration of the
+        row's reference over that of the case (`ratio`), `error` (see `ROWS`), `sigma` (rms in
+        units of the paper scene's noise), `memory` (bytes), `size` (for scaling). Cases that could
+        not be measured have NaN and a note. In `meta`: provenance, the reference of every row,
+        exponents, and the machine's limits.
 
     Raises
     ------
     IncompatibleSetupError
-        For a row that there is not.
+        For an unknown row.
     """
-    chosen = chosen_rows(list(rows or []))
+    selected = select_rows(list(rows or []))
     began = time.perf_counter()
     lines: list[dict[str, Any]] = []
     references: dict[str, str] = {}
-    for row in chosen:
-        found = _measured(row, here, budget, memory)
+    for row in selected:
+        lines_of_row = _measured(row, setting, budget, memory)
         if row.name != SCALING:
-            references[row.name] = _with_ratios(found)
-        lines += found
+            references[row.name] = _with_ratios(lines_of_row)
+        lines += lines_of_row
     table = Table(
         rows=[[line[name] for name in _COLUMNS] for line in lines],
         names=list(_COLUMNS),
@@ -114,24 +114,24 @@ def run_bench(
         "date": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}",
         "machine": f"{os.cpu_count()} cores of {processor()}",
         "threads": torch.get_num_threads(),
-        "device": _device(here.device),
+        "device": _device(setting.device),
         "versions": _versions(),
-        "pupil": here.npix,
-        "field": here.fov,
-        "quick": here.quick,
-        "errors": {row.name: row.error for row in chosen},
+        "pupil": setting.npix,
+        "field": setting.fov,
+        "quick": setting.quick,
+        "errors": {row.name: row.error for row in selected},
         "references": references,
         "exponents": _exponents(table),
-        "limits": limits(here) if any(row.name == SCALING for row in chosen) else [],
+        "limits": limits(setting) if any(row.name == SCALING for row in selected) else [],
     }
     table.meta["seconds"] = round(time.perf_counter() - began)
     return table
 
 
-def _measured(row: Row, here: Setting, budget: float, memory: bool) -> list[dict[str, Any]]:
+def _measured(row: Row, setting: Setting, budget: float, memory: bool) -> list[dict[str, Any]]:
     lines, works, timed, repeated = [], [], [], []
-    for case in row.cases(here):
-        line = _blank(case, here)
+    for case in row.cases(setting):
+        line = _blank(case, setting)
         lines.append(line)
         if case.make is None:
             continue
@@ -140,15 +140,15 @@ def _measured(row: Row, here: Setting, budget: float, memory: bool) -> list[dict
         start = time.perf_counter()
         answer = work()
         first = time.perf_counter() - start
-        found: Found = case.judge(answer)
+        accuracy: Accuracy = case.judge(answer)
         del answer
-        line.update(error=found.error, sigma=found.sigma)
+        line.update(error=accuracy.error, sigma=accuracy.sigma)
         line["seconds"] = first * case.times
         timed.append((case, line))
         if first < _ONCE * budget:
             works.append(work)
             repeated.append((case, line))
-    durations = interleaved(works, budget, here.device)
+    durations = interleaved(works, budget, setting.device)
     del works
     for (case, line), duration in zip(repeated, durations, strict=True):
         line["seconds"] = duration * case.times
@@ -156,20 +156,20 @@ def _measured(row: Row, here: Setting, budget: float, memory: bool) -> list[dict
         for case, line in timed:
             if case.memory:
                 _log.info("memory of %s", case.key)
-                line["memory"] = peak_memory(case, here)
+                line["memory"] = peak_memory(case, setting)
     for case, line in timed:
         line["_reference"] = case.reference
     return lines
 
 
-def _blank(case: Case, here: Setting) -> dict[str, Any]:
+def _blank(case: Case, setting: Setting) -> dict[str, Any]:
     line: dict[str, Any] = dict.fromkeys(_COLUMNS, math.nan)
     line.update(
         row=case.row,
         column=case.column,
         precision=case.precision,
         mode=case.mode,
-        device=here.device,
+        device=setting.device,
         times=case.times,
         size=case.size,
         note=case.note,
@@ -178,22 +178,22 @@ def _blank(case: Case, here: Setting) -> dict[str, Any]:
 
 
 def _with_ratios(lines: list[dict[str, Any]]) -> str:
-    """Put in how many times faster than the reference each is; the reference's name."""
-    found = [line for line in lines if line.get("_reference")]
-    if not found:
+    """Add the ratios to the duration of the reference; return the name of the reference."""
+    references = [line for line in lines if line.get("_reference")]
+    if not references:
         return ""
     for line in lines:
-        line["ratio"] = found[-1]["seconds"] / line["seconds"]
-    return str(found[-1]["column"])
+        line["ratio"] = references[-1]["seconds"] / line["seconds"]
+    return str(references[-1]["column"])
 
 
 def _exponents(table: Table) -> dict[str, float]:
-    found = {}
+    exponents = {}
     for name in dict.fromkeys(table["row"]):
-        here = table[(table["row"] == name)]
-        if str(name).startswith(SCALING) and len(here) > 1:
-            found[str(name)] = round(exponent(here["size"], here["seconds"]), 2)
-    return found
+        lines = table[(table["row"] == name)]
+        if str(name).startswith(SCALING) and len(lines) > 1:
+            exponents[str(name)] = round(exponent(lines["size"], lines["seconds"]), 2)
+    return exponents
 
 
 def _device(name: str) -> str:

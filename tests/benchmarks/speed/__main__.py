@@ -29,23 +29,29 @@ COMMAND = "python -m tests.benchmarks.speed"
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    made = argparse.ArgumentParser(prog=COMMAND, description=__doc__.splitlines()[0])
-    made.add_argument("-v", "--verbose", action="store_true", help="show progress messages")
-    made.add_argument(
+    command_line = argparse.ArgumentParser(prog=COMMAND, description=__doc__.splitlines()[0])
+    command_line.add_argument("-v", "--verbose", action="store_true", help="show progress messages")
+    command_line.add_argument(
         "-o", "--output", type=Path, default=Path("speed"), help="folder to write into"
     )
-    made.add_argument(
+    command_line.add_argument(
         "--rows", nargs="+", metavar="ROW", help="measure only rows whose names begin like this"
     )
-    made.add_argument("--quick", action="store_true", help="small arrays and short repetitions")
-    made.add_argument("--device", default="cpu", help="torch device of this package, such as cuda")
-    made.add_argument("--stpsf-path", default="", help="data directory of stpsf (or STPSF_PATH)")
-    made.add_argument("--no-memory", action="store_true", help="skip memory measurement")
-    made.add_argument(
+    command_line.add_argument(
+        "--quick", action="store_true", help="small arrays and short repetitions"
+    )
+    command_line.add_argument(
+        "--device", default="cpu", help="torch device of this package, such as cuda"
+    )
+    command_line.add_argument(
+        "--stpsf-path", default="", help="data directory of stpsf (or STPSF_PATH)"
+    )
+    command_line.add_argument("--no-memory", action="store_true", help="skip memory measurement")
+    command_line.add_argument(
         "--page", type=Path, metavar="TABLE",
         help="measure nothing; write performance.md from this table into the output folder",
     )  # fmt: skip
-    return made
+    return command_line
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -69,13 +75,13 @@ def _run(options: argparse.Namespace) -> None:
     if options.page:
         print(f"wrote {write_page(options.page, options.output)}")
         return
-    shown = ["--quick"] * options.quick + (["--rows", *options.rows] if options.rows else [])
+    flags = ["--quick"] * options.quick + (["--rows", *options.rows] if options.rows else [])
     table = run_bench(
         Setting(options.quick, options.device, options.stpsf_path),
         options.rows,
         budget=0.1 if options.quick else 2.0,
         memory=not options.no_memory,
-        command=" ".join([COMMAND, shlex.join(shown)]).strip(),
+        command=" ".join([COMMAND, shlex.join(flags)]).strip(),
     )
     table["row", "column", "precision", "seconds", "ratio", "error", "sigma"].pprint_all()
     figure = options.output / "performance.png"

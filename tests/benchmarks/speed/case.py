@@ -1,4 +1,4 @@
-"""What is measured: a case is one way of doing what its row asks for."""
+"""Cases of the benchmark: each is one way of performing the task of its row."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["Case", "Found", "missing"]
+__all__ = ["Accuracy", "Case", "missing"]
 
 
 @dataclass(frozen=True)
-class Found:
-    """How good an answer is.
+class Accuracy:
+    """Errors of a result.
 
     Attributes
     ----------
@@ -28,16 +28,16 @@ class Found:
 
 @dataclass(frozen=True)
 class Case:
-    """One way of doing what a row asks for.
+    """One way of performing the task of a row.
 
     Attributes
     ----------
     row, column : str
-        What is done, and by whom and how finely.
+        The task, and the software and settings that perform it.
     make : callable or None
-        Everything that is done once; returns the function that is timed. None if it cannot be.
+        Performs the set-up; returns the function that is timed. None if the case cannot be run.
     judge : callable
-        From an answer of that function to its errors.
+        Maps a result of that function to its errors.
     precision : str
         "float64" or "float32".
     mode : str
@@ -45,19 +45,19 @@ class Case:
     reference : bool
         Whether the row's ratios are with respect to this case.
     times : float
-        How often the timed piece is needed for the whole: above 1, the rest is extrapolated.
+        Number of times that the timed piece is needed; the total is extrapolated.
     memory : bool
         Measure the memory as well.
     note : str
-        What a reader must know.
+        Remark for the reader.
     size : float
-        For the rows of scaling: what the duration is a function of.
+        For the rows of scaling: the independent variable.
     """
 
     row: str
     column: str
     make: Callable[[], Callable[[], Any]] | None
-    judge: Callable[[Any], Found] = field(default=lambda answer: Found())
+    judge: Callable[[Any], Accuracy] = field(default=lambda answer: Accuracy())
     precision: str = "float64"
     mode: str = "eager"
     reference: bool = False
@@ -68,10 +68,10 @@ class Case:
 
     @property
     def key(self) -> str:
-        """Names the case among all."""
+        """Unique name of the case."""
         return f"{self.row} | {self.column} | {self.precision} | {self.mode}"
 
 
 def missing(row: str, column: str, why: str) -> Case:
-    """A case that cannot be measured here, so that a reader sees that it was meant to be."""
+    """Make a case that is listed although it cannot be measured on this machine."""
     return Case(row, column, None, note=f"not measured: {why}")

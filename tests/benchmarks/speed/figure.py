@@ -29,10 +29,10 @@ def draw(table: Table) -> Figure:
     labelled = []
     for ax, row in zip(figure.subplots(1, 2), ("forward", "forward + backward"), strict=True):
         measured = np.isfinite(table["seconds"]) & (table["error"] > 0)
-        chosen = table[(table["row"] == row) & measured]
-        chosen.sort("seconds")
+        selected = table[(table["row"] == row) & measured]
+        selected.sort("seconds")
         names: dict[str, tuple[float, float]] = {}
-        for line in chosen:
+        for line in selected:
             ours = str(line["column"]).startswith(("this package", "multi-fidelity", "coarse"))
             color = _OURS if ours else _OTHERS
             filled = color if line["precision"] == "float64" else "none"
@@ -41,9 +41,9 @@ def draw(table: Table) -> Figure:
                 name = str(line["column"])
                 names[name if ours else name.split(",")[0]] = (line["seconds"], line["error"])
         # Nothing is both faster and better than these.
-        order = np.argsort(chosen["seconds"])
-        best = np.minimum.accumulate(np.asarray(chosen["error"])[order])
-        front = np.asarray(chosen["seconds"])[order]
+        order = np.argsort(selected["seconds"])
+        best = np.minimum.accumulate(np.asarray(selected["error"])[order])
+        front = np.asarray(selected["seconds"])[order]
         ax.step(front, best, where="post", color="0.75", lw=1, zorder=0)
         ax.margins(0.15)
         ax.set_xlabel("seconds", fontsize=9)
@@ -63,7 +63,7 @@ def draw(table: Table) -> Figure:
 
 def _label_apart(ax: Axes, names: Mapping[str, tuple[float, float]]) -> None:
     """Names beside their points, where they neither cover each other nor leave the axes."""
-    taken: list[Any] = []
+    used: list[Any] = []
     for name, point in names.items():
         for up, right in product((5, -9, 17, -21, 29, -33), (True, False)):
             label = ax.annotate(
@@ -72,10 +72,10 @@ def _label_apart(ax: Axes, names: Mapping[str, tuple[float, float]]) -> None:
             )  # fmt: skip
             box = label.get_window_extent()
             inside = ax.bbox.x0 < box.x0 and box.x1 < ax.bbox.x1
-            if inside and not any(box.overlaps(other) for other in taken):
+            if inside and not any(box.overlaps(other) for other in used):
                 break
             label.remove()
         else:
             label = ax.annotate(name, point, fontsize=7, color=_INK)
             box = label.get_window_extent()
-        taken.append(box)
+        used.append(box)

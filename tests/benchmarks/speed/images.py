@@ -17,7 +17,7 @@ from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import coarse_steps
-from tests.benchmarks.speed.case import Case, Found, missing
+from tests.benchmarks.speed.case import Accuracy, Case, missing
 from tests.benchmarks.speed.rivals import hcipy_image, load, paper_recipe, prysm_image
 from tests.benchmarks.speed.setting import CELLS, WAVELENGTH, Arrays, Setting
 
@@ -28,17 +28,21 @@ FORWARD, STEP = "forward", "forward + backward"
 _NAMES = {torch.float64: "float64", torch.float32: "float32"}
 
 
-def _models(here: Setting) -> Iterator[tuple[str, torch.dtype, Callable[[], OpticalSystem]]]:
+def _models(setting: Setting) -> Iterator[tuple[str, torch.dtype, Callable[[], OpticalSystem]]]:
     """This package at several fidelities: name, precision, how to make it."""
     for dtype in _NAMES:
-        yield f"this package, {here.npix}", dtype, partial(here.model.with_fidelity, dtype=dtype)
-    for npix in here.coarse[::-1]:
+        yield (
+            f"this package, {setting.npix}",
+            dtype,
+            partial(setting.model.with_fidelity, dtype=dtype),
+        )
+    for npix in setting.coarse[::-1]:
         for dtype in _NAMES:
-            mixed = partial(coarse_steps, here.model, here.measured, npix, dtype)
+            mixed = partial(coarse_steps, setting.model, setting.measured, npix, dtype)
             yield f"multi-fidelity, {npix}", dtype, mixed
-    coarsest = here.coarse[-1]
-    alone = partial(here.model.with_fidelity, npix=coarsest)
-    yield f"coarse alone, {coarsest}", torch.float64, alone
+    coarsest = setting.coarse[-1]
+    coarse_model = partial(setting.model.with_fidelity, npix=coarsest)
+    yield f"coarse alone, {coarsest}", torch.float64, coarse_model
 
 
 def _of_fine(make: Callable[[], OpticalSystem]) -> Callable[[Tensor], Tensor]:
@@ -47,19 +51,21 @@ def _of_fine(make: Callable[[], OpticalSystem]) -> Callable[[Tensor], Tensor]:
     return lambda opd: model(downsample(opd, model.npix))
 
 
-def _without_derivatives(make: Callable[[], OpticalSystem], here: Setting) -> Callable[[], Tensor]:
+def _without_derivatives(
+    make: Callable[[], OpticalSystem], setting: Setting
+) -> Callable[[], Tensor]:
     image = _of_fine(make)
 
     def work() -> Tensor:
         with torch.no_grad():
-            return image(here.opd)
+            return image(setting.opd)
 
     return work
 
 
-def _captured(make: Callable[[], OpticalSystem], here: Setting) -> Callable[[], Tensor]:
+def _captured(make: Callable[[], OpticalSystem], setting: Setting) -> Callable[[], Tensor]:
     """The forward model as one CUDA graph: no time is lost to starting its many small kernels."""
-    work = _without_derivatives(make, here)
+    work = _without_derivatives(make, setting)
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
@@ -77,34 +83,36 @@ def _captured(make: Callable[[], OpticalSystem], here: Setting) -> Callable[[], 
     return replay
 
 
-def forward(here: Setting) -> list[Case]:
+def forward(setting: Setting) -> list[Case]:
     """One image of the star, monochromatic, by everyone."""
     cases = []
-    for name, dtype, make in _models(here):
+    for name, dtype, make in _models(setting):
         cases.append(
             Case(
                 FORWARD,
                 name,
-                partial(_without_derivatives, make, here),
-                here.judge,
+                partial(_without_derivatives, make, setting),
+                setting.judge,
                 precision=_NAMES[dtype],
                 memory=dtype == torch.float64,
             )
         )
-        if torch.device(here.device).type == "cuda" and "multi" in name:
+        if torch.device(setting.device).type == "cuda" and "multi" in name:
             cases.append(
                 Case(
                     FORWARD,
                     name,
-                    partial(_captured, make, here),
-                    here.judge,
+                    partial(_captured, make, setting),
+                    setting.judge,
                     precision=_NAMES[dtype],
                     mode="graph",
                 )
             )
-    if torch.device(here.device).type != "cuda":
+    if torch.device(setting.device).type != "cuda":
         cases.append(missing(FORWARD, "this package as a CUDA graph", "--device names no GPU"))
-    cases.append(Case(FORWARD, "the paper's recipe", lambda: _paper(here), here.judge, memory=True))
+    cases.append(
+        Case(FORWARD, "the paper's recipe", lambda: _paper(setting), setting.judge, memory=True)
+    )
     for name, rival in (("prysm", prysm_image), ("hcipy", hcipy_image)):
         try:
             load(name)
@@ -115,8 +123,8 @@ def forward(here: Setting) -> list[Case]:
             Case(
                 FORWARD,
                 f"{name}, {CELLS} cells per lambda/D",
-                partial(_on_arrays, rival, here),
-                lambda image: here.judge(_scaled(image, here)),
+                partial(_on_arrays, rival, setting),
+                lambda image: setting.judge(_scaled(image, setting)),
                 memory=True,
             )
         )
@@ -124,38 +132,38 @@ def forward(here: Setting) -> list[Case]:
         Case(
             FORWARD,
             "poppy, FFT, oversample 4",
-            lambda: _poppy(here),
-            here.judge,
+            lambda: _poppy(setting),
+            setting.judge,
             reference=True,
             memory=True,
         )
     )
-    return cases + _stpsf_cases(here)
+    return cases + _stpsf_cases(setting)
 
 
-def _paper(here: Setting) -> Callable[[], Tensor]:
-    image = paper_recipe(here.arrays, here.device)
+def _paper(setting: Setting) -> Callable[[], Tensor]:
+    image = paper_recipe(setting.arrays, setting.device)
 
     def work() -> Tensor:
         with torch.no_grad():
-            return image(here.opd)
+            return image(setting.opd)
 
     return work
 
 
-def _on_arrays(rival: Callable[[Arrays], Callable[[], Any]], here: Setting) -> Callable[[], Any]:
-    return rival(here.arrays)
+def _on_arrays(rival: Callable[[Arrays], Callable[[], Any]], setting: Setting) -> Callable[[], Any]:
+    return rival(setting.arrays)
 
 
-def _scaled(image: Any, here: Setting) -> Any:
+def _scaled(image: Any, setting: Setting) -> Any:
     """Codes differ in what they count light in: the factor that fits the truth best."""
-    return image * (float((image * here.truth).sum()) / float((image**2).sum()))
+    return image * (float((image * setting.truth).sum()) / float((image**2).sum()))
 
 
-def _poppy(here: Setting) -> Callable[[], Any]:
+def _poppy(setting: Setting) -> Callable[[], Any]:
     from tests.benchmarks.speed.plain import plain_poppy
 
-    arrays = here.arrays
+    arrays = setting.arrays
     return plain_poppy(
         arrays.amplitude,
         arrays.opd,
@@ -163,41 +171,41 @@ def _poppy(here: Setting) -> Callable[[], Any]:
         diameter=arrays.diameter,
         wavelength=WAVELENGTH,
         pixelscale=NIRCAM_LW_PIXELSCALE,
-        fov_pixels=here.fov,
+        fov_pixels=setting.fov,
         oversample=4,
     )
 
 
-def _stpsf_cases(here: Setting) -> list[Case]:
+def _stpsf_cases(setting: Setting) -> list[Case]:
     """calc_psf, and this package's model of the same instrument."""
     name = "stpsf calc_psf, fft_oversample 4"
     if find_spec("stpsf") is None:
         return [missing(FORWARD, name, "stpsf is not installed (extra 'webbpsf')")]
-    if here.data is None:
+    if setting.data is None:
         return [missing(FORWARD, name, "no data directory (--stpsf-path or STPSF_PATH)")]
-    os.environ["STPSF_PATH"] = str(here.data)
+    os.environ["STPSF_PATH"] = str(setting.data)
     from pyklip_diffrender.bridges import from_webbpsf
     from tests.benchmarks.speed.plain import plain_stpsf
 
     try:
-        instrument = plain_stpsf(here.data, 256 if here.quick else here.npix)
+        instrument = plain_stpsf(setting.data, 256 if setting.quick else setting.npix)
     except DiffrenderError as error:
         return [missing(FORWARD, name, str(error))]
     call: dict[str, Any] = {
         "monochromatic": WAVELENGTH,
-        "fov_pixels": here.fov,
+        "fov_pixels": setting.fov,
         "fft_oversample": 4,
         "detector_oversample": 1,
         "add_distortion": False,
     }
-    kept: list[Any] = []
+    reference: list[Any] = []
 
-    def judge(image: Any) -> Found:
-        if not kept:
+    def judge(image: Any) -> Accuracy:
+        if not reference:
             with torch.no_grad():
-                kept.append(from_webbpsf(instrument, occulter_sampling=16.0, **call)().numpy())
-        difference = np.asarray(image) - kept[0]
-        return Found(float(np.abs(difference).max() / kept[0].max()))
+                reference.append(from_webbpsf(instrument, occulter_sampling=16.0, **call)().numpy())
+        difference = np.asarray(image) - reference[0]
+        return Accuracy(float(np.abs(difference).max() / reference[0].max()))
 
     def converted() -> Callable[[], Tensor]:
         model = from_webbpsf(instrument, occulter_sampling=3.0, **call)
@@ -224,34 +232,34 @@ def _stpsf_cases(here: Setting) -> list[Case]:
     ]
 
 
-def step(here: Setting) -> list[Case]:
+def step(setting: Setting) -> list[Case]:
     """The loss of the paper and its derivative with respect to every sample of the fine OPD."""
-    data = torch.from_numpy(here.observation.data[0]).to(here.device)
-    photons = here.scene.star.photons
+    data = torch.from_numpy(setting.observation.data[0]).to(setting.device)
+    photons = setting.scene.star.photons
 
     def differentiated(
         make: Callable[[], Callable[[Tensor], Tensor]],
     ) -> Callable[[], tuple[Tensor, Tensor]]:
         image = make()
-        opd = here.opd.clone().requires_grad_()
+        opd = setting.opd.clone().requires_grad_()
 
         def work() -> tuple[Tensor, Tensor]:
-            found = image(opd)
-            loss = (photons * found - data).abs().mean()
+            result = image(opd)
+            loss = (photons * result - data).abs().mean()
             (slope,) = torch.autograd.grad(loss, opd)
-            return found, slope
+            return result, slope
 
         return work
 
     cases = []
-    for name, dtype, make in _models(here):
+    for name, dtype, make in _models(setting):
         if "alone" not in name:
             cases.append(
                 Case(
                     STEP,
                     name,
                     partial(differentiated, partial(_of_fine, make)),
-                    lambda answer: here.judge(answer[0]),
+                    lambda answer: setting.judge(answer[0]),
                     precision=_NAMES[dtype],
                     memory=dtype == torch.float64,
                 )
@@ -260,8 +268,8 @@ def step(here: Setting) -> list[Case]:
         Case(
             STEP,
             "the paper's recipe",
-            lambda: differentiated(lambda: paper_recipe(here.arrays, here.device)),
-            lambda answer: here.judge(answer[0]),
+            lambda: differentiated(lambda: paper_recipe(setting.arrays, setting.device)),
+            lambda answer: setting.judge(answer[0]),
             reference=True,
             memory=True,
         )

@@ -20,7 +20,7 @@ from pyklip_diffrender.refinement import GaussNewton, Refinement, refine
 from pyklip_diffrender.scene.objects import Planet, Scene
 from pyklip_diffrender.scene.simulation import planet_photons
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
-from tests.benchmarks.speed.case import Case, Found
+from tests.benchmarks.speed.case import Accuracy, Case
 from tests.benchmarks.speed.rivals import paper_recipe
 from tests.benchmarks.speed.setting import Setting
 
@@ -42,50 +42,50 @@ _ADAM_STEPS, _LEARNING_RATE = 1000, 1e-11
 _SEPARATIONS, _ANGLES = 20, 6
 
 
-def basis_of(here: Setting) -> Basis:
+def basis_of(setting: Setting) -> Basis:
     """The default modes, fewer if quick."""
-    return default_basis(6.0 if here.quick else 24.0)
+    return default_basis(6.0 if setting.quick else 24.0)
 
 
 # -- Jacobian --------------------------------------------------------------------------------------
 
 
-def jacobian(here: Setting) -> list[Case]:
+def jacobian(setting: Setting) -> list[Case]:
     """The derivative of the image with respect to all modes."""
-    basis = basis_of(here)
+    basis = basis_of(setting)
     sample = range(0, len(basis), max(1, len(basis) // 4))
     with torch.no_grad():
-        fields = here.model.fields(here.opd)
+        fields = setting.model.fields(setting.opd)
 
     def response(model: OpticalSystem, npix: int) -> Callable[[], WavefrontResponse]:
-        return partial(WavefrontResponse, model, basis, here.opd, {}, npix=npix)
+        return partial(WavefrontResponse, model, basis, setting.opd, {}, npix=npix)
 
     @lru_cache(maxsize=1)
     def exact() -> Tensor:
-        """Of some modes, by the fine model's forward-mode derivative."""
-        return torch.stack([_along(here.model, here.opd, basis, k) for k in sample])
+        """Derivatives by some modes, from forward mode through the fine model."""
+        return torch.stack([_along(setting.model, setting.opd, basis, k) for k in sample])
 
-    def judge(found: Tensor) -> Found:
+    def judge(rows: Tensor) -> Accuracy:
         truth = exact()
-        return Found(float((found.to(truth.dtype) - truth).norm() / truth.norm()))
+        return Accuracy(float((rows.to(truth.dtype) - truth).norm() / truth.norm()))
 
     cases = [
         Case(
             JACOBIAN,
             f"this package, {len(basis)} modes on {npix}",
-            partial(response, here.model, npix),
-            lambda found: judge(found.image(fields, {})[list(sample)]),
+            partial(response, setting.model, npix),
+            lambda derivative: judge(derivative.image(fields, {})[list(sample)]),
             precision="float32",
         )
-        for npix in here.coarse[:2]
+        for npix in setting.coarse[:2]
     ]
-    waves = 2 if here.quick else 10
-    broad = here.model.with_fidelity(monochromatic=None, nlambda=waves)
+    waves = 2 if setting.quick else 10
+    broad = setting.model.with_fidelity(monochromatic=None, nlambda=waves)
     cases.append(
         Case(
             JACOBIAN,
-            f"this package, {waves} wavelengths on {here.coarse[0]}",
-            lambda: response(broad, here.coarse[0]),
+            f"this package, {waves} wavelengths on {setting.coarse[0]}",
+            lambda: response(broad, setting.coarse[0]),
             precision="float32",
             note="error as for one wavelength",
         )
@@ -93,8 +93,8 @@ def jacobian(here: Setting) -> list[Case]:
     cases.append(
         Case(
             JACOBIAN,
-            f"mode by mode, forward mode on {here.npix}",
-            lambda: lambda: _along(here.model, here.opd, basis, 0)[None],
+            f"mode by mode, forward mode on {setting.npix}",
+            lambda: lambda: _along(setting.model, setting.opd, basis, 0)[None],
             lambda _: judge(exact()),
             times=len(basis),
             note="one mode timed",
@@ -102,8 +102,8 @@ def jacobian(here: Setting) -> list[Case]:
     )
 
     def differences() -> Callable[[], Tensor]:
-        image = paper_recipe(here.arrays, here.device)
-        changed = here.opd + NANOMETRE * _mode(here.model, basis, 0).to(here.device)
+        image = paper_recipe(setting.arrays, setting.device)
+        changed = setting.opd + NANOMETRE * _mode(setting.model, basis, 0).to(setting.device)
 
         def work() -> Tensor:
             with torch.no_grad():
@@ -111,15 +111,16 @@ def jacobian(here: Setting) -> list[Case]:
 
         return work
 
-    def judge_differences(_: Any) -> Found:
-        image = paper_recipe(here.arrays, here.device)
+    def judge_differences(_: Any) -> Accuracy:
+        image = paper_recipe(setting.arrays, setting.device)
         with torch.no_grad():
-            base = image(here.opd)
-            found = [
-                image(here.opd + NANOMETRE * _mode(here.model, basis, k).to(here.device)) - base
+            base = image(setting.opd)
+            differences_of_modes = [
+                image(setting.opd + NANOMETRE * _mode(setting.model, basis, k).to(setting.device))
+                - base
                 for k in sample
             ]
-        return judge(torch.stack(found))
+        return judge(torch.stack(differences_of_modes))
 
     cases.append(
         Case(
@@ -149,83 +150,83 @@ def _along(model: OpticalSystem, opd: Tensor, basis: Basis, k: int) -> Tensor:
 
 
 def _fit(
-    here: Setting, observation: Any = None, start: dict[str, float] | None = None, **changes: Any
+    setting: Setting, observation: Any = None, start: dict[str, float] | None = None, **changes: Any
 ) -> Refinement:
-    options: dict[str, Any] = {"basis": basis_of(here), **changes}
-    if here.quick:
+    options: dict[str, Any] = {"basis": basis_of(setting), **changes}
+    if setting.quick:
         options["max_iterations"] = 10
     return refine(
-        here.model,
-        observation or here.observation,
-        here.measured.cpu().numpy(),
+        setting.model,
+        observation or setting.observation,
+        setting.measured.cpu().numpy(),
         settings=GaussNewton(**options),
         start=start,
     )
 
 
-def refinement(here: Setting) -> list[Case]:
+def refinement(setting: Setting) -> list[Case]:
     """The wavefront of one frame that is 40 hours away from the map."""
-    data = torch.from_numpy(here.observation.data[0]).to(here.device)
-    photons = here.scene.star.photons
+    data = torch.from_numpy(setting.observation.data[0]).to(setting.device)
+    photons = setting.scene.star.photons
 
-    def judge(fit: Refinement) -> Found:
-        """What the star model misses, background included."""
-        sigma = (fit.frames[0].star - here.star) / here.noise
-        return Found(float(np.sqrt((sigma**2).mean())), float(np.sqrt((sigma**2).mean())))
+    def judge(fit: Refinement) -> Accuracy:
+        """Error of the star model, background included."""
+        sigma = (fit.frames[0].star - setting.star) / setting.noise
+        return Accuracy(float(np.sqrt((sigma**2).mean())), float(np.sqrt((sigma**2).mean())))
 
     def recipe(image: Callable[[Tensor], Tensor], start: Tensor) -> Callable[[], Tensor]:
         opd = start.clone().requires_grad_()
         optimiser = torch.optim.Adam([opd], lr=_LEARNING_RATE)
 
-        def one() -> Tensor:
+        def step() -> Tensor:
             optimiser.zero_grad()
             loss = (photons * image(opd) - data).abs().mean()
             loss.backward()
             optimiser.step()
             return opd
 
-        return one
+        return step
 
-    def judge_recipe(_: Any) -> Found:
+    def judge_recipe(_: Any) -> Accuracy:
         """All steps, at the pace of the multi-fidelity model, then the fine model's image."""
-        coarse = coarse_steps(here.model, here.measured, here.coarse[1])
-        small = downsample(here.measured, coarse.npix)
-        one = recipe(coarse, small)
-        for _step in range(20 if here.quick else _ADAM_STEPS):
-            opd = one()
-        factor = here.npix // coarse.npix
+        coarse = coarse_steps(setting.model, setting.measured, setting.coarse[1])
+        small = downsample(setting.measured, coarse.npix)
+        step = recipe(coarse, small)
+        for _step in range(20 if setting.quick else _ADAM_STEPS):
+            opd = step()
+        factor = setting.npix // coarse.npix
         change = (opd.detach() - small).repeat_interleave(factor, 0).repeat_interleave(factor, 1)
         with torch.no_grad():
-            image = here.model(here.measured + change)
-        return Found(here.judge(image).sigma, here.judge(image).sigma)
+            image = setting.model(setting.measured + change)
+        return Accuracy(setting.judge(image).sigma, setting.judge(image).sigma)
 
-    known = {"flux": photons, "background": 0.0}
-    lean = basis_of(here) if here.quick else default_basis(20.0)
+    start = {"flux": photons, "background": 0.0}
+    lean = basis_of(setting) if setting.quick else default_basis(20.0)
     return [
-        Case(REFINEMENT, "this package, as it comes", lambda: partial(_fit, here), judge),
+        Case(REFINEMENT, "this package, as it comes", lambda: partial(_fit, setting), judge),
         Case(
             REFINEMENT,
             "this package, the wavefront alone free",
-            lambda: partial(_fit, here, free=(), start=known),
+            lambda: partial(_fit, setting, free=(), start=start),
             judge,
             note="alignment and flux known, as in the paper's recipe",
         ),
         Case(
             REFINEMENT,
             "this package, the wavefront alone, 20 cycles",
-            lambda: partial(_fit, here, free=(), start=known, basis=lean, tolerance=0.1),
+            lambda: partial(_fit, setting, free=(), start=start, basis=lean, tolerance=0.1),
             judge,
             note="fewer modes, and a tolerance of 0.1",
         ),
         Case(
             REFINEMENT,
             f"the paper's recipe, {_ADAM_STEPS} Adam steps",
-            lambda: recipe(paper_recipe(here.arrays, here.device), here.measured),
+            lambda: recipe(paper_recipe(setting.arrays, setting.device), setting.measured),
             judge_recipe,
             reference=True,
             times=_ADAM_STEPS,
             note="one step timed, times the number of steps; the error after all steps, taken "
-            f"with the multi-fidelity model on {here.coarse[1]}",
+            f"with the multi-fidelity model on {setting.coarse[1]}",
         ),
     ]
 
@@ -234,30 +235,30 @@ def refinement(here: Setting) -> list[Case]:
 
 
 @lru_cache(maxsize=1)
-def _fitted(here: Setting) -> Refinement:
+def _fitted(setting: Setting) -> Refinement:
     """The fit that all of detection works on."""
-    return _fit(here)
+    return _fit(setting)
 
 
-def _ring(here: Setting) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _ring(setting: Setting) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Some positions, x and y in arcsec."""
-    radius = np.linspace(0.4, 0.6 if here.quick else 1.8, 3)
+    radius = np.linspace(0.4, 0.6 if setting.quick else 1.8, 3)
     angle = np.array([0.3, 2.4, 4.5])
     return np.stack([-radius * np.sin(angle), radius * np.cos(angle)], axis=1)
 
 
-def snr_map(here: Setting) -> list[Case]:
+def snr_map(setting: Setting) -> list[Case]:
     """S/N, contrast and its error for a source at every pixel."""
-    fit = partial(_fitted, here)
+    fit = partial(_fitted, setting)
 
-    def judge(found: Detection) -> Found:
+    def judge(detection: Detection) -> Accuracy:
         """S/N on the map against single sources through the fine model, at pixel centres."""
-        grid = found.grid.reshape(-1, 2)
-        near = [int(np.hypot(*(grid - place).T).argmin()) for place in _ring(here)]
-        exact = measure(found.fits, grid[near], scatter=found.scatter)["snr"]
-        return Found(float(np.abs(found.snr.reshape(-1)[near] - exact).max()))
+        grid = detection.grid.reshape(-1, 2)
+        nearest = [int(np.hypot(*(grid - place).T).argmin()) for place in _ring(setting)]
+        exact = measure(detection.fits, grid[nearest], scatter=detection.scatter)["snr"]
+        return Accuracy(float(np.abs(detection.snr.reshape(-1)[nearest] - exact).max()))
 
-    pixels = here.fov**2
+    pixels = setting.fov**2
     return [
         Case(
             MAP,
@@ -269,8 +270,8 @@ def snr_map(here: Setting) -> list[Case]:
         Case(
             MAP,
             "one call of the fine model a position",
-            lambda: (fit(), lambda: measure(fit(), _ring(here)[:2], relinearise=np.inf))[1],
-            lambda _: Found(0.0),
+            lambda: (fit(), lambda: measure(fit(), _ring(setting)[:2], relinearise=np.inf))[1],
+            lambda _: Accuracy(0.0),
             reference=True,
             times=pixels / 2,
             note="two positions timed",
@@ -278,10 +279,10 @@ def snr_map(here: Setting) -> list[Case]:
     ]
 
 
-def contrast(here: Setting) -> list[Case]:
+def contrast(setting: Setting) -> list[Case]:
     """5 sigma contrast at 20 separations and 6 angles."""
-    fit = partial(_fitted, here)
-    farthest = 0.65 if here.quick else 2.2
+    fit = partial(_fitted, setting)
+    farthest = 0.65 if setting.quick else 2.2
     separations = np.linspace(0.3, farthest, _SEPARATIONS)
     radius = 0.5 * (0.3 + farthest)
 
@@ -290,18 +291,18 @@ def contrast(here: Setting) -> list[Case]:
         offset = np.array([[0.0, radius]])
         limit = 5 * float(measure(fit(), offset)["contrast_error"][0])
         planet = Planet(limit, radius, 0.0)
-        light = planet_photons(here.model, Scene(), planet, here.opd)
-        observation = here.observation
+        light = planet_photons(setting.model, Scene(), planet, setting.opd)
+        observation = setting.observation
         data = observation.data + light
-        again = _fit(here, replace(observation, data=data))
-        row = measure(again, offset)[0]
+        refitted = _fit(setting, replace(observation, data=data))
+        row = measure(refitted, offset)[0]
         before = measure(fit(), offset)[0]
-        kept = (float(row["contrast"]) - float(before["contrast"])) / limit
-        return 5 * float(row["contrast_error"]) / limit, kept
+        throughput = (float(row["contrast"]) - float(before["contrast"])) / limit
+        return 5 * float(row["contrast_error"]) / limit, throughput
 
-    def judge(_: Any) -> Found:
-        ratio, kept = _once()
-        return Found(max(abs(ratio - 1), abs(kept - 1)))
+    def judge(_: Any) -> Accuracy:
+        ratio, throughput = _once()
+        return Accuracy(max(abs(ratio - 1), abs(throughput - 1)))
 
     @lru_cache(maxsize=1)
     def _once() -> tuple[float, float]:
@@ -319,7 +320,7 @@ def contrast(here: Setting) -> list[Case]:
             CONTRAST,
             f"{_SEPARATIONS * _ANGLES} injections, each refined again",
             lambda: (fit(), injected)[1],
-            lambda _: Found(0.0),
+            lambda _: Accuracy(0.0),
             reference=True,
             times=_SEPARATIONS * _ANGLES,
             note="one injection timed",

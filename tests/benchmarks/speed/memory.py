@@ -26,31 +26,33 @@ __all__ = ["memory_of", "peak_memory"]
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def memory_of(case: Case, here: Setting) -> float:
+def memory_of(case: Case, setting: Setting) -> float:
     """Bytes, measured in this process."""
     if case.make is None:
         return math.nan
-    on_gpu = torch.device(here.device).type == "cuda"
+    on_gpu = torch.device(setting.device).type == "cuda"
     # What all cases share is there before.
-    _ = here.opd, here.model
+    _ = setting.opd, setting.model
     give_back()
-    before = torch.cuda.memory_allocated(here.device) if on_gpu else resident()
+    before = torch.cuda.memory_allocated(setting.device) if on_gpu else resident()
     work = case.make()
     work()
-    start_peak(here.device)
+    start_peak(setting.device)
     work()
-    peak = torch.cuda.max_memory_allocated(here.device) if on_gpu else resident("VmHWM")
+    peak = torch.cuda.max_memory_allocated(setting.device) if on_gpu else resident("VmHWM")
     return peak - before
 
 
-def peak_memory(case: Case, here: Setting, timeout: float = 300.0) -> float:
+def peak_memory(case: Case, setting: Setting, timeout: float = 300.0) -> float:
     """Bytes, measured in a process of its own; NaN where that fails."""
     # Last, as in tests/conftest.py: an installed package comes before its source.
     program = f"import sys; sys.path.append({str(ROOT)!r}); from {__name__} import main; main()"
-    command = [sys.executable, "-c", program, json.dumps(asdict(here)), case.key]
+    command = [sys.executable, "-c", program, json.dumps(asdict(setting)), case.key]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=True)
-        return float(done.stdout.splitlines()[-1])
+        process = subprocess.run(
+            command, capture_output=True, text=True, timeout=timeout, check=True
+        )
+        return float(process.stdout.splitlines()[-1])
     except (subprocess.SubprocessError, ValueError, IndexError):
         return math.nan
 
@@ -59,8 +61,8 @@ def main() -> None:
     """Measure one case."""
     from tests.benchmarks.speed.rows import cases_of
 
-    here = Setting(**json.loads(sys.argv[1]))
+    setting = Setting(**json.loads(sys.argv[1]))
     (case,) = (
-        case for case in cases_of(sys.argv[2].split(" | ")[0], here) if case.key == sys.argv[2]
+        case for case in cases_of(sys.argv[2].split(" | ")[0], setting) if case.key == sys.argv[2]
     )
-    sys.stdout.write(f"{memory_of(case, here)}\n")
+    sys.stdout.write(f"{memory_of(case, setting)}\n")

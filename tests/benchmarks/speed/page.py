@@ -171,8 +171,10 @@ def _section(table: Table, name: str) -> list[str]:
 def _scaling(table: Table) -> list[str]:
     rows = []
     for name, power in table.meta.get("exponents", {}).items():
-        here = table[table["row"] == name]
-        points = ", ".join(f"{line['column']}: {_duration(line['seconds'])}" for line in here)
+        points_of_row = table[table["row"] == name]
+        points = ", ".join(
+            f"{line['column']}: {_duration(line['seconds'])}" for line in points_of_row
+        )
         rows.append((name.removeprefix("scaling: "), points, f"{power:.2f}"))
     if not rows:
         return []
@@ -233,16 +235,16 @@ def _limits(limits: list[dict[str, Any]]) -> list[str]:
 def write_page(table: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Path:
     """Write performance.md into a folder, from a table in a file; returns the path.
 
-    Notes in a file beside it, NAME_notes.md for NAME.ecsv, go onto the page.
+    Notes in the same folder, NAME_notes.md for NAME.ecsv, are included.
     """
     remarks = Path(table).with_name(f"{Path(table).stem}_notes.md")
     notes = remarks.read_text(encoding="utf-8") if remarks.is_file() else ""
-    found = Table.read(table, format="ascii.ecsv")
+    measured = Table.read(table, format="ascii.ecsv")
     path = Path(folder) / "performance.md"
     try:
         figure = Path(table).resolve().with_suffix(".png").relative_to(Path(folder).resolve())
     except ValueError:
         figure = Path("results/performance.png")
     with replacing(path) as temporary:
-        Path(temporary).write_text(page(found, figure.as_posix(), notes), encoding="utf-8")
+        Path(temporary).write_text(page(measured, figure.as_posix(), notes), encoding="utf-8")
     return path

@@ -60,8 +60,8 @@ def paper_recipe(arrays: Arrays, device: str, pad: int = 2) -> Callable[[Tensor]
         field = amplitude * torch.exp(2j * torch.pi / WAVELENGTH * opd)
         focus = torch.fft.fft2(field, s=(size, size))
         pupil = torch.fft.ifft2(focus * mask)[:npix, :npix]
-        found: Tensor = (scale * (rows @ (pupil * stop) @ columns)).abs().square()
-        return found
+        intensity: Tensor = (scale * (rows @ (pupil * stop) @ columns)).abs().square()
+        return intensity
 
     return image
 
@@ -107,11 +107,13 @@ def prysm_image(arrays: Arrays) -> Image:
     def image() -> Array:
         field = amplitude * np.exp((2j * np.pi / WAVELENGTH) * opd)
         focus = propagation.focus_fixed_sampling(field, spacing, focal, wave, cell, cells)
-        back = propagation.unfocus_fixed_sampling(focus * blocked, cell, focal, wave, spacing, npix)
-        found = propagation.focus_fixed_sampling(
-            stop * (field - back), spacing, focal, wave, pixel, arrays.pixels, shift=middle
+        returned = propagation.unfocus_fixed_sampling(
+            focus * blocked, cell, focal, wave, spacing, npix
         )
-        return np.asarray(found.real**2 + found.imag**2)
+        field_on_detector = propagation.focus_fixed_sampling(
+            stop * (field - returned), spacing, focal, wave, pixel, arrays.pixels, shift=middle
+        )
+        return np.asarray(field_on_detector.real**2 + field_on_detector.imag**2)
 
     return image
 
@@ -139,7 +141,7 @@ def hcipy_image(arrays: Arrays) -> Image:
 
     def image() -> Array:
         field = amplitude * np.exp((2j * np.pi / WAVELENGTH) * opd)
-        found = detector(coronagraph(hcipy.Wavefront(field, WAVELENGTH)))
-        return np.asarray(found.power.shaped)
+        wavefront = detector(coronagraph(hcipy.Wavefront(field, WAVELENGTH)))
+        return np.asarray(wavefront.power.shaped)
 
     return image

@@ -21,7 +21,7 @@ from tests.benchmarks.speed.inference import (
 from tests.benchmarks.speed.scaling import SCALING, scaling
 from tests.benchmarks.speed.setting import Setting
 
-__all__ = ["ROWS", "Row", "cases_of", "chosen_rows"]
+__all__ = ["ROWS", "Row", "cases_of", "select_rows"]
 
 
 @dataclass(frozen=True)
@@ -53,24 +53,24 @@ ROWS = (
 """In the order of the table."""
 
 
-def chosen_rows(names: list[str] | None) -> list[Row]:
-    """Rows by their names, or by what their names begin with.
+def select_rows(names: list[str] | None) -> list[Row]:
+    """Return rows by their names or the beginnings of their names.
 
     Raises
     ------
     IncompatibleSetupError
-        For a name that none begins with.
+        If no row begins with a name.
     """
     if not names:
         return list(ROWS)
     for name in names:
         if not any(row.name.startswith(name) for row in ROWS):
-            known = ", ".join(repr(row.name) for row in ROWS)
-            raise IncompatibleSetupError(f"rows: got {name!r}, expected some of {known}")
+            available = ", ".join(repr(row.name) for row in ROWS)
+            raise IncompatibleSetupError(f"rows: got {name!r}, expected some of {available}")
     return [row for row in ROWS if any(row.name.startswith(name) for name in names)]
 
 
-def cases_of(row: str, here: Setting) -> list[Case]:
+def cases_of(row: str, setting: Setting) -> list[Case]:
     """All cases of the row that a case belongs to."""
-    (found,) = (r for r in ROWS if r.name == row.split(":")[0])
-    return found.cases(here)
+    (selected_row,) = (r for r in ROWS if r.name == row.split(":")[0])
+    return selected_row.cases(setting)

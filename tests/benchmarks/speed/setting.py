@@ -21,7 +21,7 @@ from pyklip_diffrender.scene.objects import PAPER_SEGMENT_GAP, Planet, Scene
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
-from tests.benchmarks.speed.case import Found
+from tests.benchmarks.speed.case import Accuracy
 
 __all__ = ["Arrays", "Setting"]
 
@@ -163,12 +163,12 @@ class Setting:
         """One frame with its noise."""
         return simulate(self.host_model, self.scene, self.opd.cpu(), seed=1)
 
-    def judge(self, image: Tensor | Array) -> Found:
+    def judge(self, image: Tensor | Array) -> Accuracy:
         """Errors of an image of the star: largest over the peak, and rms over the noise."""
-        found = image.detach().cpu().numpy() if isinstance(image, Tensor) else image
-        difference = found.astype(np.float64) - self.truth
+        value = image.detach().cpu().numpy() if isinstance(image, Tensor) else image
+        difference = value.astype(np.float64) - self.truth
         sigma = self.scene.star.photons * difference / self.noise
-        return Found(
+        return Accuracy(
             float(np.abs(difference).max() / self.truth.max()), float(np.sqrt((sigma**2).mean()))
         )
 

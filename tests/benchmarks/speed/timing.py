@@ -71,9 +71,9 @@ def interleaved(
                 continue
             rested = False
             for _ in range(5 if shortest[k] < _SHORT else 1):
-                taken = seconds(work, device)
-                spent[k] += taken
-                shortest[k] = min(shortest[k], taken)
+                durations = seconds(work, device)
+                spent[k] += durations
+                shortest[k] = min(shortest[k], durations)
         if rested:
             break
     return shortest

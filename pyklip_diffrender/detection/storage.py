@@ -1,0 +1,138 @@
+"""Convert the parts of a detection to FITS extensions, and back."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from astropy.io import fits
+from astropy.table import QTable
+
+from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.field import Image
+from pyklip_diffrender.detection.groups import Group, groups_of
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.refinement.storage import image
+
+__all__ = [
+    "MAPS",
+    "candidates_of",
+    "digest",
+    "fit_beside",
+    "groups_of_searched",
+    "image_hdu",
+    "maps_of",
+    "table_facts",
+    "table_of",
+]
+
+MAPS = {
+    "SNR": "snr",
+    "RESIDUAL_SNR": "residual_snr",
+    "CONTRAST": "contrast",
+    "CONTRAST_ERROR": "error",
+    "PHOTON_ERROR": "photon_error",
+}
+"""Attributes of a detection by the names of their extensions."""
+
+
+def image_hdu(array: Image, name: str, unit: str, version: int = 1) -> fits.ImageHDU:
+    """Make an extension of an image in double precision."""
+    hdu = fits.ImageHDU(np.asarray(array, dtype=np.float64), name=name, ver=version)
+    hdu.header["BUNIT"] = unit
+    return hdu
+
+
+def maps_of(hdus: fits.HDUList) -> dict[str, Image]:
+    """Return the maps and the grid of a detection, by attribute.
+
+    Raises
+    ------
+    KeyError, ValueError
+        If an extension is missing, or if not all images have the same shape.
+    """
+    maps = {attribute: image(hdus, name, 0) for name, attribute in MAPS.items()}
+    maps["grid"] = np.stack([image(hdus, "OFFSET_X", 0), image(hdus, "OFFSET_Y", 0)], axis=-1)
+    shapes = {each.shape[:2] for each in maps.values()}
+    if len(shapes) > 1 or maps["snr"].ndim != 2:
+        raise ValueError(f"maps have the shapes {sorted(shapes)}")
+    return maps
+
+
+def candidates_of(facts: dict[str, Any]) -> Candidates:
+    """Make candidates from their attributes."""
+    count = len(facts["contrasts"])
+    shapes = {"offsets": (count, 2), "contrasts": (count,), "covariance": (3 * count, 3 * count)}
+    arrays = {
+        name: torch.from_numpy(np.array(facts[name], dtype=np.float64).reshape(shape))
+        for name, shape in shapes.items()
+    }
+    return Candidates(**arrays, converged=facts["converged"])
+
+
+def table_facts(table: QTable) -> dict[str, Any]:
+    """Return the columns and the metadata of a table as settings that `text_hdu` writes."""
+    return {"columns": {name: table[name] for name in table.colnames}, "meta": table.meta}
+
+
+def table_of(facts: dict[str, Any]) -> QTable:
+    """Make a table of numbers from what `table_facts` returned."""
+    columns = {
+        name: column if hasattr(column, "unit") else np.array(column, dtype=np.float64)
+        for name, column in facts["columns"].items()
+    }
+    return QTable(columns, meta=facts["meta"])
+
+
+def digest(fit: Refinement) -> str:
+    """Return a hash of all fitted values, which identifies a fit also after it was written."""
+    return hashlib.sha256(fit.star_only.vector.numpy().tobytes()).hexdigest()
+
+
+def fit_beside(path: Path) -> Refinement:
+    """Read the fit that was written to the folder of a detection.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If there is none.
+    """
+    file = path.with_name("fit.fits")
+    if not file.is_file():
+        raise IncompatibleSetupError(
+            f"{path}: measurements need the linear model of the fit, and there is no fit.fits in "
+            "the same folder. Pass the fit that was searched: Detection.read(path, fit=fit)"
+        )
+    return Refinement.read(file)
+
+
+def groups_of_searched(
+    searched: Sequence[Refinement], digests: Sequence[str], path: Path
+) -> tuple[Group, ...]:
+    """Linear models and templates of fits, if they are those in which a detection was made.
+
+    Parameters
+    ----------
+    searched : sequence of Refinement
+    digests : sequence of str
+        See `digest`.
+    path : Path
+        File of the detection, for messages.
+
+    Raises
+    ------
+    IncompatibleSetupError
+    """
+    if [digest(fit) for fit in searched] != list(digests):
+        raise IncompatibleSetupError(
+            f"{path}: the fit is not the one that was searched for this detection"
+            + (f", which has {len(digests)} fits" if len(searched) != len(digests) else "")
+            + ". Pass the attribute `fits` of the detection that was written: "
+            "Detection.read(path, fit=fits)"
+        )
+    return tuple(groups_of(searched))

@@ -1,0 +1,162 @@
+"""Read JWST stage-2 coronagraphic files, as the pipeline or spaceKLIP write them."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, ShapeError, UnitError
+from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.io.headers import header_date, header_number, header_text, merged_header
+from pyklip_diffrender.io.units import native_float64, require_finite
+from pyklip_diffrender.scene.detector_pixels import first_pixel, net_shifts, shift_frames
+
+__all__ = ["BAD_PIXEL_BITS", "on_detector_pixels", "read_calints"]
+
+BAD_PIXEL_BITS = 1 | 2 | 512 | 1024
+"""JWST data-quality bits that take a pixel out of the fit: DO_NOT_USE, SATURATED, NON_SCIENCE,
+DEAD. A jump (4) that the ramp fit has repaired, or a hot pixel (2048) that was dark-subtracted,
+may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
+
+
+def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[Any] | None]:
+    """Read a calints file; see `Observation.from_fits`.
+
+    Returns
+    -------
+    arguments : dict
+        Arguments of `Observation.from_arrays`.
+    shifts : ndarray, (frames, 2), or None
+        IMSHIFTS of spaceKLIP's aligned files.
+    """
+    path = Path(path)
+    with open_fits(path) as hdus:
+        if "SCI" not in hdus:
+            raise CorruptFileError(
+                f"{path.name}: no SCI extension, only {[h.name for h in hdus]}; expected a "
+                "JWST calints file"
+            )
+        science = hdus["SCI"]
+        header = merged_header(hdus[0].header, science.header, path.name)
+        for hdu in hdus:
+            if hdu.name in ("SCI", "ERR", "DQ") and not hdu.is_image:
+                raise CorruptFileError(f"{path.name}: {hdu.name} is a table, not an image")
+            if hdu.name in ("SCI", "ERR", "DQ") and hdu.data is None:
+                raise CorruptFileError(f"{path.name}: {hdu.name} has no data, so no frames")
+        data = native_float64(science.data)
+        if "ERR" not in hdus:
+            raise CorruptFileError(f"{path.name}: no ERR extension; the fit needs errors")
+        error = native_float64(hdus["ERR"].data)
+        if "DQ" in hdus:
+            quality = np.asarray(hdus["DQ"].data)
+            if quality.dtype.kind not in "iu":
+                raise CorruptFileError(
+                    f"{path.name}: DQ holds {quality.dtype.name}, expected integers (flags)"
+                )
+        else:
+            warnings.warn(
+                f"{path.name}: no DQ extension; only NaN pixels are masked",
+                DiffrenderWarning,
+                stacklevel=3,
+            )
+            quality = np.zeros(data.shape, dtype=np.uint32)
+        mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
+        shifts = hdus["IMSHIFTS"].data if "IMSHIFTS" in hdus else None
+    arguments = {
+        "data": data,
+        "error": error,
+        "valid": (quality.astype(np.uint32) & BAD_PIXEL_BITS) == 0,
+        **_details(header, 1 if data.ndim == 2 else len(data), path.name),
+    }
+    if shifts is None and "STARCENX" not in header:
+        arguments["first_pixel"] = first_pixel(header, np.zeros(2, dtype=np.int64), path.name)
+    if mask is not None:
+        # Position of the mask from the star, in pixels, for every integration.
+        offset = -native_float64(mask).reshape(-1, 2).mean(axis=0) * arguments["pixelscale"]
+        arguments["star_offset"] = (float(offset[0]), float(offset[1]))
+    return arguments, shifts
+
+
+def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
+    """Arguments of `Observation.from_arrays` that the merged header determines."""
+
+    def number(key: str, default: float) -> float:
+        value = header_number(header, key, name)
+        return default if value is None else value
+
+    unit = header_text(header, "BUNIT", name)
+    if unit is None:
+        raise UnitError(f"{name}: SCI has no BUNIT; expected one such as 'MJy/sr'")
+    star = [
+        number(key, number(fallback, np.nan)) for key, fallback in
+        (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
+    ]  # fmt: skip
+    angle = number("ROLL_REF", 0.0) - number("V3I_YANG", 0.0) * number("VPARITY", -1)
+    area = number("PIXAR_A2", 0.0)
+    if area == 0:
+        raise UnitError(f"{name}: the header has no PIXAR_A2 (pixel area, arcsec^2)")
+    if area < 0:
+        raise CorruptFileError(
+            f"{name}: PIXAR_A2 is {area}, expected a pixel area in arcsec^2, such as 0.0039. "
+            "Correct the header, or fetch the file again"
+        )
+    return {
+        "unit": unit,
+        "pixelscale": area**0.5,
+        "center": None if np.isnan(star).any() else np.array(star) - 1,
+        "filter": header_text(header, "FILTER", name),
+        "date": header_date(header, ("DATE-BEG", "DATE-OBS"), name),
+        "position_angles": np.full(frames, angle),
+        "name": name,
+        "header": header,
+    }
+
+
+def on_detector_pixels(
+    arguments: dict[str, Any], center: NDArray[np.float64], shifts: NDArray[Any]
+) -> dict[str, Any]:
+    """Undo the shifts (IMSHIFTS) by which frames were aligned, up to whole pixels.
+
+    Parameters
+    ----------
+    arguments : dict
+        See `read_calints`. The alignment leaves DQ unchanged.
+    center : ndarray, (frames, 2)
+        x, y of the star, 0-indexed.
+    shifts : ndarray, (frames, 2)
+        x, y in pixels.
+
+    Returns
+    -------
+    dict
+        The attributes of the observation that change.
+    """
+    name, header, frames = arguments["name"], arguments["header"], len(center)
+    if np.shape(shifts) != (frames, 2):
+        raise ShapeError(
+            f"{name}: IMSHIFTS: got shape {np.shape(shifts)}, expected ({frames}, 2), "
+            "x and y for every frame"
+        )
+    require_finite(native_float64(shifts), f"{name}: IMSHIFTS")
+    net = net_shifts(shifts, center, header, name)
+    pixels = np.round(net.mean(axis=0)).astype(np.int64)
+    data, error, usable = (
+        arguments[key].reshape(frames, *arguments[key].shape[-2:])
+        for key in ("data", "error", "valid")
+    )
+    shifted = [shift_frames(np.nan_to_num(each), pixels - net) for each in (data, error)]
+    usable = np.roll(usable, (pixels[1], pixels[0]), axis=(1, 2))
+    good = np.isfinite(data) & np.isfinite(error) & usable & (shifted[1] > 0)
+    return {
+        "data": np.where(good, shifted[0], 0.0),
+        "error": np.where(good, shifted[1], 1.0),
+        "valid": good,
+        "center": center + pixels - net,
+        "first_pixel": first_pixel(header, pixels, name),
+    }
