@@ -18,7 +18,7 @@ from pyklip_diffrender.refinement.learning import (
     MeasuredPattern,
     combine_patterns,
     measure_patterns,
-    thermal_light,
+    pattern_pedestal,
 )
 from pyklip_diffrender.refinement.library import write_patterns
 
@@ -57,14 +57,14 @@ def main() -> None:
     library = []
     for name in options.filters:
         first = {star: fit_of(star, name, files, options.opd, []) for star in options.stars}
-        thermal = thermal_light(list(first.values()))
-        log.info("%s: thermal background %.3g", name, thermal)
+        pedestal = pattern_pedestal(list(first.values()))
+        log.info("%s: pedestal %.3g", name, pedestal)
         second = []
         for star in options.stars:
             others = [fit for other, fit in first.items() if other != star]
-            known = measure_patterns(others, thermal)
+            known = measure_patterns(others, pedestal)
             second.append(fit_of(star, name, files, options.opd, known))
-        library += measure_patterns(second, thermal)
+        library += measure_patterns(second, pedestal)
         write_patterns(library, options.output)
 
 

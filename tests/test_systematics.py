@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, Systematics
+from pyklip_diffrender.refinement.learning import learn_systematics, pattern_pedestal
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.scene.objects import Planet
@@ -199,6 +202,98 @@ def test_frames_fitted_together_have_the_pattern_each_at_its_star() -> None:
     assert fit.status is Status.CONVERGED
     assert fit.reduced_chi2 == pytest.approx(1.0, abs=0.1)
     np.testing.assert_array_equal(fit.frames[1].gain[1:, 2:], 1 + pattern()[:-1, :-2])
+
+
+@cache
+def rolls(pedestal: float = 0.0) -> list[Observation]:
+    """Two rolls of the planet on the same pixels, with a pattern of 3 %."""
+    error, frames = 0.5 * pattern(), []
+    for k, angle in enumerate((0.0, 60.0)):
+        roll = observed(
+            light() * (1 + error) + light(PLANET.rotated(-angle)),
+            70 + k,
+            position_angles=np.array([angle]),
+            first_pixel=(600, 1600),
+        )
+        frames.append(replace(roll, data=roll.data + pedestal * error))
+    return frames
+
+
+def test_frames_of_the_same_pixels_share_what_is_unknown_of_the_pattern() -> None:
+    zeros = np.zeros((SIZE, SIZE))
+    unknown = Systematics(zeros, zeros + 0.5 * RMS, MIDDLE, RMS, first_pixel=(600, 1600))
+    settings = GaussNewton(basis=BASIS, response_npix=NPIX)
+    shared, apart = (
+        dr.refine(model(), frames, before(), settings=settings, systematics=unknown)
+        for frames in (rolls(), [replace(roll, first_pixel=None) for roll in rolls()])
+    )
+    assert shared.status is Status.CONVERGED
+    assert shared.chi2_per_pixel == pytest.approx(1.0, abs=0.1)
+    # The pattern is in the same pixels, the planet is not.
+    limits = [
+        dr.contrast_curve(fit, [0.6], scatter=1.0)["known_star"][0] for fit in (shared, apart)
+    ]
+    assert limits[0] < 0.85 * limits[1]
+    rows = [dr.measure(fit, [PLANET.offset])[0] for fit in (shared, apart)]
+    assert rows[0]["snr"] > rows[1]["snr"] > 20
+    assert abs(rows[0]["contrast"] - PLANET.contrast) < 3 * rows[0]["contrast_error"]
+
+
+def test_the_pattern_multiplies_the_pedestal(tmp_path: Path) -> None:
+    pedestal = 1e4
+    measured = Systematics(
+        0.5 * pattern(),
+        np.full((SIZE, SIZE), 1e-3),
+        MIDDLE,
+        RMS,
+        pedestal=pedestal,
+        first_pixel=(600, 1600),
+    )
+    measured = Systematics.read(measured.write(tmp_path / "systematics.fits"))
+    assert measured.pedestal == pedestal
+    frames, settings = rolls(pedestal), GaussNewton(basis=BASIS, response_npix=NPIX)
+    fits = [
+        dr.refine(model(), frames, before(), settings=settings, systematics=each)
+        for each in (measured, replace(measured, pedestal=0.0))
+    ]
+    assert fits[0].reduced_chi2 == pytest.approx(1.0, abs=0.1)
+    assert fits[1].reduced_chi2 > 2
+
+
+def test_the_pedestal_makes_the_pattern_equally_strong_everywhere() -> None:
+    """Two frames of a bright star with a pattern of 3 % on star and pedestal."""
+    size, pedestal, noise = 100, 1.5, 0.05
+    rng = np.random.default_rng(9)
+    y, x = np.indices((size, size)) - (size - 1) / 2
+    star = 30.0 / (1 + (np.hypot(x, y) / 8) ** 3)
+    error = 0.03 * rng.normal(size=(size, size))
+    frames = []
+    for _ in range(2):
+        data = star + error * (star + pedestal) + noise * rng.normal(size=(size, size))
+        observation = Observation.from_arrays(
+            data, np.full(data.shape, noise), pixelscale=0.063, first_pixel=(600, 1600)
+        )
+        frames.append(
+            SimpleNamespace(
+                observation=observation,
+                star=star,
+                gain=np.ones((size, size)),
+                companion_image=np.zeros((size, size)),
+                values={"background": np.zeros(1)},
+            )
+        )
+    fit = SimpleNamespace(frames=tuple(frames), systematics=None, status=Status.CONVERGED)
+    assert pattern_pedestal([fit]) == pytest.approx(pedestal, rel=0.15)
+    known = learn_systematics([fit])
+    assert known.pedestal == pattern_pedestal([fit])
+    # Two frames: 0.05 / sqrt(2) of noise over the light.
+    predicted = noise / np.sqrt(2) / (star + known.pedestal)
+    pull = (known.pattern - error) / predicted
+    assert 0.5 < pull.std() < 1.05
+    assert np.corrcoef(known.pattern.ravel(), error.ravel())[0, 1] > 0.85
+    elsewhere = replace(frames[1].observation, first_pixel=None)
+    lost = SimpleNamespace(**{**vars(frames[1]), "observation": elsewhere})
+    assert pattern_pedestal([SimpleNamespace(**{**vars(fit), "frames": (frames[0], lost)})]) == 0
 
 
 def test_the_recipe_does_not_take_a_pattern() -> None:

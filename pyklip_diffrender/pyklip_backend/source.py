@@ -22,6 +22,7 @@ from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import merged_header
 from pyklip_diffrender.scene.detector_pixels import first_pixel
 from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
+from pyklip_diffrender.scene.noise import calibrated_errors
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
@@ -200,6 +201,15 @@ def _read(path: str, dataset: Any) -> _File:
     if not aligned:
         moved = "STARCENX" in header
         origin = None if moved else first_pixel(header, np.zeros(2, dtype=np.int64), path)
+        if error is not None and header.get("INSTRUME") == "NIRCAM":
+            # As `Observation.from_fits` does.
+            scale = float(np.sqrt(science["PIXAR_A2"]))
+            known = usable & np.isfinite(data) & np.isfinite(error) & (error > 0)
+            error = calibrated_errors(
+                np.where(known, data, 0.0), np.where(known, error, 1.0), known, centers,
+                (scale, scale), Path(path).name,
+            ).astype(np.float32)  # fmt: skip
+            error[~known] = 0.0
         return _File(header, data, error, usable, centers, origin, None, as_read, center)
     # The shift of the alignment is undone, so that flat-field errors are in their pixels again.
     back = Observation.from_fits(path)

@@ -39,7 +39,7 @@ class Point:
         The star at flux 1.
     light : Tensor, (ny, nx)
         The star in the data's unit, with the known pattern of the model's error (also that of the
-        thermal background).
+        pedestal, see `Systematics`).
     star : Tensor, (ny, nx)
         The same with the background.
     total : Tensor, (ny, nx)
@@ -102,7 +102,7 @@ class Forward:
         with torch.no_grad():
             fields = self.model.fields(opd, **values)
             image = self.model.image_of(fields, values).double()
-        light = flux * self.problem.gain * image + self.problem.pedestal
+        light = flux * self.problem.gain * image + self.problem.fixed_pattern
         star = light + unknowns.level("background", vector)
         total = star
         if unknowns.shows_companions and len(unknowns.companions):

@@ -20,7 +20,7 @@ __all__ = [
     "combine_patterns",
     "learn_systematics",
     "measure_patterns",
-    "thermal_light",
+    "pattern_pedestal",
 ]
 
 Image = NDArray[np.float64]
@@ -29,7 +29,7 @@ _RING = 4.0
 """Width in pixels of the rings in which scatters are estimated."""
 
 _FIRST_RING = 2
-"""First ring from which the thermal background is estimated: closer to the star, residuals are
+"""First ring from which the pedestal is estimated: closer to the star, residuals are
 also those of the wavefront."""
 
 _FEW = 50
@@ -51,7 +51,7 @@ class MeasuredPattern:
     ----------
     star : str
     value : ndarray, (ny, nx)
-        Residual over star and thermal background; 0 where not known.
+        Residual over the sum of star and pedestal; 0 where not known.
     variance : ndarray, (ny, nx)
         Of the data's noise; inf where not known.
     center : tuple of float
@@ -61,8 +61,8 @@ class MeasuredPattern:
     filter, image_mask : str or None
     frame, date : str
         Where and when it was measured.
-    thermal : float
-        Thermal background that was assumed, in the unit of the frames.
+    pedestal : float
+        As of `Systematics`.
     """
 
     star: str
@@ -74,7 +74,7 @@ class MeasuredPattern:
     image_mask: str | None = None
     frame: str = ""
     date: str = ""
-    thermal: float = 0.0
+    pedestal: float = 0.0
 
 
 def learn_systematics(
@@ -82,13 +82,12 @@ def learn_systematics(
 ) -> Systematics:
     """Learn the pattern that the star model misses from fits of other stars.
 
-    In every frame the residual is divided by the star and the thermal background. The brightness of
-    the latter is the one with which the pattern is as strong far from the star as it is near it,
-    see `thermal_light`. The ratios are averaged with inverse
-    variances, which are those of the data's noise and of the scatter between frames beyond that
-    noise; a zero-mean Gaussian prior, as wide as the ratios scatter over the pixels of a ring,
-    shrinks pixels that were not measured well. The error of the pattern for another frame is that
-    of this average and the scatter between frames.
+    In every frame the residual is divided by the sum of the star and a pedestal, with which the
+    pattern is as strong far from the star as it is near it, see `pattern_pedestal`. The ratios are
+    averaged with inverse variances, which are those of the data's noise and of the scatter between
+    frames beyond that noise; a zero-mean Gaussian prior, as wide as the ratios scatter over the
+    pixels of a ring, shrinks pixels that were not measured well. The error of the pattern for
+    another frame is that of this average and the scatter between frames.
 
     Parameters
     ----------
@@ -118,31 +117,30 @@ def learn_systematics(
 
 
 def measure_patterns(
-    fits: Refinement | Sequence[Refinement], thermal: float | None = None
+    fits: Refinement | Sequence[Refinement], pedestal: float | None = None
 ) -> list[MeasuredPattern]:
     """Measure the pattern in every frame of the fits that did not fail.
 
     Parameters
     ----------
     fits : Refinement or sequence of Refinement
-    thermal : float, optional
-        Thermal background, in the unit of the frames. By default it is estimated.
+    pedestal : float, optional
+        As of `Systematics`, in the unit of the frames. By default it is estimated.
     """
     several = [fits] if isinstance(fits, Refinement) else list(fits)
     usable = [fit for fit in several if fit.status.usable]
-    if thermal is None:
-        thermal = thermal_light(usable)
-    return [_measured(frame, fit, thermal) for fit in usable for frame in fit.frames]
+    if pedestal is None:
+        pedestal = pattern_pedestal(usable)
+    return [_measured(frame, fit, pedestal) for fit in usable for frame in fit.frames]
 
 
-def thermal_light(fits: Sequence[Refinement]) -> float:
-    """Estimate the thermal background that the pattern of the model's error multiplies.
+def pattern_pedestal(fits: Sequence[Refinement]) -> float:
+    """Estimate the pedestal with which one pattern holds near the star and far from it.
 
-    The thermal background is subtracted from frames as if the flat field were perfect. What remains
-    of it is a fixed pattern that does not become fainter with the distance from the star. The
+    Frames have a fixed pattern that does not become fainter with the distance from the star. The
     product of the residuals of two frames of the same pixels, averaged over a ring, is
-    m^2 (s_1 + B) (s_2 + B) for a pattern of rms m and stars s: a least-squares fit to all rings
-    gives m and B.
+    m^2 (s_1 + B) (s_2 + B) for a pattern of rms m, stars s and a pedestal B. A least-squares fit to
+    all rings gives m and B.
 
     Returns
     -------
@@ -154,8 +152,8 @@ def thermal_light(fits: Sequence[Refinement]) -> float:
         return 0.0
     product, first, second, error = np.array(rings).T
 
-    def misfit(thermal: float) -> float:
-        shape = (first + thermal) * (second + thermal)
+    def misfit(pedestal: float) -> float:
+        shape = (first + pedestal) * (second + pedestal)
         strength = (shape * product / error**2).sum() / ((shape / error) ** 2).sum()
         return float((((product - strength * shape) / error) ** 2).sum())
 
@@ -201,11 +199,11 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
         For none, or patterns of different filters.
     """
     filters = {pattern.filter for pattern in patterns}
-    thermal = {pattern.thermal for pattern in patterns}
-    if len(thermal) != 1:
+    pedestals = {pattern.pedestal for pattern in patterns}
+    if len(pedestals) != 1:
         raise IncompatibleSetupError(
-            f"systematics: got patterns for thermal backgrounds of {sorted(thermal)}, expected "
-            "one. Measure them with the same value of thermal"
+            f"systematics: got patterns with pedestals of {sorted(pedestals)}, expected one. "
+            "Measure them with the same value of pedestal"
         )
     if len(filters) != 1:
         raise IncompatibleSetupError(
@@ -228,7 +226,7 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
         center=center,
         first_pixel=first_pixel,
         unknown=float(np.median(width)),
-        thermal=thermal.pop(),
+        pedestal=pedestals.pop(),
         filter=patterns[0].filter,
         image_mask=patterns[0].image_mask,
         name=name or ", ".join(names),
@@ -253,19 +251,19 @@ def _text(value: object) -> str | None:
 def _light_and_residual(
     frame: FrameFit, fit: Refinement
 ) -> tuple[Image, Image, Image, NDArray[np.bool_]]:
-    """Star without the known pattern, what the frame has beyond it, noise, and valid pixels."""
+    """Star without the known pattern, what the frame shows beyond it, noise, and valid pixels."""
     combined = frame.observation.combined()
     background = float(frame.values["background"][0])
-    known = 0.0 if fit.systematics is None else fit.systematics.thermal
+    known = 0.0 if fit.systematics is None else fit.systematics.pedestal
     light = (frame.star - background + known) / frame.gain - known
     left = combined.data[0] - background - frame.companion_image - light
     return light, left, combined.error[0], combined.valid[0]
 
 
-def _measured(frame: FrameFit, fit: Refinement, thermal: float) -> MeasuredPattern:
+def _measured(frame: FrameFit, fit: Refinement, pedestal: float) -> MeasuredPattern:
     observation = frame.observation
     light, left, error, valid = _light_and_residual(frame, fit)
-    multiplied = light + thermal
+    multiplied = light + pedestal
     usable = valid & (multiplied > 0)
     safe = np.where(usable, multiplied, 1.0)
     x, y = observation.center.mean(axis=0)
@@ -279,7 +277,7 @@ def _measured(frame: FrameFit, fit: Refinement, thermal: float) -> MeasuredPatte
         image_mask=_text(observation.header.get("CORONMSK")),
         frame=observation.name,
         date="" if observation.date is None else observation.date.isot,
-        thermal=thermal,
+        pedestal=pedestal,
     )
 
 

@@ -58,8 +58,8 @@ def known_systematics(
     None
     """
     library = _library_for(observation)
-    thermal = library[0].thermal if library else None
-    patterns = measure_patterns(references, thermal)
+    pedestal = library[0].pedestal if library else None
+    patterns = measure_patterns(references, pedestal)
     stars = {_plain(pattern.star) for pattern in patterns} | {_plain(observation.target)}
     if all(pattern.first_pixel is not None for pattern in patterns):
         patterns += [each for each in library if _plain(each.star) not in stars]
@@ -115,7 +115,10 @@ def write_patterns(patterns: Sequence[MeasuredPattern], path: str | os.PathLike[
         header["STAR"] = (pattern.star, "star that it was measured on")
         header["FILTER"], header["CORONMSK"] = pattern.filter or "", pattern.image_mask or ""
         header["STARX"], header["STARY"] = pattern.center
-        header["THERMAL"] = (pattern.thermal, "subtracted light that the pattern multiplies")
+        header["PEDESTAL"] = (
+            pattern.pedestal,
+            "added to the star, then multiplied",
+        )
         if pattern.first_pixel is not None:
             header["COLUMN"], header["ROW"] = pattern.first_pixel
         header["FRAME"], header["DATE-BEG"] = pattern.frame, pattern.date
@@ -144,7 +147,7 @@ def read_patterns(path: str | os.PathLike[str]) -> list[MeasuredPattern]:
                     value=np.where(known, native_float64(hdus["PATTERN", k].data), 0.0),
                     variance=np.where(known, error, np.inf) ** 2,
                     center=(header["STARX"], header["STARY"]),
-                    thermal=header.get("THERMAL", 0.0),
+                    pedestal=header["PEDESTAL"],
                     first_pixel=(header["COLUMN"], header["ROW"]) if "COLUMN" in header else None,
                     filter=header["FILTER"] or None,
                     image_mask=header["CORONMSK"] or None,

@@ -100,7 +100,7 @@ class Objective:
 
     def _multiplied(self, frame: int, point: Point) -> Tensor:
         """Light that the pattern of the model's error multiplies."""
-        return point.light + self.forwards[frame].problem.thermal
+        return point.light + self.forwards[frame].problem.pedestal
 
     def whitened(self, frame: int, point: Point, sigma: Tensor) -> Tensor:
         """Residual over `sigma`; 0 where masked."""

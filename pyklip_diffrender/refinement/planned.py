@@ -180,9 +180,9 @@ def _on_full_model(
     linear = tuple(name for name in ("flux", "background") if name in free)
     start = {name: float(frame.values[name][0]) for name in ("flux", "background")}
     flux, level = problem.flux_and_background(
-        image, problem.sigma, linear, data=before - problem.pedestal, start=start
+        image, problem.sigma, linear, data=before - problem.fixed_pattern, start=start
     )
-    star = flux * image + level + problem.pedestal
+    star = flux * image + level + problem.fixed_pattern
     difference = ((star - before) / problem.sigma)[problem.valid].abs()
     error = ModelError(float(difference.square().mean().sqrt()), float(difference.max()))
     fitted = {**frame.values, "flux": np.array([flux]), "background": np.array([level])}

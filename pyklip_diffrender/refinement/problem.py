@@ -77,12 +77,12 @@ class Problem:
             raise NoValidPixelsError(f"{self.observation.name}: all pixels are masked")
         self.gain = torch.ones_like(self.data)
         self.gain_error = torch.zeros_like(self.data)
-        self.thermal = 0.0
+        self.pedestal = 0.0
         if self.systematics is not None:
             pattern, error = self.systematics.at(self.observation)
             self.gain = 1 + torch.from_numpy(pattern).to(device)
             self.gain_error = torch.from_numpy(error).to(device)
-            self.thermal = self.systematics.thermal
+            self.pedestal = self.systematics.pedestal
 
     def starting_opd(self, npix: int) -> Tensor:
         """The starting wavefront on a pupil array of (npix, npix), m."""
@@ -94,9 +94,9 @@ class Problem:
         return replace(self, model=model, full_model=self.full_model or self.model)
 
     @property
-    def pedestal(self) -> Tensor:
-        """What the pattern of the model's error makes of the thermal background, (ny, nx)."""
-        return (self.gain - 1) * self.thermal
+    def fixed_pattern(self) -> Tensor:
+        """What the pattern adds to the frame where there is no star, (ny, nx)."""
+        return (self.gain - 1) * self.pedestal
 
     @property
     def pixels(self) -> int:

@@ -28,7 +28,7 @@ class Systematics:
 
     What no wavefront explains in the image of one star is largely the same fraction of the light
     in the image of another, on the same pixels of the detector: mostly an error of the flat field.
-    The star in pixel p is taken to be ``model_p * (1 + m_p) + thermal * m_p``, where m_p is
+    The star in pixel p is taken to be ``model_p * (1 + m_p) + pedestal * m_p``, where m_p is
     Gaussian with mean `pattern` and standard deviation `error`. Frames of the same pixels that are
     fitted together share m_p. Light of companions is not multiplied: nothing of it can be mistaken
     for the pattern.
@@ -43,9 +43,11 @@ class Systematics:
         x, y of the star in the pattern, 0-indexed pixels.
     unknown : float
         Standard deviation of the pattern where it has not been measured.
-    thermal : float
-        Light per pixel, in the unit of the frames, that the pattern multiplies besides the star:
-        the thermal background, which was subtracted without the pattern.
+    pedestal : float
+        Constant, in the unit of the frames, that is added to the star before the pattern
+        multiplies it. It stands for what a fixed pattern leaves far from the star: that of the
+        flat field in the thermal background, which was subtracted as if the flat field were
+        perfect, and that of the dark current.
     first_pixel : tuple of int or None
         Column and row of the pattern's first pixel on the full detector, as of an `Observation`.
     filter, image_mask : str or None
@@ -60,7 +62,7 @@ class Systematics:
     error: NDArray[np.float64]
     center: tuple[float, float]
     unknown: float
-    thermal: float = 0.0
+    pedestal: float = 0.0
     first_pixel: tuple[int, int] | None = None
     filter: str | None = None
     image_mask: str | None = None
@@ -90,7 +92,7 @@ class Systematics:
         if self.first_pixel is not None:
             header["COLUMN"], header["ROW"] = self.first_pixel
         header["UNKNOWN"] = (self.unknown, "deviation where nothing was measured")
-        header["THERMAL"] = (self.thermal, "subtracted light that the pattern multiplies")
+        header["PEDESTAL"] = (self.pedestal, "added to the star, then multiplied")
         header["FILTER"], header["CORONMSK"] = self.filter or "", self.image_mask or ""
         for key, value in self.provenance.items():
             header[f"HIERARCH {key.upper()}"] = json.dumps(value)
@@ -105,7 +107,7 @@ class Systematics:
             error=native_float64(hdus["PATTERN_ERROR"].data),
             center=(float(header["STARX"]), float(header["STARY"])),
             unknown=float(header["UNKNOWN"]),
-            thermal=float(header["THERMAL"]),
+            pedestal=float(header["PEDESTAL"]),
             first_pixel=(header["COLUMN"], header["ROW"]) if "COLUMN" in header else None,
             filter=header["FILTER"] or None,
             image_mask=header["CORONMSK"] or None,
