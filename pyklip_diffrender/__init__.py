@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.scene.real_frames import model_for
     from pyklip_diffrender.scene.sequence import Sequence
     from pyklip_diffrender.scene.simulation import simulate
+    from pyklip_diffrender.surveys import survey
     from pyklip_diffrender.wavefront.opd import drift, random_opd, read_opd
     from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
 
@@ -82,6 +83,7 @@ __all__ = [
     "refine",
     "register",
     "simulate",
+    "survey",
     "unregister",
 ]
 
@@ -102,6 +104,7 @@ _NAMES = {
     "scene.real_frames": "model_for",
     "scene.sequence": "Sequence",
     "scene.simulation": "simulate",
+    "surveys": "survey",
     "wavefront.opd": "drift random_opd read_opd",
     "wavefront.priors": "WavefrontPrior learn_prior",
 }

@@ -1,0 +1,160 @@
+"""Jobs run in this process, or by the workers of dask.distributed."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections import defaultdict, deque
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
+from pyklip_diffrender.surveys.folders import Record, finished
+from pyklip_diffrender.surveys.jobs import Job
+from pyklip_diffrender.surveys.runs import Work, failure, run_job
+
+__all__ = ["in_this_process", "with_dask"]
+
+_CONNECT = 30.0
+"""Seconds to wait for a scheduler."""
+
+_PATIENCE = 20
+"""Half seconds to wait for a folder that another machine has made: network disks lag."""
+
+
+class _Order:
+    """Which jobs can start: injections wait for the job whose fit they start from."""
+
+    def __init__(self, todo: Sequence[Job], jobs: Path) -> None:
+        self.jobs = jobs
+        self.first: list[Job] = []
+        self.later: dict[str, list[Job]] = defaultdict(list)
+        coming = {job.key for job in todo}
+        for job in todo:
+            if job.base in coming:
+                self.later[str(job.base)].append(job)
+            else:
+                self.first.append(job)
+
+    def after(self, job: Job, record: Record) -> tuple[list[Job], list[tuple[Job, Record]]]:
+        """Jobs that can start now that one has ended, and those that failed with it."""
+        waiting = self.later.pop(job.key, [])
+        if record["status"] == "finished":
+            return waiting, []
+        error = RefinementError(f"the reduction without a planet failed: {record['message']}")
+        return [], [(each, failure(each, self.jobs, error)) for each in waiting]
+
+
+def in_this_process(todo: Sequence[Job], jobs: Path, work: Work) -> Iterator[tuple[Job, Record]]:
+    """Run jobs one after the other; yields each with its record."""
+    order = _Order(todo, jobs)
+    queue = deque(order.first)
+    while queue:
+        job = queue.popleft()
+        record = run_job(job, jobs, work)
+        yield job, record
+        ready, failed = order.after(job, record)
+        queue.extendleft(reversed(ready))
+        yield from failed
+
+
+def with_dask(
+    todo: Sequence[Job],
+    jobs: Path,
+    work: Work,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    memory_limit: str | None = None,
+) -> Iterator[tuple[Job, Record]]:
+    """Run jobs on a cluster, by default on this machine; yields each with its record.
+
+    A job whose worker dies is given to another one, up to three times.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If dask.distributed is not installed, or no scheduler answers.
+    RefinementError
+        If the scheduler is lost. Jobs that are finished stay.
+    """
+    try:
+        from dask.distributed import Client, LocalCluster, as_completed
+        from dask.system import CPU_COUNT
+    except ImportError as error:
+        raise IncompatibleSetupError(
+            f"dask.distributed is needed for more than one process and is not installed ({error}): "
+            'pip install "pyklip-diffrender[survey]", or set workers = 0'
+        ) from error
+    order = _Order(todo, jobs)
+    with ExitStack() as stack:
+        if scheduler is None:
+            address: Any = stack.enter_context(
+                LocalCluster(
+                    n_workers=min(workers or CPU_COUNT, len(todo)),
+                    threads_per_worker=1,
+                    processes=True,
+                    memory_limit=memory_limit or "auto",
+                    dashboard_address=None,
+                    # A worker that dies is the business of the survey, which says so.
+                    silence_logs="critical",
+                )
+            )
+        else:
+            address = scheduler
+        try:
+            client = stack.enter_context(Client(address, timeout=_CONNECT))
+        except (OSError, ValueError) as error:
+            raise IncompatibleSetupError(
+                f"scheduler: got {scheduler!r}, where none answers ({error}). Start one with `dask "
+                "scheduler`, and give the address that it prints, such as tcp://host:8786"
+            ) from error
+
+        def submit(each: Job) -> Any:
+            # Two surveys on one scheduler and one folder share their jobs.
+            place = hashlib.sha256(str(jobs).encode()).hexdigest()[:8]
+            return client.submit(run_job, each, jobs, work, key=f"survey-{place}-{each.key}")
+
+        running = {submit(job): job for job in order.first}
+        completed = as_completed(list(running), raise_errors=False)
+        for future in completed:
+            job = running.pop(future)
+            record = _record_of(future, job, jobs)
+            yield job, record
+            ready, failed = order.after(job, record)
+            for each in ready:
+                new = submit(each)
+                running[new] = each
+                completed.add(new)
+            yield from failed
+
+
+def _record_of(future: Any, job: Job, jobs: Path) -> Record:
+    """Record of a job that dask has finished with."""
+    if future.status in ("cancelled", "lost"):
+        raise RefinementError(
+            "the connection to the scheduler was lost. Finished jobs are kept: start the survey "
+            "again to go on"
+        )
+    error = future.exception()
+    if error is not None:
+        # No error of a job gets here: its workers were killed, by the memory limit for example.
+        return failure(job, jobs, error)
+    record: Record = future.result()
+    if record["status"] == "finished" and not _appears(jobs / job.key):
+        lost = IncompatibleSetupError(
+            f"the worker on {record['host']} wrote its products to another disk than {jobs}. Put "
+            "the output on a disk that all workers share"
+        )
+        return failure(job, jobs, lost)
+    return record
+
+
+def _appears(final: Path) -> bool:
+    for _ in range(_PATIENCE):
+        if finished(final):
+            return True
+        time.sleep(0.5)
+    return False
