@@ -26,7 +26,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.surveys import execution, folders, runs
 from pyklip_diffrender.surveys.config import read_config
-from pyklip_diffrender.surveys.driver import survey
+from pyklip_diffrender.surveys.driver import run_survey, survey
 from pyklip_diffrender.surveys.jobs import Job, plan_jobs
 from pyklip_diffrender.surveys.page import write_page
 
@@ -123,7 +123,7 @@ def test_a_mistake_is_named_before_anything_is_done(
     place = config["sequence"][where[0]] if where else config
     place[key] = value
     with pytest.raises(IncompatibleSetupError) as raised:
-        survey(config, tmp_path / "out", _work=stub)
+        run_survey(config, tmp_path / "out", stub)
     lines = str(raised.value).splitlines()
     assert len(lines) == 2
     for word in words:
@@ -217,15 +217,15 @@ def test_finished_jobs_are_not_run_again(tmp_path: Path) -> None:
         ran.append(job.name)
         return stub(job, folder)
 
-    table = survey(config, output, _work=work)
+    table = run_survey(config, output, work)
     assert list(table["status"]) == ["finished"] * 3
     assert len(ran) == 3
-    survey(config, output, _work=work)
+    run_survey(config, output, work)
     assert len(ran) == 3
     # One input has changed, one product is damaged: these two are missing.
     Path(config["sequence"][1]["files"]).write_bytes(b"new frames")
     (output / "jobs" / table["key"][2] / "report.html").write_text("cut")
-    survey(config, output, _work=work)
+    run_survey(config, output, work)
     assert ran[3:] == ["star1_calints", "star2_calints"]
     # The job of the old content stays.
     assert len(list((output / "jobs").iterdir())) == 4
@@ -242,7 +242,7 @@ def test_a_failure_is_a_row_and_is_tried_again(tmp_path: Path) -> None:
             raise ZeroDivisionError("at the second star")
         return stub(job, folder)
 
-    table = survey(config, output, _work=work)
+    table = run_survey(config, output, work)
     assert list(table["status"]) == ["finished"] * 2 + ["failed"] * 2 + ["finished"] * 2
     message, consequence = table["message"][2:4]
     assert message == "ZeroDivisionError: at the second star"
@@ -252,7 +252,7 @@ def test_a_failure_is_a_row_and_is_tried_again(tmp_path: Path) -> None:
     assert [path.name for path in folder.iterdir()] == ["job.json"]
     assert json.loads((folder / "job.json").read_text())["status"] == "failed"
     assert "at the second star" in (output / "survey.html").read_text()
-    assert list(survey(config, output, _work=stub)["status"]) == ["finished"] * 6
+    assert list(run_survey(config, output, stub)["status"]) == ["finished"] * 6
     assert (folder / "report.html").exists()
     assert hidden(output) == []
 
@@ -266,7 +266,7 @@ def test_an_injection_starts_from_the_finished_reduction(tmp_path: Path) -> None
             assert (folder.parent / str(job.base) / "report.html").exists()
         return stub(job, folder)
 
-    table = survey(config, tmp_path / "out", _work=work)
+    table = run_survey(config, tmp_path / "out", work)
     assert list(table["status"]) == ["finished"] * 2
     assert table["injected_contrast"].tolist() == [None, 1e-5]
     assert table["recovered_contrast"].tolist() == [None, 1.1e-5]
@@ -307,11 +307,11 @@ def test_only_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"products": {}}', '{"products": 3}'])
 def test_a_damaged_record_is_a_missing_job(tmp_path: Path, damage: str) -> None:
     config, output = inputs(tmp_path / "data", 1), tmp_path / "out"
-    (key,) = survey(config, output, _work=stub)["key"]
+    (key,) = run_survey(config, output, stub)["key"]
     record = output / "jobs" / key / "job.json"
     whole = json.loads(record.read_text())
     record.write_text(damage)
-    assert list(survey(config, output, _work=stub)["status"]) == ["finished"]
+    assert list(run_survey(config, output, stub)["status"]) == ["finished"]
     assert json.loads(record.read_text())["products"] == whole["products"]
 
 
@@ -322,7 +322,7 @@ def test_frames_that_change_on_the_way_are_noticed(tmp_path: Path) -> None:
         Path(config["sequence"][1]["files"]).write_bytes(b"other")
         return stub(job, folder)
 
-    table = survey(config, tmp_path / "out", _work=work)
+    table = run_survey(config, tmp_path / "out", work)
     assert list(table["status"]) == ["finished", "failed"]
     assert "star1_calints.fits: the content on" in table["message"][1]
 
@@ -352,7 +352,7 @@ def test_the_tables_say_the_same(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     config = inputs(tmp_path / "data", 2)
     config["sequence"][0]["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
-    table = survey(config, tmp_path / "out", _work=stub)
+    table = run_survey(config, tmp_path / "out", stub)
     ecsv = Table.read(tmp_path / "out" / "results.ecsv")
     rows = parquet.read_table(tmp_path / "out" / "results.parquet").to_pylist()
     assert len(rows) == len(ecsv) == len(table) == 3
@@ -376,7 +376,7 @@ def test_the_tables_are_there_while_the_survey_runs(tmp_path: Path) -> None:
         seen.append(list(Table.read(path)["status"]) if path.exists() else [])
         return stub(job, folder)
 
-    survey(config, output, _work=work)
+    run_survey(config, output, work)
     assert seen[0] == []
     assert seen[1] == ["finished", "waiting", "waiting"]
 
@@ -404,7 +404,7 @@ def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path: Path) ->
         return {**stub(job, folder), **result(HOSTILE), "filter": HOSTILE, "fit_status": HOSTILE}
 
     output = tmp_path / HOSTILE.replace("/", "")
-    survey(config, output, _work=work)
+    run_survey(config, output, work)
     text = (output / "survey.html").read_text(encoding="utf-8")
     tags = Tags(text).tags
     assert text.count("&lt;script&gt;") > 8
@@ -443,8 +443,8 @@ def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, miss
         with pytest.raises(
             IncompatibleSetupError, match=r"pyklip-diffrender\[survey\].*workers = 0"
         ):
-            survey({**config, "workers": 1}, tmp_path / "out", _work=stub)
-    assert list(survey(config, tmp_path / "out", _work=stub)["status"]) == ["finished"]
+            run_survey({**config, "workers": 1}, tmp_path / "out", stub)
+    assert list(run_survey(config, tmp_path / "out", stub)["status"]) == ["finished"]
     assert (tmp_path / "out" / "results.ecsv").exists()
     assert (tmp_path / "out" / "results.parquet").exists() == (missing != "pyarrow")
 
@@ -452,7 +452,7 @@ def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, miss
 def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
     with pytest.raises(IncompatibleSetupError, match=r"output: got .*out, expected a folder"):
-        survey(inputs(tmp_path / "data", 1), tmp_path / "out", _work=stub)
+        run_survey(inputs(tmp_path / "data", 1), tmp_path / "out", stub)
     assert (tmp_path / "out").read_text() == "mine"
 
 
@@ -465,10 +465,10 @@ def test_a_table_that_cannot_be_written_stops_nothing(
     monkeypatch.setattr("pyklip_diffrender.surveys.driver.write_tables", full)
     config, output = inputs(tmp_path / "data"), tmp_path / "out"
     with pytest.raises(IncompatibleSetupError, match="No space left on device"):
-        survey(config, output, _work=stub)
+        run_survey(config, output, stub)
     assert "No space left" in caplog.text
     monkeypatch.undo()
-    assert list(survey(config, output, _work=pytest.fail)["status"]) == ["finished"] * 3
+    assert list(run_survey(config, output, pytest.fail)["status"]) == ["finished"] * 3
 
 
 def test_a_job_that_another_disk_has_is_a_failure(

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
-from pyklip_diffrender.refinement import GaussNewton
 
 __all__ = ["Config", "Injections", "Options", "SequenceConfig", "read_config"]
 
@@ -291,6 +290,9 @@ def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
     if unknown:
         known = ", ".join(_SETTINGS)
         return [f"got the key {_short(key)}, expected one of {known}" for key in unknown]
+    # Late, as everything that waits for PyTorch: workers import this module to unpickle a job.
+    from pyklip_diffrender.refinement import GaussNewton
+
     try:
         GaussNewton.nircam(**settings)
     except DiffrenderError as error:

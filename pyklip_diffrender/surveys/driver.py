@@ -17,12 +17,10 @@ from pyklip_diffrender.surveys.config import Config, read_config
 from pyklip_diffrender.surveys.execution import in_this_process, with_dask
 from pyklip_diffrender.surveys.folders import Record, clean, prepare, read_record
 from pyklip_diffrender.surveys.jobs import Job, plan_jobs
-from pyklip_diffrender.surveys.page import write_page
 from pyklip_diffrender.surveys.runs import Work
 from pyklip_diffrender.surveys.tables import row, table_of, write_tables
-from pyklip_diffrender.surveys.work import reduce_job
 
-__all__ = ["survey"]
+__all__ = ["run_survey", "survey"]
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +34,6 @@ def survey(
     scheduler: str | None = None,
     *,
     progress: bool = False,
-    _work: Work = reduce_job,
 ) -> Table:
     """Reduce many sequences, with and without injected planets, as independent jobs.
 
@@ -75,6 +72,20 @@ def survey(
     Processes are started with the method "spawn", so a script that calls this needs the usual
     ``if __name__ == "__main__":``.
     """
+    from pyklip_diffrender.surveys.work import reduce_job
+
+    return run_survey(config, output, reduce_job, scheduler, progress=progress)
+
+
+def run_survey(
+    config: str | os.PathLike[str] | Mapping[str, Any],
+    output: str | os.PathLike[str],
+    work: Work,
+    scheduler: str | None = None,
+    *,
+    progress: bool = False,
+) -> Table:
+    """Run any work as the jobs of a survey; see `survey`."""
     plan = read_config(config)
     todo = plan_jobs(plan)
     # Workers have their own working directory.
@@ -86,7 +97,7 @@ def survey(
     _log.info("%d of %d jobs are finished", len(todo) - len(missing), len(todo))
     try:
         with tqdm(total=len(missing), desc="survey", disable=not progress) as bar:
-            for job, record in _execute(missing, jobs, plan, scheduler, _work):
+            for job, record in _execute(missing, jobs, plan, scheduler, work):
                 board.add(job, record)
                 bar.set_postfix(failed=board.failures)
                 bar.update()
@@ -163,6 +174,8 @@ class _Board:
         IncompatibleSetupError
             If the output cannot be written to.
         """
+        from pyklip_diffrender.surveys.page import write_page
+
         try:
             write_tables(self.rows, self.output)
             write_page([(job, self.records.get(job.key)) for job in self.todo], self.output)

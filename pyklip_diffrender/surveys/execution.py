@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import time
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
@@ -90,20 +91,24 @@ def with_dask(
         ) from error
     order = _Order(todo, jobs)
     with ExitStack() as stack:
+        address: Any = scheduler
         if scheduler is None:
-            address: Any = stack.enter_context(
-                LocalCluster(
+            try:
+                cluster = LocalCluster(
                     n_workers=min(workers or CPU_COUNT, len(todo)),
                     threads_per_worker=1,
                     processes=True,
                     memory_limit=memory_limit or "auto",
                     dashboard_address=None,
-                    # A worker that dies is the business of the survey, which says so.
-                    silence_logs="critical",
+                    # The survey says itself what became of the job of a worker that died.
+                    silence_logs=logging.CRITICAL,
                 )
-            )
-        else:
-            address = scheduler
+            except RuntimeError as error:
+                raise IncompatibleSetupError(
+                    f"the worker processes cannot be started ({error}). A script that calls survey "
+                    "needs `if __name__ == '__main__':`; workers = 0 does without processes"
+                ) from error
+            address = stack.enter_context(cluster)
         try:
             client = stack.enter_context(Client(address, timeout=_CONNECT))
         except (OSError, ValueError) as error:
