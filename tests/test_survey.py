@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import CancelledError
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -21,8 +22,8 @@ from survey_stubs import HOSTILE, configuration, inputs, result, stub
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import (
     CorruptFileError,
-    DiffrenderError,
     IncompatibleSetupError,
+    RefinementError,
 )
 from pyklip_diffrender.surveys import execution, folders, runs
 from pyklip_diffrender.surveys.config import read_config
@@ -480,21 +481,26 @@ def test_a_job_that_another_disk_has_is_a_failure(
     jobs = folders.prepare(tmp_path / "out")
 
     class Future:
-        status = "finished"
-
-        def exception(self) -> None:
-            return None
-
         def result(self) -> dict[str, Any]:
             return {"status": "finished", "host": "node7"}
 
     record = execution._record_of(Future(), job, jobs)
     assert record["status"] == "failed"
     assert "node7 wrote its products to another disk" in record["message"]
-    lost = Future()
-    lost.status = "cancelled"
-    with pytest.raises(DiffrenderError, match="scheduler was lost"):
-        execution._record_of(lost, job, jobs)
+
+
+def test_a_result_that_dies_with_its_worker_is_read_from_the_disk(tmp_path: Path) -> None:
+    (job,) = planned(inputs(tmp_path / "data", 1))
+    jobs = folders.prepare(tmp_path / "out")
+
+    class Future:
+        def result(self) -> dict[str, Any]:
+            raise CancelledError
+
+    with pytest.raises(RefinementError, match="scheduler was lost"):
+        execution._record_of(Future(), job, jobs)
+    record = runs.run_job(job, jobs, stub)
+    assert execution._record_of(Future(), job, jobs) == record
 
 
 def test_public_name() -> None:

@@ -7,12 +7,13 @@ import logging
 import time
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
-from pyklip_diffrender.surveys.folders import Record, finished
+from pyklip_diffrender.surveys.folders import Record, finished, read_record
 from pyklip_diffrender.surveys.jobs import Job
 from pyklip_diffrender.surveys.runs import Work, failure, run_job
 
@@ -138,17 +139,22 @@ def with_dask(
 
 def _record_of(future: Any, job: Job, jobs: Path) -> Record:
     """Record of a job that dask has finished with."""
-    if future.status in ("cancelled", "lost"):
+    final = jobs / job.key
+    known = read_record(final)
+    if known is not None and known["status"] == "finished":
+        # The truth is on the disk: what dask has may have died with its worker.
+        return known
+    try:
+        record: Record = future.result()
+    except CancelledError as error:
         raise RefinementError(
             "the connection to the scheduler was lost. Finished jobs are kept: start the survey "
             "again to go on"
-        )
-    error = future.exception()
-    if error is not None:
+        ) from error
+    except Exception as error:
         # No error of a job gets here: its workers were killed, by the memory limit for example.
         return failure(job, jobs, error)
-    record: Record = future.result()
-    if record["status"] == "finished" and not _appears(jobs / job.key):
+    if record["status"] == "finished" and not _appears(final):
         lost = IncompatibleSetupError(
             f"the worker on {record['host']} wrote its products to another disk than {jobs}. Put "
             "the output on a disk that all workers share"
