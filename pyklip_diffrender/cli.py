@@ -91,6 +91,14 @@ def _parser() -> argparse.ArgumentParser:
     psf.add_argument("--offset", type=float, nargs=2, default=(0.0, 0.0), metavar=("X", "Y"),
                      help="star from the occulter's centre, arcsec")  # fmt: skip
     psf.set_defaults(run=_psf, products="")
+
+    survey = commands.add_parser(
+        "survey", parents=[common], help="reduce many sequences, with and without injected planets"
+    )
+    survey.add_argument("config", type=Path, help="TOML file that lists sequences and options")
+    survey.add_argument("-o", "--output", type=Path, required=True, help="folder for the products")
+    survey.add_argument("--scheduler", help="address of a dask scheduler, such as tcp://host:8786")
+    survey.set_defaults(run=_survey, products="jobs")
     return parser
 
 
@@ -101,15 +109,18 @@ def main(arguments: abc.Sequence[str] | None = None) -> int:
         level=logging.INFO if options.verbose else logging.WARNING, format="%(message)s"
     )
     try:
-        _require_free(options.output, options.products, options.overwrite)
-        options.run(options)
+        # A survey goes on with what is there.
+        _require_free(
+            options.output, options.products, options.overwrite or options.command == "survey"
+        )
+        status: int | None = options.run(options)
     except DiffrenderError as error:
         print(f"pyklip-diffrender: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("pyklip-diffrender: interrupted; nothing was written", file=sys.stderr)
         return 130
-    return 0
+    return status or 0
 
 
 def _require_free(output: Path, product: str, overwrite: bool) -> None:
@@ -181,6 +192,12 @@ def _psf(options: argparse.Namespace) -> None:
     hdu.header["FILTER"] = options.filter.upper()
     write_fits(fits.HDUList([hdu]), options.output)
     print(f"wrote {options.output}")
+
+
+def _survey(options: argparse.Namespace) -> int:
+    from pyklip_diffrender.surveys.command import run
+
+    return run(options.config, options.output, options.scheduler, progress=not options.quiet)
 
 
 def _detect(options: argparse.Namespace) -> None:

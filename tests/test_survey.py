@@ -15,20 +15,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import QTable, Table
 from survey_stubs import HOSTILE, configuration, inputs, result, stub
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.cli import main
 from pyklip_diffrender.errors import (
     CorruptFileError,
     IncompatibleSetupError,
     RefinementError,
 )
-from pyklip_diffrender.surveys import execution, folders, runs
+from pyklip_diffrender.refinement import FrameFit
+from pyklip_diffrender.surveys import execution, folders, runs, work
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.driver import run_survey, survey
-from pyklip_diffrender.surveys.jobs import Job, plan_jobs
+from pyklip_diffrender.surveys.jobs import Injection, Job, plan_jobs
 from pyklip_diffrender.surveys.page import write_page
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -503,5 +506,114 @@ def test_a_result_that_dies_with_its_worker_is_read_from_the_disk(tmp_path: Path
     assert execution._record_of(Future(), job, jobs) == record
 
 
+@pytest.mark.parametrize("broken", [False, True])
+def test_the_command_says_what_came_of_it(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    broken: bool,
+) -> None:
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        if broken and job.name.startswith("star1"):
+            raise ValueError("no such star")
+        return stub(job, folder)
+
+    monkeypatch.setattr("pyklip_diffrender.surveys.work.reduce_job", work)
+    path = configuration(tmp_path / "survey.toml", inputs(tmp_path / "data", 2))
+    output = tmp_path / "out"
+    assert main(["survey", str(path), "-o", str(output), "--quiet"]) == int(broken)
+    said = capsys.readouterr().out
+    assert f"{2 - broken} of 2 jobs finished, {int(broken)} failed" in said
+    assert "star0_calints: S/N 30.0 at 0.820 arcsec" in said
+    assert ("star1_calints failed: ValueError: no such star" in said) == broken
+    assert f"wrote {output / 'survey.html'}" in said
+
+
+def test_an_interrupted_command_says_that_it_can_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        if job.name.startswith("star1"):
+            raise KeyboardInterrupt
+        return stub(job, folder)
+
+    monkeypatch.setattr("pyklip_diffrender.surveys.work.reduce_job", work)
+    path = configuration(tmp_path / "survey.toml", inputs(tmp_path / "data"))
+    output = tmp_path / "out"
+    assert main(["survey", str(path), "-o", str(output), "-q"]) == 130
+    assert "finished jobs are kept" in capsys.readouterr().err
+    table = Table.read(output / "results.ecsv")
+    assert list(table["status"]) == ["finished", "waiting", "waiting"]
+
+
+def test_a_configuration_with_mistakes_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "survey.toml"
+    path.write_text("workers = -1")
+    assert main(["survey", str(path), "-o", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert "survey.toml: nothing was started:\n  workers: got -1" in said
+    assert not (tmp_path / "out").exists()
+
+
 def test_public_name() -> None:
     assert dr.survey is survey
+
+
+# -- the real work ---------------------------------------------------------------------------------
+
+ROLLS = (20.0, 60.0)
+
+
+def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for() -> None:
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    scene, opd = dr.Scene(dr.Star(exposure=200.0)), dr.random_opd(1, npix=128)
+    star = dr.simulate(model, scene, opd, seed=5)
+    nothing = np.zeros((32, 32))
+    values = {"flux": np.array([scene.star.photons]), "background": np.zeros(1)}
+    frames = [
+        FrameFit(
+            model, replace(star, position_angles=np.array([roll])), {}, opd.data, nothing,
+            nothing, values, {}, nothing,
+        )
+        for roll in ROLLS
+    ]  # fmt: skip
+    planet = Injection(1e-4, 0.6, 100.0)
+    sequence = work._with_planet(frames, planet)
+    assert len(sequence.science) == 2
+    for roll, frame in zip(ROLLS, sequence.science, strict=True):
+        light = (frame.data - star.data)[0]
+        # Position angles of planets in a scene are counted from +y of the frame.
+        truth = dr.Planet(planet.contrast, planet.separation, planet.angle - roll)
+        expected = dr.simulate(model, replace(scene, planets=(truth,)), opd, seed=5).data[0]
+        x, y = np.round(np.array(truth.offset) / 0.0624 + 15.5).astype(int)
+        core = (slice(y - 2, y + 3), slice(x - 2, x + 3))
+        assert light[core].max() == light.max()
+        # The photon noise of the star under the planet is 3 % of the planet.
+        assert light[core].sum() == pytest.approx((expected - star.data[0])[core].sum(), rel=0.1)
+
+
+def test_what_is_recovered_is_the_candidate_at_the_place() -> None:
+    planet = Injection(1e-4, 0.6, 100.0)
+    x, y = dr.Planet(1e-4, 0.6, 100.0 - 20.0).offset
+    measured = {"contrast": 9e-5, "contrast_error": 1e-5, "snr": 9.0}
+
+    class Found:
+        north = 20.0
+        table = QTable({"x": [0.5, x + 0.03] * u.arcsec, "y": [0.5, y] * u.arcsec,
+                        **{key: [7.0, value] for key, value in measured.items()}})  # fmt: skip
+
+        def measure(self, offsets: list[Any]) -> QTable:
+            np.testing.assert_allclose(offsets, [[x, y]])
+            return QTable({key: [value / 2] for key, value in measured.items()})
+
+    class Whole:
+        detection = Found()
+
+    assert work._recovered(Whole(), planet) == {**measured, "detected": True}
+    Found.table = Found.table[:1]
+    assert work._recovered(Whole(), planet)["snr"] == 4.5
+    assert work._recovered(Whole(), planet)["detected"] is False
+    Found.table = Found.table[:0]
+    assert work._recovered(Whole(), planet)["detected"] is False

@@ -99,7 +99,8 @@ def write_record(folder: Path, job: Job, record: Mapping[str, Any]) -> Record:
     whole = {**record, "job": asdict(job), "products": products}
     text = json.dumps(whole, indent=2, allow_nan=False) + "\n"
     (folder / RECORD).write_text(text, encoding="utf-8")
-    return whole
+    read: Record = json.loads(text)
+    return read
 
 
 def read_record(final: Path) -> Record | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import abc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,9 @@ def reduce_job(job: Job, folder: Path) -> dict[str, Any]:
         "settings": GaussNewton.nircam(**options.settings) if options.settings else None,
     }
     if job.injection is not None and job.base is not None:
-        sequence, pattern = _injected(folder.parent / job.base, job.injection)
-        reduction = reduce(sequence, job.opd, systematics=pattern or "off", **common)
+        fit = Refinement.read(folder.parent / job.base / "fit.fits")
+        sequence = _with_planet(fit.frames, job.injection)
+        reduction = reduce(sequence, job.opd, systematics=fit.systematics or "off", **common)
         extra = {"recovered": _recovered(reduction, job.injection)}
     else:
         sequence = Sequence.from_files(job.files, target=job.target, filter=job.filter)
@@ -78,18 +80,17 @@ def planet_image(
     return frame.flux * np.asarray(image.double().numpy())
 
 
-def _injected(base: Path, planet: Injection) -> tuple[Sequence, Systematics | None]:
-    """The frames of a finished job with a planet, and the pattern that it used."""
-    fit = Refinement.read(base / "fit.fits")
-    first = fit.frames[0].observation
+def _with_planet(frames: abc.Sequence[FrameFit], planet: Injection) -> Sequence:
+    """The frames of a fit with a planet added."""
+    first = frames[0].observation
     science = []
-    for frame in fit.frames:
+    for frame in frames:
         observation = frame.observation
         light = planet_image(
             frame, _place(planet, first.position_angle), observation.roll_from(first)
         )
         science.append(replace(observation, data=observation.data + planet.contrast * light))
-    return Sequence(first.target, tuple(science)), fit.systematics
+    return Sequence(first.target, tuple(science))
 
 
 def _place(planet: Injection, north: float) -> tuple[float, float]:
