@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ from tqdm import tqdm
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.surveys.config import Config, read_config
 from pyklip_diffrender.surveys.execution import in_this_process, with_dask
-from pyklip_diffrender.surveys.folders import Record, clean, prepare, read_record
+from pyklip_diffrender.surveys.folders import Record, clean, prepare, read_record, staging
 from pyklip_diffrender.surveys.jobs import Job, plan_jobs
 from pyklip_diffrender.surveys.runs import Work
 from pyklip_diffrender.surveys.tables import row, table_of, write_tables
@@ -174,13 +175,21 @@ class _Board:
         IncompatibleSetupError
             If the output cannot be written to.
         """
-        from pyklip_diffrender.surveys.page import write_page
+        from pyklip_diffrender.surveys.page import page
 
+        text = page([(job, self.records.get(job.key)) for job in self.todo], self.output.name)
+        folder = None
         try:
-            write_tables(self.rows, self.output)
-            write_page([(job, self.records.get(job.key)) for job in self.todo], self.output)
+            folder = staging(self.output / "jobs", "tables")
+            write_tables(self.rows, folder)
+            (folder / "survey.html").write_text(text, encoding="utf-8")
+            for path in folder.iterdir():
+                os.replace(path, self.output / path.name)
         except OSError as error:
             raise IncompatibleSetupError(
                 f"output: the tables cannot be written to {self.output} ({error.strerror}). Make "
                 "room, and start the survey again: finished jobs are kept"
             ) from error
+        finally:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)

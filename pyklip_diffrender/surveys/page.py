@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender import __version__
-from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.plotting import draw_limits, to_png
 from pyklip_diffrender.report import pieces
 from pyklip_diffrender.report.pictures import Picture
@@ -19,30 +17,23 @@ from pyklip_diffrender.report.words import number, plus_minus, probability, scie
 from pyklip_diffrender.surveys.folders import Record
 from pyklip_diffrender.surveys.jobs import Job
 
-__all__ = ["write_page"]
+__all__ = ["page"]
 
 Rows = Sequence[tuple[Job, Record | None]]
 
 _GIB = 2.0**30
 
 
-def write_page(rows: Rows, output: Path) -> Path:
-    """Write ``survey.html``, with every value escaped: headers of files may hold anything.
+def page(rows: Rows, name: str) -> str:
+    """The page, with every value escaped: headers of files may hold anything.
 
     Parameters
     ----------
     rows : sequence of (Job, dict or None)
         Jobs with their records; None for one that waits.
-    output : Path
-        Folder of the survey.
+    name : str
+        Of the survey.
     """
-    path = output / "survey.html"
-    with replacing(path) as temporary:
-        temporary.write_text(_page(rows, output.name), encoding="utf-8")
-    return path
-
-
-def _page(rows: Rows, name: str) -> str:
     sections = [
         pieces.section("Contrast", _limits(rows)),
         pieces.section("Candidates", _candidates(rows)),

@@ -9,7 +9,6 @@ from typing import Any
 
 from astropy.table import MaskedColumn, Table
 
-from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.surveys.folders import Record
 from pyklip_diffrender.surveys.jobs import Job
 
@@ -92,18 +91,15 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def write_tables(rows: Sequence[Mapping[str, Any]], output: Path) -> list[Path]:
+def write_tables(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
     """Write ``results.ecsv`` and, where pyarrow is installed, ``results.parquet``."""
-    ecsv, parquet = output / "results.ecsv", output / "results.parquet"
-    with replacing(ecsv) as temporary:
-        table_of(rows).write(temporary, format="ascii.ecsv", overwrite=True)
+    table_of(rows).write(folder / "results.ecsv", format="ascii.ecsv")
     if find_spec("pyarrow") is None:
-        return [ecsv]
+        return
     import pyarrow as pa
     from pyarrow import parquet as files
 
     kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
     schema = pa.schema([(name, kinds[kind]) for name, kind in COLUMNS.items()])
-    with replacing(parquet) as temporary:
-        files.write_table(pa.Table.from_pylist(list(rows), schema=schema), temporary)
-    return [ecsv, parquet]
+    table = pa.Table.from_pylist(list(rows), schema=schema)
+    files.write_table(table, folder / "results.parquet")

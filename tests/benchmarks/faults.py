@@ -91,7 +91,7 @@ WORK: dict[str, Callable[[Job, Path], dict[str, Any]]] = {
 def run_client(config: str, output: str, work: str, scheduler: str | None) -> int:
     """Run a survey as the command line does, without the page, whose imports take longer."""
     page = ModuleType("pyklip_diffrender.surveys.page")
-    page.write_page = lambda *_: None  # type: ignore[attr-defined]
+    page.page = lambda *_: "no page"  # type: ignore[attr-defined]
     sys.modules[page.__name__] = page
     try:
         run_survey(config, output, WORK[work], scheduler)
@@ -144,7 +144,9 @@ class Trial:
     def staged(self) -> list[int]:
         """Processes of the folders that are not published; those killed have left theirs."""
         names = [path.name for path in (self.output / "jobs").glob(".*-*-*@*")]
-        return [int(name.split("-")[1]) for name in names if not name.startswith(".probe")]
+        return [
+            int(name.split("-")[1]) for name in names if not name.startswith((".probe", ".tables"))
+        ]
 
     def finished(self) -> dict[str, int]:
         """Finished jobs by key, each with the time of its record."""
