@@ -40,7 +40,7 @@ def draw_limits(
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6.4, 4.6), layout="constrained")
+    figure = Figure(figsize=(5.0, 4.0), layout="constrained")
     ax = figure.add_subplot()
     few = len(curves) <= len(_COLORS)
     for k, (name, separation, contrast) in enumerate(curves):

@@ -48,7 +48,7 @@ class _Order:
         waiting = self.later.pop(job.key, [])
         if record["status"] == "finished":
             return waiting, []
-        error = RefinementError(f"the reduction without a planet failed: {record['message']}")
+        error = RefinementError("the reduction without a planet failed, see there")
         return [], [(each, failure(each, self.jobs, error)) for each in waiting]
 
 

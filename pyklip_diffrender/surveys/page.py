@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from html import escape
 from typing import Any
 
@@ -57,10 +58,11 @@ def page(rows: Rows, name: str) -> str:
         ("Injected planets", str(sum(job.injection is not None for job, _ in rows))),
         ("Time of all jobs", _time(seconds)),
         ("Largest memory of a job", _memory(peak)),
-        ("Software", f"pyklip_diffrender {__version__}"),
     ]
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M")
     header = (
         f"<header>\n<h1>{escape(name)}</h1>\n"
+        f'<p class="setup">Survey with pyklip_diffrender {__version__}, state of {now} UTC</p>\n'
         f'<p class="result">{escape(_sentence(rows))}</p>\n'
         f'<div class="status {tone}"><strong>{escape(", ".join(parts))}.</strong>'
         f"<p>{advice}</p></div>\n{pieces.facts(facts)}\n</header>\n"
@@ -118,7 +120,7 @@ def _limits(rows: Rows) -> str:
         sigmas,
     )
     picture = Picture(
-        to_png(figure),
+        to_png(figure, dpi=200),
         f"Curves of the contrast at {sigmas:g} sigma against separation in arcsec for "
         f"{pieces.count(len(curves), 'sequence')}; the table has their values.",
         f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "
@@ -197,7 +199,7 @@ def _jobs(rows: Rows) -> str:
         candidates = result.get("candidates")
         table.append(
             [
-                _report(job) if _status(record) == "finished" else str(job),
+                _report(job, _label(job)) if _status(record) == "finished" else _label(job),
                 result.get("filter") or job.filter or "",
                 _status(record),
                 (result.get("fit_status") or "").lower().replace("_", " "),
@@ -209,7 +211,7 @@ def _jobs(rows: Rows) -> str:
         )
     header = ["Job", "Filter", "Job status", "Fit status", "Reduced chi-squared", "Candidates",
               "Time", "Peak memory"]  # fmt: skip
-    return pieces.table(header, table)
+    return pieces.table(header, table, wrap=0)
 
 
 def _failures(rows: Rows) -> str:
@@ -217,15 +219,23 @@ def _failures(rows: Rows) -> str:
     if not failed:
         return pieces.note("No job has failed.")
     return "\n".join(
-        f"<h3>{escape(str(job))}</h3>\n<p>{escape(record['message'])}</p>\n"
+        f"<h3>{escape(_label(job))}</h3>\n<p>{escape(record['message'])}</p>\n"
         "<details><summary>Traceback</summary>"
         f'<div class="scroll" tabindex="0"><pre>{escape(record["traceback"])}</pre></div></details>'
         for job, record in failed
     )
 
 
-def _report(job: Job) -> pieces.Markup:
-    return pieces.link(f"jobs/{job.key}/report.html", str(job))
+def _label(job: Job) -> str:
+    planet = job.injection
+    if planet is None:
+        return job.name
+    place = f"{planet.separation:g} arcsec, {planet.angle:g} deg"
+    return f"{job.name}, planet of {scientific(planet.contrast)} at {place}"
+
+
+def _report(job: Job, label: str | None = None) -> pieces.Markup:
+    return pieces.link(f"jobs/{job.key}/report.html", label or job.name)
 
 
 def _time(seconds: float) -> str:

@@ -64,7 +64,7 @@ def failure(job: Job, jobs: Path, error: BaseException, **circumstances: Any) ->
     record = {
         **circumstances,
         "status": "failed",
-        "message": _printable(error),
+        "message": f"{type(error).__name__}: {error}".removesuffix(": "),
         "traceback": "".join(traceback.format_exception(error)),
         "result": {},
     }
@@ -77,11 +77,6 @@ def failure(job: Job, jobs: Path, error: BaseException, **circumstances: Any) ->
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
     return record
-
-
-def _printable(error: BaseException) -> str:
-    """The last line of its traceback."""
-    return "".join(traceback.format_exception_only(error)).strip()
 
 
 def _require_same_world(job: Job, jobs: Path) -> None:
