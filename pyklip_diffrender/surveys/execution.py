@@ -8,7 +8,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,12 @@ _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 _CONNECT = 30.0
 """Seconds to wait for a scheduler."""
+
+_PULSE = 0.1
+"""Seconds between looks at what has finished."""
+
+_ALONE = 600.0
+"""Seconds without any worker on this machine after which the survey gives up."""
 
 _PATIENCE = 20
 """Half seconds to wait for a folder that another machine has made: network disks lag."""
@@ -96,8 +102,12 @@ def with_dask(
         ) from error
     order = _Order(todo, jobs)
     with ExitStack() as stack:
+        cluster: Any = None
         address: Any = scheduler
         if scheduler is None:
+            stack.enter_context(_without_messages("distributed"))
+            # A worker that is not back after this time is given up, by default after 15 seconds.
+            stack.enter_context(config.set({"distributed.deploy.lost-worker-timeout": "7 days"}))
             try:
                 # Dask makes glibc give freed memory back at once, which slows fits down.
                 with config.set({f"{_ENVIRONMENT}.MALLOC_TRIM_THRESHOLD_": None}):
@@ -106,8 +116,8 @@ def with_dask(
                         threads_per_worker=1,
                         processes=True,
                         memory_limit=memory_limit or "auto",
-                        dashboard_address=None,
-                        # The survey says itself what became of the job of a worker that died.
+                        # Any free port; None would ask for a certain one, and warn.
+                        dashboard_address="127.0.0.1:0",
                         silence_logs=logging.CRITICAL,
                         env=dict.fromkeys(_THREADS, "1"),
                     )
@@ -132,16 +142,39 @@ def with_dask(
 
         running = {submit(job): job for job in order.first}
         completed = as_completed(list(running), raise_errors=False)
-        for future in completed:
-            job = running.pop(future)
-            record = _record_of(future, job, jobs)
-            yield job, record
-            ready, failed = order.after(job, record)
-            for each in ready:
-                new = submit(each)
-                running[new] = each
-                completed.add(new)
-            yield from failed
+        seen = time.monotonic()
+        while running:
+            for future in completed.next_batch(block=False):
+                job = running.pop(future)
+                record = _record_of(future, job, jobs)
+                yield job, record
+                ready, failed = order.after(job, record)
+                for each in ready:
+                    new = submit(each)
+                    running[new] = each
+                    completed.add(new)
+                yield from failed
+            time.sleep(_PULSE)
+            # Those of a cluster elsewhere may wait in a queue for days.
+            if scheduler is not None or cluster.scheduler.workers:
+                seen = time.monotonic()
+            elif time.monotonic() > seen + _ALONE:
+                raise RefinementError(
+                    "no worker process is left, and none can be started. Look at the memory of the "
+                    "machine and start the survey again: finished jobs are kept"
+                )
+
+
+@contextmanager
+def _without_messages(name: str) -> Iterator[None]:
+    """Silence a library; the survey says itself what became of the job of a worker that died."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def _record_of(future: Any, job: Job, jobs: Path) -> Record:
@@ -159,8 +192,15 @@ def _record_of(future: Any, job: Job, jobs: Path) -> Record:
             "again to go on"
         ) from error
     except Exception as error:
-        # No error of a job gets here: its workers were killed, by the memory limit for example.
-        return failure(job, jobs, error)
+        # No error of a job gets here.
+        if type(error).__name__ != "KilledWorker":
+            return failure(job, jobs, error)
+        killed = RefinementError(
+            "every worker that took this job was killed. If they ran out of memory, raise "
+            "memory_limit, with fewer workers where the machine has no more"
+        )
+        killed.__cause__ = error
+        return failure(job, jobs, killed)
     if record["status"] == "finished" and not _appears(final):
         lost = IncompatibleSetupError(
             f"the worker on {record['host']} wrote its products to another disk than {jobs}. Put "
