@@ -9,7 +9,9 @@ import subprocess
 import sys
 from concurrent.futures import CancelledError
 from dataclasses import replace
+from datetime import date
 from html.parser import HTMLParser
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -81,15 +83,16 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_options_of_a_sequence_come_before_those_of_all(tmp_path: Path) -> None:
     config = inputs(tmp_path, 2)
-    config["options"] = {"threshold": 6, "size": 48, "settings": {"cycles": 8, "robust": 4.0}}
+    config["options"] = {"threshold": 6, "size": 48, "settings": {"cycles": 8, "robust": inf}}
     config["injections"] = PLANETS
     config["sequence"][1] |= {"threshold": 7.5, "settings": {"cycles": 12.0}, "injections": {}}
     first, second = read_config(config).sequences
     assert (first.options.size, first.options.threshold) == (40, 6.0)
     assert (second.options.size, second.options.threshold) == (40, 7.5)
-    assert second.options.settings == {"cycles": 12.0, "robust": 4.0}
+    assert second.options.settings == {"cycles": 12.0, "robust": inf}
     assert first.injections.contrasts == second.injections.contrasts == (1e-5, 3e-6)
     assert len(planned(config)) == 2 * (1 + 2 * 2 * 2)
+    assert set(run_survey(config, tmp_path / "out", stub)["status"]) == {"finished"}
 
 
 @pytest.mark.parametrize(
@@ -104,6 +107,8 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path: Path) -> None:
         ((), "options", {"threshold": "5"}, ["options: threshold", "'5'", "positive"]),
         ((), "options", {"settings": {"basis": 1}}, ["options: settings", "'basis'", "cycles"]),
         ((), "options", {"settings": {"cycles": "x"}}, ["options: settings", "cycles", "'x'"]),
+        ((), "options", {"settings": {"free": [date(2022, 8, 1)]}}, ["settings", "a date"]),
+        ((), "options", {"settings": {"robust": float("nan")}}, ["options: settings", "nan"]),
         ((), "options", {"settings": {"tolerance": []}}, ["options: settings", "wrong type"]),
         ((), "injections", {"contrasts": [1e-5]}, ["injections", "both"]),
         ((), "injections", {"angles": 3}, ["injections: angles", "a list"]),
@@ -251,6 +256,9 @@ def test_a_failure_is_a_row_and_is_tried_again(tmp_path: Path) -> None:
     assert message == "ZeroDivisionError: at the second star"
     assert "without a planet failed" in consequence
     assert "in work" in table["traceback"][2]
+    # ECSV drops the blanks at the start of a line.
+    read = Table.read(output / "results.ecsv")["traceback"]
+    assert [read[k].split() for k in (2, 3)] == [table["traceback"][k].split() for k in (2, 3)]
     folder = output / "jobs" / table["key"][2]
     assert [path.name for path in folder.iterdir()] == ["job.json"]
     assert json.loads((folder / "job.json").read_text())["status"] == "failed"

@@ -290,6 +290,8 @@ def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
     if unknown:
         known = ", ".join(_SETTINGS)
         return [f"got the key {_short(key)}, expected one of {known}" for key in unknown]
+    if not _is_plain(settings):
+        return ["got a date or nan, expected numbers, text, lists and tables"]
     # Late, as everything that waits for PyTorch: workers import this module to unpickle a job.
     from pyklip_diffrender.refinement import GaussNewton
 
@@ -374,6 +376,15 @@ def _mapping(value: Any) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         raise ValueError
     return dict(value)
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a value has only what a record of the job can hold."""
+    if isinstance(value, Mapping):
+        return all(map(_is_plain, value.values()))
+    if isinstance(value, list):
+        return all(map(_is_plain, value))
+    return isinstance(value, str | int | float) and value == value
 
 
 def _tables(value: Any) -> list[Any]:

@@ -96,7 +96,10 @@ def write_record(folder: Path, job: Job, record: Mapping[str, Any]) -> Record:
         for path in sorted(folder.rglob("*"))
         if path.is_file() and path.name != RECORD
     }
-    whole = {**record, "job": asdict(job), "products": products}
+    about = asdict(job)
+    # JSON has no infinity.
+    about["options"]["settings"] = {k: repr(v) for k, v in job.options.settings.items()}
+    whole = {**record, "job": about, "products": products}
     text = json.dumps(whole, indent=2, allow_nan=False) + "\n"
     (folder / RECORD).write_text(text, encoding="utf-8")
     read: Record = json.loads(text)

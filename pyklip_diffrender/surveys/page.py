@@ -50,7 +50,11 @@ def page(rows: Rows, name: str) -> str:
     parts = [f"{done} of {pieces.count(len(rows), 'job')} finished"]
     parts += [f"{failed} failed"] if failed else []
     parts += [f"{waiting} not finished yet"] if waiting else []
-    advice = "Start the survey again to try what is missing." if done < len(rows) else ""
+    advice = (
+        "When the survey has ended, start it again to do what is missing."
+        if done < len(rows)
+        else ""
+    )
     seconds = sum(record["seconds"] for _, record in rows if record and "seconds" in record)
     peak = max((record.get("peak_memory_bytes") or 0 for _, record in rows if record), default=0)
     facts = [
@@ -124,7 +128,7 @@ def _limits(rows: Rows) -> str:
         f"Curves of the contrast at {sigmas:g} sigma against separation in arcsec for "
         f"{pieces.count(len(curves), 'sequence')}; the table has their values.",
         f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "
-        "median of all position angles. Circles are candidates.",
+        f"median of all position angles.{' Circles are candidates.' if candidates else ''}",
     )
     separations = sorted(
         {each["separation_arcsec"] for _, result in curves for each in result["limits"]}
