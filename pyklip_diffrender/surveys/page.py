@@ -235,7 +235,8 @@ def _label(job: Job) -> str:
     if planet is None:
         return job.name
     place = f"{planet.separation:g} arcsec, {planet.angle:g} deg"
-    return f"{job.name}, planet of {scientific(planet.contrast)} at {place}"
+    contrast = scientific(planet.contrast).replace(" ", "\u00a0")
+    return f"{job.name}, planet of {contrast} at {place}"
 
 
 def _report(job: Job, label: str | None = None) -> pieces.Markup:

@@ -349,7 +349,7 @@ def out_of_memory(folder: Path, *_: int) -> str:
         require((len(finished), failed) == (JOBS - 1, 1), (finished, failed))
         require(leftovers(trial.output) == [], leftovers(trial.output))
         said.append(word)
-    return f"1 job failed by {' and 1 by '.join(said)}, the other {2 * JOBS - 2} finished"
+    return f"1 job failed ({said[0]}), 1 (its worker {said[1]}), the other {2 * JOBS - 2} finished"
 
 
 @contextmanager
