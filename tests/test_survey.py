@@ -624,3 +624,31 @@ def test_what_is_recovered_is_the_candidate_at_the_place() -> None:
     assert work._recovered(Whole(), planet)["detected"] is False
     Found.table = Found.table[:0]
     assert work._recovered(Whole(), planet)["detected"] is False
+
+
+@pytest.mark.slow
+def test_real_frames_with_and_without_a_planet(tmp_path: Path, shared_data: Path) -> None:
+    """A small field and a coarse fit: the errors are large, and the planet is ten of them."""
+    config = {
+        "workers": 0,
+        "options": {
+            "size": 40, "systematics": "off", "settings": {"cycles": [8.0], "max_iterations": 6},
+        },
+        "injections": {"contrasts": [3e-3], "separations": [0.8], "angles": [330.0]},
+        "sequence": [
+            {
+                "files": str(shared_data / "hip65426_f444w_calints.fits.gz"),
+                "opd": str(shared_data / "opd_2022-07-30.fits.gz"),
+            }
+        ],
+    }  # fmt: skip
+    table = survey(config, tmp_path)
+    assert list(table["status"]) == ["finished"] * 2
+    assert list(table["target"]) == ["HIP-65426"] * 2
+    planet = table[1]
+    assert planet["recovered_snr"] > 5
+    away = abs(planet["recovered_contrast"] - planet["injected_contrast"])
+    assert away < 3 * planet["recovered_error"]
+    for key in table["key"]:
+        products = {path.name for path in (tmp_path / "jobs" / key).iterdir()}
+        assert {"detection.fits", "candidates.ecsv", "fit.fits", "report.html"} <= products
