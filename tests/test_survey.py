@@ -527,10 +527,14 @@ def test_the_command_says_what_came_of_it(
 
     monkeypatch.setattr("pyklip_diffrender.surveys.work.reduce_job", work)
     path = configuration(tmp_path / "survey.toml", inputs(tmp_path / "data", 2))
+    with path.open("a") as file:
+        file.write("\ninjections = { contrasts = [1e-5], separations = [0.5] }")
     output = tmp_path / "out"
     assert main(["survey", str(path), "-o", str(output), "--quiet"]) == int(broken)
     said = capsys.readouterr().out
-    assert f"{2 - broken} of 2 jobs finished, {int(broken)} failed" in said
+    assert f"{3 - 2 * broken} of 3 jobs finished, {2 * broken} failed" in said
+    # The injected planet, which the stub finds beside star 1, is no candidate.
+    assert said.count("S/N") == 2 - broken
     assert "star0_calints: S/N 30.0 at 0.820 arcsec" in said
     assert ("star1_calints failed: ValueError: no such star" in said) == broken
     assert f"wrote {output / 'survey.html'}" in said

@@ -29,7 +29,9 @@ def run(config: Path, output: Path, scheduler: str | None = None, *, progress: b
     failed = table[table["status"] == "failed"]
     counts = {status: int((table["status"] == status).sum()) for status in ("finished", "failed")}
     print(f"{counts['finished']} of {len(table)} jobs finished, {counts['failed']} failed")
-    for row in table[(table["status"] == "finished") & ~table["snr"].mask]:
+    # The candidates of a job with an injected planet include that planet.
+    real = (table["status"] == "finished") & table["injected_contrast"].mask
+    for row in table[real & ~table["snr"].mask]:
         print(
             f"  {row['name']}: S/N {row['snr']:.1f} at {row['separation_arcsec']:.3f} arcsec, "
             f"contrast {row['contrast']:.2e} +- {row['contrast_error']:.1e}"
