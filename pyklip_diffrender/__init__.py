@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.scene.real_frames import model_for
     from pyklip_diffrender.scene.sequence import Sequence
     from pyklip_diffrender.scene.simulation import simulate
+    from pyklip_diffrender.surveys import survey
     from pyklip_diffrender.wavefront.map_choice import choose_map
     from pyklip_diffrender.wavefront.opd import drift, random_opd, read_opd
     from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
@@ -84,6 +85,7 @@ __all__ = [
     "refine",
     "register",
     "simulate",
+    "survey",
     "unregister",
 ]
 
@@ -105,6 +107,7 @@ _NAMES = {
     "scene.sequence": "Sequence",
     "scene.simulation": "simulate",
     "wavefront.map_choice": "choose_map",
+    "surveys": "survey",
     "wavefront.opd": "drift random_opd read_opd",
     "wavefront.priors": "WavefrontPrior learn_prior",
 }

@@ -34,6 +34,7 @@ PACKAGES = (
     "demo",
     "plotting",
     "report",
+    "surveys",
     "cli",
 )
 """Top-level modules and packages in order: each imports only from those before it.
@@ -47,9 +48,12 @@ LATE = ("plotting", "report")
 """What a method may import when it is called."""
 
 OWNERS = {
+    "dask": "surveys",
+    "distributed": "surveys",
     "matplotlib": "plotting",
     "mpl_toolkits": "plotting",
     "poppy": "bridges",
+    "pyarrow": "surveys",
     "pyklip": "pyklip_backend",
     "stpsf": "bridges",
     "webbpsf": "bridges",

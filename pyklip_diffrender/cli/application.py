@@ -38,6 +38,7 @@ for _command in (
     commands.demo,
     commands.reduce_frames,
     commands.detect_in_file,
+    commands.survey,
     commands.psf,
     doctor,
 ):

@@ -12,6 +12,7 @@ import click
 
 from pyklip_diffrender.cli.options import (
     Command,
+    common,
     file_type,
     option,
     outputs,
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.io.opd_map import OPDMap
     from pyklip_diffrender.scene.sequence import Sequence
 
-__all__ = ["demo", "detect_in_file", "psf", "reduce_frames"]
+__all__ = ["demo", "detect_in_file", "psf", "reduce_frames", "survey"]
 
 _DEMO = ("demo.fits", "demo.ecsv", "candidates.ecsv", "demo.png")
 _REDUCTION = (
@@ -219,6 +220,31 @@ def psf(
     hdu.header["FILTER"] = filter.upper()
     write_fits(fits.HDUList([hdu]), output)
     click.echo(f"wrote {output}")
+
+
+@click.command(
+    "survey",
+    cls=Command,
+    epilog="""\b
+Examples:
+  pyklip-diffrender survey survey.toml -o products
+  pyklip-diffrender survey survey.toml -o products --scheduler tcp://host:8786""",
+)
+@click.argument("plan", type=file_type())
+@option("-o", "--output", type=file_type(), required=True, metavar="FOLDER",
+        help="Folder for jobs and tables. What is finished there is not repeated.")  # fmt: skip
+@option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler; default a local cluster.")
+@common
+@click.pass_obj
+def survey(run: Run, /, plan: Path, output: Path, scheduler: str | None) -> int:
+    """Reduce many sequences, with and without injected planets, as jobs.
+
+    PLAN is a TOML file with the sequences and their options. The same command goes on where an
+    earlier one was stopped.
+    """
+    from pyklip_diffrender.surveys.command import run as run_survey
+
+    return run_survey(plan, output, scheduler, progress=run.progress)
 
 
 def _reduction(

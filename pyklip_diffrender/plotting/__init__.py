@@ -9,11 +9,13 @@ from pyklip_diffrender.plotting.results import (
     plot_refinement,
     plot_system,
 )
+from pyklip_diffrender.plotting.surveys import draw_limits
 
 __all__ = [
     "draw_demo",
     "draw_detection",
     "draw_image",
+    "draw_limits",
     "draw_search",
     "draw_star",
     "draw_subtraction",

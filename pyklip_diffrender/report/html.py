@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from importlib import resources
 from string import Template
 from typing import Any
 
+from pyklip_diffrender.report import pieces
 from pyklip_diffrender.report.pictures import Picture
 from pyklip_diffrender.report.words import (
     number,
@@ -20,20 +19,7 @@ from pyklip_diffrender.report.words import (
 
 __all__ = ["page"]
 
-_PAGE = Template("""\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy"
- content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>$title</title>
-<style>
-$style</style>
-</head>
-<body>
+_HEADER = Template("""\
 <header>
 <h1>$target</h1>
 <p class="setup">$setup</p>
@@ -44,11 +30,6 @@ $style</style>
 </div>
 $facts
 </header>
-<main>
-$sections
-</main>
-</body>
-</html>
 """)
 
 _PRODUCTS = {
@@ -90,14 +71,15 @@ def page(
     message = status["message"]
     tone = "good" if status["name"] == "CONVERGED" else "warn" if status["usable"] else "bad"
     sections = [
-        _section("Search", _pictures(search, "pair"), _candidates(summary), _limits(summary)),
-        _section("Star subtraction", *_star(summary, stars)),
-        _section("Wavefront", _wavefront(summary), _pictures(wavefront)),
-        _section("Frames", _frames(summary), _left_out(summary)),
-        _section("Provenance", _provenance(summary, files)),
+        pieces.section(
+            "Search", pieces.pictures(search, "pair"), _candidates(summary), _limits(summary)
+        ),
+        pieces.section("Star subtraction", *_star(summary, stars)),
+        pieces.section("Wavefront", _wavefront(summary), pieces.pictures(wavefront)),
+        pieces.section("Frames", _frames(summary), _left_out(summary)),
+        pieces.section("Provenance", _provenance(summary, files)),
     ]
     text = {
-        "title": f"{summary['target']}, {summary['filter'] or 'no filter'}: report",
         "target": summary["target"],
         "setup": _setup(summary),
         # Numbers are not broken over lines.
@@ -106,13 +88,12 @@ def page(
         "status": message[:1].upper() + message[1:] + ("" if message.endswith(".") else "."),
         "advice": status["advice"],
     }
-    style = resources.files("pyklip_diffrender.report").joinpath("page.css")
-    return _PAGE.substitute(
+    header = _HEADER.substitute(
         {name: escape(str(value)) for name, value in text.items()},
-        style=style.read_text(encoding="utf-8"),
-        facts=_facts(_key_facts(summary)),
-        sections="\n".join(sections),
+        facts=pieces.facts(_key_facts(summary)),
     )
+    title = f"{summary['target']}, {summary['filter'] or 'no filter'}: report"
+    return pieces.document(title, header, sections)
 
 
 def _setup(summary: Mapping[str, Any]) -> str:
@@ -126,8 +107,8 @@ def _setup(summary: Mapping[str, Any]) -> str:
         summary["image_mask"],
         summary["program"] and f"program {summary['program']}",
         " to ".join(dict.fromkeys(filter(None, dates))),
-        _count(len(targets), "frame") + " of the target",
-        _count(references, "reference frame") if references else None,
+        pieces.count(len(targets), "frame") + " of the target",
+        pieces.count(references, "reference frame") if references else None,
     ]
     return " · ".join(str(part) for part in parts if part)
 
@@ -159,7 +140,7 @@ def _age(days: float | None) -> str:
 
 def _candidates(summary: Mapping[str, Any]) -> str:
     if not summary["candidates"]:
-        return _note(f"No candidate has an S/N above {summary['threshold_snr']:g}.")
+        return pieces.note(f"No candidate has an S/N above {summary['threshold_snr']:g}.")
     rows = [
         [
             str(k),
@@ -183,7 +164,7 @@ def _candidates(summary: Mapping[str, Any]) -> str:
         "errors of the star model are not Gaussian and can be more frequent. One epoch does "
         "not show whether a candidate is bound or in the background."
     )
-    return "<h3>Candidates</h3>" + _table(header, rows) + _note(note)
+    return "<h3>Candidates</h3>" + pieces.table(header, rows) + pieces.note(note)
 
 
 def _limits(summary: Mapping[str, Any]) -> str:
@@ -204,7 +185,7 @@ def _limits(summary: Mapping[str, Any]) -> str:
         "Separation (arcsec)", "Contrast, median", "Magnitude difference (mag)",
         "Contrast, all angles", "Contrast if the star were known",
     ]  # fmt: skip
-    return f"<h3>Limits at {sigmas:g} sigma</h3>" + _table(header, rows)
+    return f"<h3>Limits at {sigmas:g} sigma</h3>" + pieces.table(header, rows)
 
 
 def _star(summary: Mapping[str, Any], stars: Sequence[Sequence[Picture]]) -> Iterable[str]:
@@ -212,9 +193,9 @@ def _star(summary: Mapping[str, Any], stars: Sequence[Sequence[Picture]]) -> Ite
     for frame, pictures in zip(targets, stars, strict=False):
         if len(targets) > 1:
             yield f"<h3>{escape(_label(frame))}</h3>"
-        yield _pictures(pictures)
+        yield pieces.pictures(pictures)
     if len(stars) < len(targets):
-        yield _note(
+        yield pieces.note(
             f"The first {len(stars)} of {len(targets)} frames are shown; detection.fits has all."
         )
 
@@ -250,14 +231,14 @@ def _frames(summary: Mapping[str, Any]) -> str:
     ]
     header = ["Use", "Star", "Date (UTC)", "Position angle of +y (deg)", "Integrations",
               "Pixels used (%)", "File"]  # fmt: skip
-    return _table(header, rows)
+    return pieces.table(header, rows)
 
 
 def _left_out(summary: Mapping[str, Any]) -> str:
     rows = [[each["name"], each["reason"]] for each in summary["left_out"]]
     if not rows:
-        return _note("No frame was left out.")
-    return "<h3>Left out</h3>" + _table(["Name", "Reason"], rows, wrap=1)
+        return pieces.note("No frame was left out.")
+    return "<h3>Left out</h3>" + pieces.table(["Name", "Reason"], rows, wrap=1)
 
 
 def _provenance(summary: Mapping[str, Any], files: Sequence[str]) -> str:
@@ -273,65 +254,16 @@ def _provenance(summary: Mapping[str, Any], files: Sequence[str]) -> str:
         [name, "none" if value is None else str(value)]
         for name, value in summary["settings"].items()
     ]
-    products = [[name, _PRODUCTS.get(name, "")] for name in files]
-    parts = [_facts(facts), _facts(long, "facts long")]
-    if products:
+    known = [[name, _PRODUCTS.get(name, "")] for name in files]
+    parts = [pieces.facts(facts), pieces.facts(long, "facts long")]
+    if known:
         parts += [
             "<h3>Files written with this page</h3>",
-            _table(["Name", "Content"], products, wrap=1),
+            pieces.table(["Name", "Content"], known, wrap=1),
         ]
     parts += [
         "<details><summary>Settings of the fit</summary>",
-        _table(["Setting", "Value"], settings, wrap=1),
+        pieces.table(["Setting", "Value"], settings, wrap=1),
         "</details>",
     ]
     return "\n".join(parts)
-
-
-# -- pieces of HTML --------------------------------------------------------------------------------
-
-
-def _section(title: str, *parts: str) -> str:
-    return "\n".join([f"<section>\n<h2>{title}</h2>", *filter(None, parts), "</section>"])
-
-
-def _pictures(pictures: Sequence[Picture], style: str = "") -> str:
-    figures = [
-        f'<figure><img src="data:image/png;base64,{b64encode(each.png).decode()}" '
-        f'alt="{escape(each.alt)}"><figcaption>{escape(each.caption)}</figcaption></figure>'
-        for each in pictures
-    ]
-    return "\n".join([f'<div class="pictures {style}">', *figures, "</div>"])
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], wrap: int | None = None) -> str:
-    """A table that scrolls in its own box; column `wrap` may have several lines."""
-    titles = "".join(f'<th scope="col">{escape(each)}</th>' for each in header)
-    opening = '<td class="wrap">'
-    lines = [
-        "".join(
-            f"{opening if k == wrap else '<td>'}{escape(str(each))}</td>"
-            for k, each in enumerate(row)
-        )
-        for row in rows
-    ]
-    body = "\n".join(f"<tr>{line}</tr>" for line in lines)
-    return (
-        f'<div class="scroll" tabindex="0"><table><thead><tr>{titles}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody></table></div>"
-    )
-
-
-def _facts(facts: Iterable[tuple[str, str]], style: str = "facts") -> str:
-    items = "\n".join(
-        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in facts
-    )
-    return f'<dl class="{style}">\n{items}\n</dl>'
-
-
-def _note(text: str) -> str:
-    return f'<p class="note">{escape(text)}</p>'
-
-
-def _count(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -27,7 +27,7 @@ from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.wavefront.opd import as_opd_map, read_opd
 
-__all__ = ["RULES", "Rule", "choose_map", "wavefront_for"]
+__all__ = ["RULES", "Rule", "choose_map", "dated_maps", "wavefront_for"]
 
 _log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
     if rule not in RULES:
         raise IncompatibleSetupError(f"rule: got {rule!r}, expected one of {', '.join(RULES)}")
     when = Time(date)
-    maps = _dated_maps(Path(folder))
+    maps = dated_maps(Path(folder))
     before = max((each for each in maps if each[0] <= when), default=None)
     after = min((each for each in maps if each[0] >= when), default=None)
     sides = {"before": [before], "after": [after], "interpolate": [before, after]}
@@ -140,7 +140,7 @@ def wavefront_for(opd: Any, date: Time | None) -> OPDMap:
     return wavefront
 
 
-def _dated_maps(folder: Path) -> list[tuple[Time, Path]]:
+def dated_maps(folder: Path) -> list[tuple[Time, Path]]:
     """Date and path of every wavefront map in a folder."""
     if not folder.is_dir():
         raise MissingOPDError(f"{folder}: no such folder, expected a folder of wavefront maps")

@@ -1,0 +1,393 @@
+"""The configuration of a survey: a TOML file, checked as a whole before any work."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
+
+__all__ = ["Config", "Injections", "Options", "SequenceConfig", "read_config"]
+
+_PIXEL = 0.063
+"""arcsec; for the largest separation of an injected planet."""
+
+_MEMORY = re.compile(r"\d+(\.\d+)? ?([kMGT]i?)?B")
+
+_SETTINGS = (
+    "free", "own", "wavefront", "cycles", "deviations", "drift_cycles", "max_companions",
+    "companion_threshold", "response_npix", "response_wavelengths", "max_iterations", "tolerance",
+    "min_model_error", "relinearise", "robust",
+)  # fmt: skip
+"""Fields of GaussNewton whose values TOML can hold."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Arguments of `reduce` for a sequence.
+
+    Attributes
+    ----------
+    size : int
+    threshold : float
+    systematics : str
+        "auto", "references", "off", or the path of a file of `Systematics.write`.
+    settings : dict
+        Arguments of `GaussNewton.nircam`; empty for the defaults of `reduce`.
+    """
+
+    size: int = 80
+    threshold: float = 5.0
+    systematics: str = "auto"
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Injections:
+    """Planets to inject: one job for every combination.
+
+    Attributes
+    ----------
+    contrasts : tuple of float
+    separations : tuple of float
+        arcsec.
+    angles : tuple of float
+        Position angles, degrees east of north.
+    """
+
+    contrasts: tuple[float, ...] = ()
+    separations: tuple[float, ...] = ()
+    angles: tuple[float, ...] = (0.0,)
+
+
+@dataclass(frozen=True)
+class SequenceConfig:
+    """A target in a filter.
+
+    Attributes
+    ----------
+    name : str
+        For tables and messages; unique.
+    files : tuple of Path
+        Files, or one folder.
+    opd : Path
+        A wavefront map, or a folder of maps, of which the nearest in time is used.
+    target, filter : str or None
+        As for `Sequence.from_files`.
+    options : Options
+    injections : Injections
+    """
+
+    name: str
+    files: tuple[Path, ...]
+    opd: Path
+    target: str | None = None
+    filter: str | None = None
+    options: Options = field(default_factory=Options)
+    injections: Injections = field(default_factory=Injections)
+
+
+@dataclass(frozen=True)
+class Config:
+    """What a survey is to do.
+
+    Attributes
+    ----------
+    sequences : tuple of SequenceConfig
+    workers : int or None
+        Processes; None for one per core, 0 for this process alone.
+    memory_limit : str or None
+        Of each worker, such as "4 GB"; None for an equal share of the machine's.
+    """
+
+    sequences: tuple[SequenceConfig, ...]
+    workers: int | None = None
+    memory_limit: str | None = None
+
+
+def read_config(source: str | os.PathLike[str] | Mapping[str, Any]) -> Config:
+    """Read and check a configuration.
+
+    Parameters
+    ----------
+    source : path or mapping
+        A TOML file, or its content. Paths in a file are relative to its folder.
+
+    Returns
+    -------
+    Config
+
+    Raises
+    ------
+    CorruptFileError
+        If the file is missing or not TOML.
+    IncompatibleSetupError
+        With everything that is wrong, one line for each mistake.
+    """
+    if isinstance(source, Mapping):
+        name, folder, content = "survey", Path(), dict(source)
+    else:
+        path = Path(source)
+        name, folder = path.name, path.parent
+        try:
+            content = tomllib.loads(path.read_bytes().decode())
+        except OSError as error:
+            raise CorruptFileError(f"{path}: cannot be read ({error.strerror})") from error
+        # Deeply nested brackets exhaust the parser's stack.
+        except (ValueError, RecursionError) as error:
+            raise CorruptFileError(
+                f"{path}: not a TOML file ({error}). Correct it; text needs quotes"
+            ) from error
+    problems: list[str] = []
+    config = _config(_Table(content, "", folder, problems))
+    if problems:
+        raise IncompatibleSetupError("\n  ".join([f"{name}: nothing was started:", *problems]))
+    return config
+
+
+class _Table:
+    """A table of the file, whose keys are taken one by one; mistakes go to `problems`."""
+
+    def __init__(self, content: Any, place: str, folder: Path, problems: list[str]) -> None:
+        self.place, self.folder, self.problems = place, folder, problems
+        if not isinstance(content, Mapping):
+            self.complain("", content, "a table with keys")
+            content = {}
+        self.content = dict(content)
+        self.known: list[str] = []
+
+    def complain(self, key: str, value: Any, expected: str) -> None:
+        where = ": ".join(filter(None, [self.place, key]))
+        self.problems.append(f"{where}: got {_short(value)}, expected {expected}")
+
+    def take(self, key: str, default: Any, expected: str, convert: Callable[[Any], Any]) -> Any:
+        """Value of a key; `convert` raises ValueError for one that is not as expected."""
+        self.known.append(key)
+        if key not in self.content:
+            return default
+        value = self.content.pop(key)
+        try:
+            return convert(value)
+        except (ValueError, OverflowError):
+            self.complain(key, value, expected)
+            return default
+
+    def table(self, key: str) -> _Table:
+        self.known.append(key)
+        where = ": ".join(filter(None, [self.place, key]))
+        return _Table(self.content.pop(key, {}), where, self.folder, self.problems)
+
+    def path(self, key: str, default: Any, expected: str) -> Path | None:
+        """A path that exists, relative to the configuration's folder."""
+        return self.take(key, default, expected, lambda value: self.existing(value))
+
+    def existing(self, value: Any) -> Path:
+        path = self.folder / _text(value)
+        try:
+            exists = path.exists()
+        except OSError as error:  # Such as a name that is too long.
+            raise ValueError(str(path)) from error
+        if not exists:
+            raise ValueError(str(path))
+        return path.absolute()
+
+    def finish(self) -> None:
+        """Complain about keys that nobody took."""
+        for key in self.content:
+            where = f"{self.place}: " if self.place else ""
+            self.problems.append(
+                f"{where}got the key {_short(key)}, expected one of {', '.join(self.known)}. "
+                "Check its name and in which table it is"
+            )
+
+
+def _config(top: _Table) -> Config:
+    workers = top.take("workers", None, "a number of processes, 0 or more", _count)
+    memory = top.take("memory_limit", None, 'text such as "4 GB"', _memory)
+    shared = top.table("options")
+    options = _options(shared, Options())
+    shared.finish()
+    injections = _injections(top.table("injections"), Injections())
+    listed = top.take("sequence", [], "one or more tables [[sequence]]", _tables)
+    sequences: list[SequenceConfig] = []
+    for k, each in enumerate(listed, 1):
+        table = _Table(each, f"sequence {k}", top.folder, top.problems)
+        sequence = _sequence(table, options, injections)
+        if sequence is None:
+            continue
+        if sequence.name in [other.name for other in sequences]:
+            table.complain("name", sequence.name, "a name that no other sequence has; add `name`")
+        sequences.append(sequence)
+    top.finish()
+    if not listed and not top.problems:
+        top.complain("sequence", "none", "one or more tables [[sequence]] with files and opd")
+    return Config(tuple(sequences), workers, memory)
+
+
+def _sequence(table: _Table, options: Options, injections: Injections) -> SequenceConfig | None:
+    expected = "FITS files, or one folder of them, that exist; paths are relative to the folder of "
+    expected += "the configuration"
+
+    def paths(value: Any) -> tuple[Path, ...]:
+        several = value if isinstance(value, list) else [value]
+        existing = tuple(table.existing(each) for each in several)
+        if not existing or (len(existing) > 1 and any(each.is_dir() for each in existing)):
+            raise ValueError
+        return existing
+
+    missing: list[Any] = [key for key in ("files", "opd") if key not in table.content]
+    for key in missing:
+        table.complain(key, "nothing", f'a path, such as {key} = "{key}.fits"')
+    files = table.take("files", None, expected, paths)
+    opd = table.path("opd", None, "a wavefront map or a folder of maps that exists")
+    target = table.take("target", None, "text, the name of the star", _text)
+    filter_ = table.take("filter", None, 'text such as "F444W"', _text)
+    first = files[0] if files else Path("sequence")
+    label = " ".join(filter(None, [target or first.name.split(".")[0], filter_]))
+    name = table.take("name", label, "printable text", _text)
+    own = _options(table, options)
+    planets = _injections(table.table("injections"), injections)
+    edge = own.size * _PIXEL / 2
+    for each in planets.separations:
+        if each >= edge:
+            table.complain("separations", each, f"less than {edge:.2g} arcsec, half of the field")
+    table.finish()
+    if files is None or opd is None:
+        return None
+    return SequenceConfig(name, files, opd, target, filter_, own, planets)
+
+
+def _options(table: _Table, default: Options) -> Options:
+    size = table.take("size", default.size, "a number of pixels, 8 or more", _size)
+    threshold = table.take("threshold", default.threshold, "a positive number", _positive)
+
+    def systematics(value: Any) -> str:
+        known = value in ("auto", "references", "off")
+        return str(value) if known else str(table.existing(value))
+
+    pattern = table.take(
+        "systematics", default.systematics,
+        "'auto', 'references', 'off' or a systematics.fits that exists", systematics,
+    )  # fmt: skip
+    own = table.take("settings", {}, "a table with arguments of GaussNewton", _mapping)
+    # Those of a sequence come on top of the survey's.
+    settings = {**default.settings, **own}
+    wrong = _wrong_settings(settings) if own else []
+    where = f"{table.place}: settings"
+    table.problems += [f"{where}: {each}" for each in wrong]
+    return Options(size, threshold, pattern, default.settings if wrong else settings)
+
+
+def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
+    """What is wrong with arguments of `GaussNewton.nircam`."""
+    unknown = sorted(set(settings) - set(_SETTINGS))
+    if unknown:
+        known = ", ".join(_SETTINGS)
+        return [f"got the key {_short(key)}, expected one of {known}" for key in unknown]
+    if not _is_plain(settings):
+        return ["got a date or nan, expected numbers, text, lists and tables"]
+    # Late, as everything that waits for PyTorch: workers import this module to unpickle a job.
+    from pyklip_diffrender.refinement import GaussNewton
+
+    try:
+        GaussNewton.nircam(**settings)
+    except DiffrenderError as error:
+        return [str(error)]
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        return [f"got a value of the wrong type ({error}), expected those of GaussNewton"]
+    return []
+
+
+def _injections(table: _Table, default: Injections) -> Injections:
+    own = bool(table.content)
+    numbers = "a list of positive numbers, such as [1e-5]"
+    contrasts = table.take("contrasts", default.contrasts, numbers, _positives)
+    separations = table.take("separations", default.separations, numbers, _positives)
+    angles = table.take("angles", default.angles, "a list of degrees east of north", _numbers)
+    if own and bool(contrasts) != bool(separations):
+        table.complain("", "one of contrasts and separations", "both, or neither")
+    table.finish()
+    return Injections(contrasts, separations, angles)
+
+
+# -- values ----------------------------------------------------------------------------------------
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or not value.strip() or not value.isprintable():
+        raise ValueError
+    return value.strip()
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError
+    return float(value)
+
+
+def _positive(value: Any) -> float:
+    if _number(value) <= 0:
+        raise ValueError
+    return float(value)
+
+
+def _count(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 1_000_000:
+        raise ValueError
+    return value
+
+
+def _size(value: Any) -> int:
+    if _count(value) < 8:
+        raise ValueError
+    return int(value)
+
+
+def _numbers(value: Any) -> tuple[float, ...]:
+    if not isinstance(value, list) or not value:
+        raise ValueError
+    return tuple(map(_number, value))
+
+
+def _positives(value: Any) -> tuple[float, ...]:
+    if not isinstance(value, list):
+        raise ValueError
+    return tuple(map(_positive, value))
+
+
+def _memory(value: Any) -> str:
+    if not _MEMORY.fullmatch(_text(value)):
+        raise ValueError
+    return _text(value)
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ValueError
+    return dict(value)
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a value has only what a record of the job can hold."""
+    if isinstance(value, Mapping):
+        return all(map(_is_plain, value.values()))
+    if isinstance(value, list):
+        return all(map(_is_plain, value))
+    return isinstance(value, str | int | float) and value == value
+
+
+def _tables(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise ValueError
+    return value

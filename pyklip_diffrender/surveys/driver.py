@@ -1,0 +1,195 @@
+"""A survey from its configuration to its tables."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from astropy.table import Table
+from tqdm import tqdm
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.surveys.config import Config, read_config
+from pyklip_diffrender.surveys.execution import in_this_process, with_dask
+from pyklip_diffrender.surveys.folders import Record, clean, prepare, read_record, staging
+from pyklip_diffrender.surveys.jobs import Job, plan_jobs
+from pyklip_diffrender.surveys.runs import Work
+from pyklip_diffrender.surveys.tables import row, table_of, write_tables
+
+__all__ = ["run_survey", "survey"]
+
+_log = logging.getLogger(__name__)
+
+_SHARE = 20.0
+"""The tables are written again after this many times the seconds that writing them took."""
+
+
+def survey(
+    config: str | os.PathLike[str] | Mapping[str, Any],
+    output: str | os.PathLike[str],
+    scheduler: str | None = None,
+    *,
+    progress: bool = False,
+) -> Table:
+    """Reduce many sequences, with and without injected planets, as independent jobs.
+
+    A job is named by a hash of the package's version, the content of its input files and its
+    options. Finished jobs are kept in the output folder: a survey that was interrupted, or whose
+    configuration or files have changed, does only what is missing when it is started again. A job
+    that fails is a row of the table with its traceback, and is tried again the next time.
+
+    Parameters
+    ----------
+    config : path or mapping
+        TOML file, or its content; see :doc:`the guide </howto/survey>`.
+    output : path
+        Folder for ``jobs/KEY/`` with the products of each job, ``results.ecsv``,
+        ``results.parquet`` and ``survey.html``. Several surveys may use the same folder.
+    scheduler : str, optional
+        Address of a dask scheduler, such as ``tcp://host:8786``. Default processes on this
+        machine, as many as the configuration says.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    Table
+        One row for each job; what is not known is masked.
+
+    Raises
+    ------
+    CorruptFileError, IncompatibleSetupError
+        If the configuration has mistakes, before any work, or if the output cannot be written.
+    RefinementError
+        If the scheduler is lost.
+
+    Notes
+    -----
+    Processes are started with the method "spawn", so a script that calls this needs the usual
+    ``if __name__ == "__main__":``.
+    """
+    from pyklip_diffrender.surveys.work import reduce_job
+
+    return run_survey(config, output, reduce_job, scheduler, progress=progress)
+
+
+def run_survey(
+    config: str | os.PathLike[str] | Mapping[str, Any],
+    output: str | os.PathLike[str],
+    work: Work,
+    scheduler: str | None = None,
+    *,
+    progress: bool = False,
+) -> Table:
+    """Run any work as the jobs of a survey; see `survey`."""
+    plan = read_config(config)
+    todo = plan_jobs(plan)
+    # Workers have their own working directory.
+    output = Path(output).absolute()
+    jobs = prepare(output)
+    clean(jobs)
+    board = _Board(todo, output)
+    missing = [job for job in todo if not board.has(job)]
+    _log.info("%d of %d jobs are finished", len(todo) - len(missing), len(todo))
+    try:
+        with tqdm(total=len(missing), desc="survey", disable=not progress) as bar:
+            for job, record in _execute(missing, jobs, plan, scheduler, work):
+                board.add(job, record)
+                bar.set_postfix(failed=board.failures)
+                bar.update()
+    finally:
+        clean(jobs)
+        board.write()
+    return table_of(board.rows)
+
+
+def _execute(
+    missing: list[Job], jobs: Path, plan: Config, scheduler: str | None, work: Work
+) -> Iterator[tuple[Job, Record]]:
+    if not missing:
+        return iter(())
+    if scheduler is None and plan.workers == 0:
+        return in_this_process(missing, jobs, work)
+    return with_dask(
+        missing,
+        jobs,
+        work,
+        scheduler=scheduler,
+        workers=plan.workers,
+        memory_limit=plan.memory_limit,
+    )
+
+
+class _Board:
+    """What is known of all jobs, on disk while the survey runs."""
+
+    def __init__(self, todo: list[Job], output: Path) -> None:
+        self.output, self.todo = output, todo
+        self.records: dict[str, Record] = {}
+        for job in todo:
+            record = read_record(output / "jobs" / job.key)
+            if record is not None:
+                self.records[job.key] = record
+        self.next = 0.0
+
+    def has(self, job: Job) -> bool:
+        """Whether a job is finished; failed ones are tried again."""
+        return self.records.get(job.key, {}).get("status") == "finished"
+
+    @property
+    def failures(self) -> int:
+        return sum(each["status"] == "failed" for each in self.records.values())
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        return [row(job, self.records.get(job.key)) for job in self.todo]
+
+    def add(self, job: Job, record: Record) -> None:
+        """Note how a job ended, and write the tables unless that was done just now."""
+        self.records[job.key] = record
+        if record["status"] == "failed":
+            _log.warning("%s failed: %s", job, record["message"])
+        else:
+            _log.info("%s: %s", job, record["result"].get("sentence", "finished"))
+        began = time.monotonic()
+        if began < self.next:
+            return
+        try:
+            self.write()
+        except IncompatibleSetupError as error:
+            # There may be room again for the next job.
+            _log.warning("%s", error)
+        ended = time.monotonic()
+        self.next = ended + _SHARE * (ended - began)
+
+    def write(self) -> None:
+        """Write the tables and the page.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If the output cannot be written to.
+        """
+        from pyklip_diffrender.surveys.page import page
+
+        text = page([(job, self.records.get(job.key)) for job in self.todo], self.output.name)
+        folder = None
+        try:
+            folder = staging(self.output / "jobs", "tables")
+            write_tables(self.rows, folder)
+            (folder / "survey.html").write_text(text, encoding="utf-8")
+            for path in folder.iterdir():
+                os.replace(path, self.output / path.name)
+        except OSError as error:
+            raise IncompatibleSetupError(
+                f"output: the tables cannot be written to {self.output} ({error.strerror}). Make "
+                "room, and start the survey again: finished jobs are kept"
+            ) from error
+        finally:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)

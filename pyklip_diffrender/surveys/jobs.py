@@ -1,0 +1,209 @@
+"""The jobs of a survey, named by a hash of everything that decides their result."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from astropy.time import Time
+
+from pyklip_diffrender import __version__
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.files import open_fits, sha256
+from pyklip_diffrender.io.headers import header_date, merged_header
+from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
+from pyklip_diffrender.wavefront.map_choice import dated_maps
+
+__all__ = ["Injection", "Job", "plan_jobs"]
+
+_SUFFIXES = (".fits", ".fits.gz")
+
+
+@dataclass(frozen=True)
+class Injection:
+    """A planet to add to the frames.
+
+    Attributes
+    ----------
+    contrast : float
+    separation : float
+        arcsec.
+    angle : float
+        Position angle, degrees east of north.
+    """
+
+    contrast: float
+    separation: float
+    angle: float
+
+
+@dataclass(frozen=True)
+class Job:
+    """One reduction.
+
+    Attributes
+    ----------
+    key : str
+        Hash of the package's version, the content of the input files, and the options.
+    name : str
+        That of the sequence.
+    files : tuple of str
+        Frames.
+    opd : str
+        Wavefront map.
+    inputs : dict of str to str
+        SHA-256 of every file that is read.
+    target, filter : str or None
+    options : Options
+    injection : Injection or None
+    base : str or None
+        Key of the job whose fit an injection starts from.
+    version : str
+        Of the package.
+    """
+
+    key: str
+    name: str
+    files: tuple[str, ...]
+    opd: str
+    inputs: Mapping[str, str]
+    target: str | None = None
+    filter: str | None = None
+    options: Options = field(default_factory=Options)
+    injection: Injection | None = None
+    base: str | None = None
+    version: str = __version__
+
+    def __str__(self) -> str:
+        planet = self.injection
+        if planet is None:
+            return self.name
+        return (
+            f"{self.name}, planet of {planet.contrast:.3g} at {planet.separation:g} arcsec, "
+            f"{planet.angle:g} deg"
+        )
+
+
+def plan_jobs(config: Config) -> list[Job]:
+    """Return the jobs of a survey; every injection comes after the job that it starts from.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        With everything that is wrong with the inputs, one line for each mistake.
+    """
+    jobs: dict[str, Job] = {}
+    problems = []
+    # Sequences may share files.
+    digest, date = cache(sha256), cache(_date)
+    for sequence in config.sequences:
+        try:
+            planned = _jobs(sequence, digest, date)
+        except (DiffrenderError, OSError) as error:
+            problems.append(f"{sequence.name}: {error}")
+            continue
+        for job in planned:
+            if job.key in jobs:
+                problems.append(f"{job}: got the same inputs and options as {jobs[job.key]}")
+            jobs[job.key] = job
+    if problems:
+        raise IncompatibleSetupError("\n  ".join(["survey: nothing was started:", *problems]))
+    return list(jobs.values())
+
+
+def _jobs(
+    sequence: SequenceConfig, digest: Callable[[Path], str], date: Callable[[Path], Time | None]
+) -> list[Job]:
+    files = _files(sequence.files)
+    opd = _nearest(sequence.opd, files, date) if sequence.opd.is_dir() else sequence.opd
+    pattern = sequence.options.systematics
+    known = [] if pattern in ("auto", "references", "off") else [Path(pattern)]
+    inputs = {str(path): digest(path) for path in (*files, opd, *known)}
+    facts = {
+        "version": __version__,
+        "frames": sorted(inputs[str(path)] for path in files),
+        "opd": inputs[str(opd)],
+        "target": sequence.target,
+        "filter": sequence.filter,
+        "size": sequence.options.size,
+        "threshold": sequence.options.threshold,
+        "systematics": inputs.get(pattern, pattern),
+        "settings": dict(sequence.options.settings),
+    }
+    plain = Job(
+        _hash(facts),
+        sequence.name,
+        tuple(map(str, files)),
+        str(opd),
+        inputs,
+        sequence.target,
+        sequence.filter,
+        sequence.options,
+    )
+    planets = sequence.injections
+    injected = [
+        _with_planet(plain, Injection(contrast, separation, angle))
+        for contrast in planets.contrasts
+        for separation in planets.separations
+        for angle in planets.angles
+    ]
+    return [plain, *injected]
+
+
+def _with_planet(base: Job, planet: Injection) -> Job:
+    key = _hash({"base": base.key, "planet": [planet.contrast, planet.separation, planet.angle]})
+    return Job(
+        key,
+        base.name,
+        base.files,
+        base.opd,
+        base.inputs,
+        base.target,
+        base.filter,
+        base.options,
+        planet,
+        base.key,
+    )
+
+
+def _hash(facts: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def _files(paths: tuple[Path, ...]) -> list[Path]:
+    """Files of a folder, or the files themselves."""
+    if len(paths) > 1 or not paths[0].is_dir():
+        return list(paths)
+    inside = sorted(each for each in paths[0].iterdir() if each.name.endswith(_SUFFIXES))
+    if not inside:
+        raise CorruptFileError(f"{paths[0]}: the folder has no FITS files")
+    return inside
+
+
+def _nearest(folder: Path, files: list[Path], date: Callable[[Path], Time | None]) -> Path:
+    """The map of a folder that was sensed nearest in time to the first frame."""
+    first = min((each.mjd for each in map(date, files) if each is not None), default=math.nan)
+    if math.isnan(first):
+        raise IncompatibleSetupError(
+            f"opd: got the folder {folder}, and the frames have no date (DATE-BEG) to choose a map "
+            "by. Name the map itself"
+        )
+    return min(dated_maps(folder), key=lambda each: (abs(each[0].mjd - first), each[1].name))[1]
+
+
+def _date(path: Path) -> Time | None:
+    """Date of a file; None if it has none or cannot be read."""
+    try:
+        with open_fits(path) as hdus:
+            header = hdus[0].header
+            for hdu in hdus[1:2]:
+                header = merged_header(header, hdu.header, path.name)
+            return header_date(header, ("DATE-BEG", "DATE-OBS"), path.name)
+    except DiffrenderError:
+        return None

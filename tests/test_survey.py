@@ -1,0 +1,659 @@
+"""Surveys: what is asked for is checked, what is finished is kept, what fails is said."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from concurrent.futures import CancelledError
+from dataclasses import replace
+from datetime import date
+from html.parser import HTMLParser
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import QTable, Table
+from survey_stubs import HOSTILE, configuration, inputs, result, stub
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.cli import main
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    IncompatibleSetupError,
+    RefinementError,
+)
+from pyklip_diffrender.refinement import FrameFit
+from pyklip_diffrender.surveys import execution, folders, page, runs, work
+from pyklip_diffrender.surveys.config import read_config
+from pyklip_diffrender.surveys.driver import run_survey, survey
+from pyklip_diffrender.surveys.jobs import Injection, Job, plan_jobs
+
+ROOT = Path(__file__).resolve().parents[1]
+
+PLANETS = {"contrasts": [1e-5, 3e-6], "separations": [0.5, 1.0], "angles": [0, 90.0]}
+
+
+@pytest.fixture
+def _drawn() -> None:
+    """For tests that need the picture of the page, which takes a second."""
+
+
+@pytest.fixture(autouse=True)
+def _not_drawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "_drawn" not in request.fixturenames:
+        monkeypatch.setattr("pyklip_diffrender.surveys.page.draw_limits", lambda *_: None)
+        monkeypatch.setattr("pyklip_diffrender.surveys.page.to_png", lambda *_, **__: b"no picture")
+
+
+def planned(config: dict[str, Any]) -> list[Job]:
+    return plan_jobs(read_config(config))
+
+
+def hidden(output: Path) -> list[str]:
+    """What is left of jobs that never ended."""
+    return [path.name for path in (output / "jobs").iterdir() if path.name.startswith(".")]
+
+
+# -- configuration ---------------------------------------------------------------------------------
+
+
+def test_a_file_says_the_same_as_a_mapping(tmp_path: Path) -> None:
+    config = inputs(tmp_path)
+    path = configuration(tmp_path / "survey.toml", config)
+    assert read_config(path) == read_config(config)
+    assert [job.key for job in planned(config)] == [job.key for job in plan_jobs(read_config(path))]
+
+
+def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    inputs(tmp_path / "data", 1)
+    path = tmp_path / "data" / "survey.toml"
+    path.write_text('[[sequence]]\nfiles = "star0_calints.fits"\nopd = "opd.fits"\n')
+    monkeypatch.chdir("/")
+    (sequence,) = read_config(path).sequences
+    assert sequence.opd == tmp_path / "data" / "opd.fits"
+    assert sequence.name == "star0_calints"
+
+
+def test_options_of_a_sequence_come_before_those_of_all(tmp_path: Path) -> None:
+    config = inputs(tmp_path, 2)
+    config["options"] = {"threshold": 6, "size": 48, "settings": {"cycles": 8, "robust": inf}}
+    config["injections"] = PLANETS
+    config["sequence"][1] |= {"threshold": 7.5, "settings": {"cycles": 12.0}, "injections": {}}
+    first, second = read_config(config).sequences
+    assert (first.options.size, first.options.threshold) == (40, 6.0)
+    assert (second.options.size, second.options.threshold) == (40, 7.5)
+    assert second.options.settings == {"cycles": 12.0, "robust": inf}
+    assert first.injections.contrasts == second.injections.contrasts == (1e-5, 3e-6)
+    assert len(planned(config)) == 2 * (1 + 2 * 2 * 2)
+    assert set(run_survey(config, tmp_path / "out", stub)["status"]) == {"finished"}
+
+
+@pytest.mark.parametrize(
+    ("where", "key", "value", "words"),
+    [
+        ((), "wokers", 2, ["the key 'wokers'", "workers", "Check its name"]),
+        ((), "workers", -1, ["workers", "-1", "0 or more"]),
+        ((), "workers", True, ["workers", "True"]),
+        ((), "memory_limit", "much", ["memory_limit", "'much'", "4 GB"]),
+        ((), "sequence", [], ["sequence", "[[sequence]]"]),
+        ((), "options", 3, ["options", "a table"]),
+        ((), "options", {"threshold": "5"}, ["options: threshold", "'5'", "positive"]),
+        ((), "options", {"settings": {"basis": 1}}, ["options: settings", "'basis'", "cycles"]),
+        ((), "options", {"settings": {"cycles": "x"}}, ["options: settings", "cycles", "'x'"]),
+        ((), "options", {"settings": {"free": [date(2022, 8, 1)]}}, ["settings", "a date"]),
+        ((), "options", {"settings": {"robust": float("nan")}}, ["options: settings", "nan"]),
+        ((), "options", {"settings": {"tolerance": []}}, ["options: settings", "wrong type"]),
+        ((), "injections", {"contrasts": [1e-5]}, ["injections", "both"]),
+        ((), "injections", {"angles": 3}, ["injections: angles", "a list"]),
+        ((0,), "files", "nowhere.fits", ["sequence 1: files", "nowhere.fits", "exist"]),
+        ((0,), "opd", 3, ["sequence 1: opd", "3", "map"]),
+        ((1,), "name", "star0_calints", ["sequence 2: name", "no other sequence"]),
+        ((1,), "name", "two\nlines", ["sequence 2: name", "printable"]),
+        ((1,), "size", 4, ["sequence 2: size", "8 or more"]),
+        ((1,), "threshold", float("nan"), ["sequence 2: threshold", "nan"]),
+        ((1,), "threshold", 10**400, ["sequence 2: threshold", "positive"]),
+        ((1,), "systematics", "no.fits", ["sequence 2: systematics", "'no.fits'", "references"]),
+        ((1,), "injections", {**PLANETS, "separations": [2.0]}, ["sequence 2", "less than 1.3"]),
+        ((1,), "code", "import os", ["sequence 2: got the key 'code'", "one of files"]),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_named_before_anything_is_done(
+    tmp_path: Path, where: tuple[int, ...], key: str, value: Any, words: list[str]
+) -> None:
+    config = inputs(tmp_path / "data", 2)
+    place = config["sequence"][where[0]] if where else config
+    place[key] = value
+    with pytest.raises(IncompatibleSetupError) as raised:
+        run_survey(config, tmp_path / "out", stub)
+    lines = str(raised.value).splitlines()
+    assert len(lines) == 2
+    for word in words:
+        assert word in lines[1]
+    assert not (tmp_path / "out").exists()
+
+
+def test_all_mistakes_are_named_at_once(tmp_path: Path) -> None:
+    config = {"workers": "two", "sequence": [{"files": []}, 3, {"opd": "x", "size": 1}]}
+    with pytest.raises(IncompatibleSetupError) as raised:
+        read_config(config)
+    text = str(raised.value)
+    for word in (
+        "workers",
+        "sequence 1: files",
+        "sequence 1: opd",
+        "sequence 2",
+        "sequence 3: size",
+    ):
+        assert word in text
+
+
+@pytest.mark.parametrize("content", [b"a = [", b"\xff", b"[" * 5000, b"a = 1\na = 2"])
+def test_a_file_that_is_not_toml(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "survey.toml"
+    with pytest.raises(CorruptFileError, match=r"survey\.toml: cannot be read"):
+        read_config(path)
+    path.write_bytes(content)
+    with pytest.raises(CorruptFileError, match=r"survey\.toml: not a TOML file"):
+        read_config(path)
+
+
+def test_the_same_job_twice_is_a_mistake(tmp_path: Path) -> None:
+    config = inputs(tmp_path, 1)
+    config["sequence"].append({**config["sequence"][0], "name": "again"})
+    with pytest.raises(IncompatibleSetupError, match="again: got the same inputs and options"):
+        planned(config)
+
+
+def test_of_a_folder_of_maps_the_nearest_in_time_is_used(tmp_path: Path) -> None:
+    config = inputs(tmp_path, 1)
+    maps = tmp_path / "maps"
+    maps.mkdir()
+    for day in ("01", "11", "29"):
+        hdu = fits.PrimaryHDU(1e-8 * np.random.default_rng(1).normal(size=(16, 16)))
+        hdu.header["BUNIT"] = "m"
+        hdu.header["DATE-OBS"] = f"2022-08-{day}T00:00:00"
+        hdu.writeto(maps / f"map{day}.fits")
+    (maps / "broken.fits").write_bytes(b"nothing")
+    config["sequence"][0]["opd"] = str(maps)
+    with pytest.raises(IncompatibleSetupError, match="no date"):
+        planned(config)
+    frame = fits.PrimaryHDU(np.ones((4, 4)))
+    frame.header["DATE-BEG"] = "2022-08-15T00:00:00"
+    frame.writeto(config["sequence"][0]["files"], overwrite=True)
+    (job,) = planned(config)
+    assert job.opd == str(maps / "map11.fits")
+    assert list(job.inputs) == [config["sequence"][0]["files"], job.opd]
+
+
+# -- names of jobs ---------------------------------------------------------------------------------
+
+
+def test_the_name_of_a_job_follows_from_content_and_options_alone(tmp_path: Path) -> None:
+    config = inputs(tmp_path / "a", 1)
+    (job,) = planned(config)
+    moved = inputs(tmp_path / "b", 1)
+    moved["sequence"][0] |= {"name": "other"}
+    assert [each.key for each in planned(moved)] == [job.key]
+    for change in ({"size": 41}, {"threshold": 6}, {"target": "x"}, {"settings": {"cycles": 9}}):
+        other = {**config, "sequence": [{**config["sequence"][0], **change}]}
+        assert [each.key for each in planned(other)] != [job.key]
+    Path(config["sequence"][0]["opd"]).write_bytes(b"another map")
+    assert [each.key for each in planned(config)] != [job.key]
+
+
+def test_a_new_version_is_a_new_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = inputs(tmp_path, 1)
+    (old,) = planned(config)
+    monkeypatch.setattr("pyklip_diffrender.surveys.jobs.__version__", "99.0")
+    (new,) = planned(config)
+    assert new.key != old.key
+
+
+# -- running ---------------------------------------------------------------------------------------
+
+
+def test_finished_jobs_are_not_run_again(tmp_path: Path) -> None:
+    config, output, ran = inputs(tmp_path / "data"), tmp_path / "out", []
+
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        ran.append(job.name)
+        return stub(job, folder)
+
+    table = run_survey(config, output, work)
+    assert list(table["status"]) == ["finished"] * 3
+    assert len(ran) == 3
+    run_survey(config, output, work)
+    assert len(ran) == 3
+    # One input has changed, one product is damaged: these two are missing.
+    Path(config["sequence"][1]["files"]).write_bytes(b"new frames")
+    (output / "jobs" / table["key"][2] / "report.html").write_text("cut")
+    run_survey(config, output, work)
+    assert ran[3:] == ["star1_calints", "star2_calints"]
+    # The job of the old content stays.
+    assert len(list((output / "jobs").iterdir())) == 4
+    assert hidden(output) == []
+
+
+def test_a_failure_is_a_row_and_is_tried_again(tmp_path: Path) -> None:
+    config, output = inputs(tmp_path / "data"), tmp_path / "out"
+    config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
+
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        (folder / "half").write_text("a product")
+        if job.name.startswith("star1"):
+            raise ZeroDivisionError("at the second star")
+        return stub(job, folder)
+
+    table = run_survey(config, output, work)
+    assert list(table["status"]) == ["finished"] * 2 + ["failed"] * 2 + ["finished"] * 2
+    message, consequence = table["message"][2:4]
+    assert message == "ZeroDivisionError: at the second star"
+    assert "without a planet failed" in consequence
+    assert "in work" in table["traceback"][2]
+    # ECSV drops the blanks at the start of a line.
+    read = Table.read(output / "results.ecsv")["traceback"]
+    assert [read[k].split() for k in (2, 3)] == [table["traceback"][k].split() for k in (2, 3)]
+    folder = output / "jobs" / table["key"][2]
+    assert [path.name for path in folder.iterdir()] == ["job.json"]
+    assert json.loads((folder / "job.json").read_text())["status"] == "failed"
+    assert "at the second star" in (output / "survey.html").read_text()
+    assert list(run_survey(config, output, stub)["status"]) == ["finished"] * 6
+    assert (folder / "report.html").exists()
+    assert hidden(output) == []
+
+
+def test_an_injection_starts_from_the_finished_reduction(tmp_path: Path) -> None:
+    config = inputs(tmp_path / "data", 1)
+    config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
+
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        if job.injection:
+            assert (folder.parent / str(job.base) / "report.html").exists()
+        return stub(job, folder)
+
+    table = run_survey(config, tmp_path / "out", work)
+    assert list(table["status"]) == ["finished"] * 2
+    assert table["injected_contrast"].tolist() == [None, 1e-5]
+    assert table["recovered_contrast"].tolist() == [None, 1.1e-5]
+    assert table["recovered"].tolist() == [None, True]
+
+
+def test_what_another_survey_published_meanwhile_stays(tmp_path: Path) -> None:
+    (job,) = planned(inputs(tmp_path / "data", 1))
+    jobs = folders.prepare(tmp_path / "out")
+
+    def work(inner: Job, folder: Path) -> dict[str, Any]:
+        if inner.name != "rival":
+            assert runs.run_job(replace(job, name="rival"), jobs, work)["status"] == "finished"
+        return stub(inner, folder)
+
+    assert runs.run_job(job, jobs, work)["status"] == "finished"
+    record = folders.read_record(jobs / job.key)
+    assert record is not None
+    assert record["job"]["name"] == "rival"
+    assert hidden(tmp_path / "out") == []
+
+
+def test_only_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
+    jobs = folders.prepare(tmp_path)
+    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
+        pass
+    mine = folders.staging(jobs, "a" * 64)
+    left = jobs / mine.name.replace(f"-{os.getpid()}-", f"-{dead.pid}-")
+    elsewhere, old = left.with_name(f"{left.name}x"), left.with_name(f"{left.name}y")
+    for each in (left, elsewhere, old):
+        each.mkdir()
+        (each / "half").write_text("half")
+    os.utime(old, (0, 0))
+    folders.clean(jobs)
+    assert sorted(jobs.iterdir()) == sorted([mine, elsewhere])
+
+
+@pytest.mark.parametrize("damage", ["", "{", "[]", '{"products": {}}', '{"products": 3}'])
+def test_a_damaged_record_is_a_missing_job(tmp_path: Path, damage: str) -> None:
+    config, output = inputs(tmp_path / "data", 1), tmp_path / "out"
+    (key,) = run_survey(config, output, stub)["key"]
+    record = output / "jobs" / key / "job.json"
+    whole = json.loads(record.read_text())
+    record.write_text(damage)
+    assert list(run_survey(config, output, stub)["status"]) == ["finished"]
+    assert json.loads(record.read_text())["products"] == whole["products"]
+
+
+def test_frames_that_change_on_the_way_are_noticed(tmp_path: Path) -> None:
+    config = inputs(tmp_path / "data", 2)
+
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        Path(config["sequence"][1]["files"]).write_bytes(b"other")
+        return stub(job, folder)
+
+    table = run_survey(config, tmp_path / "out", work)
+    assert list(table["status"]) == ["finished", "failed"]
+    assert "star1_calints.fits: the content on" in table["message"][1]
+
+
+@pytest.mark.parametrize("what", ["file", "version", "output"])
+def test_a_worker_that_sees_something_else_says_so(tmp_path: Path, what: str) -> None:
+    (job,) = planned(inputs(tmp_path / "data", 1))
+    jobs = folders.prepare(tmp_path / "out")
+    words = {"file": "does not see this file", "version": "99.0", "output": "see this folder"}
+    if what == "file":
+        shutil.rmtree(tmp_path / "data")
+    elif what == "version":
+        job = replace(job, version="99.0")
+    else:
+        shutil.rmtree(jobs)
+    record = runs.run_job(job, jobs, stub)
+    assert record["status"] == "failed"
+    assert words[what] in record["message"]
+    # A worker must not make the folder on a disk of its own.
+    assert jobs.exists() == (what != "output")
+
+
+# -- results ---------------------------------------------------------------------------------------
+
+
+def test_the_tables_say_the_same(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    config = inputs(tmp_path / "data", 2)
+    config["sequence"][0]["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
+    table = run_survey(config, tmp_path / "out", stub)
+    ecsv = Table.read(tmp_path / "out" / "results.ecsv")
+    rows = parquet.read_table(tmp_path / "out" / "results.parquet").to_pylist()
+    assert len(rows) == len(ecsv) == len(table) == 3
+    for mine, row, theirs in zip(table, rows, ecsv, strict=True):
+        for name in table.colnames:
+            value = None if np.ma.is_masked(mine[name]) else mine[name]
+            assert row[name] == value
+            assert np.ma.is_masked(theirs[name]) if value is None else theirs[name] == value
+    assert rows[0]["snr"] == 30.0
+    assert rows[0]["candidates"] == 1
+    assert rows[0]["limit_1.0_arcsec"] == 1e-5
+    assert rows[0]["limit_2.0_arcsec"] is None
+    assert rows[0]["peak_memory_bytes"] > 1e6
+
+
+def test_the_tables_are_there_while_the_survey_runs(tmp_path: Path) -> None:
+    config, output, seen = inputs(tmp_path / "data"), tmp_path / "out", []
+
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        path = output / "results.ecsv"
+        seen.append(list(Table.read(path)["status"]) if path.exists() else [])
+        return stub(job, folder)
+
+    run_survey(config, output, work)
+    assert seen[0] == []
+    assert seen[1] == ["finished", "waiting", "waiting"]
+
+
+class Tags(HTMLParser):
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+
+@pytest.mark.usefixtures("_drawn")
+def test_neither_header_nor_file_name_can_write_into_the_page(tmp_path: Path) -> None:
+    config = inputs(tmp_path / "data", 2)
+    config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
+    for k, name in enumerate((HOSTILE, "$\\frac{_a$")):
+        config["sequence"][k]["name"] = name
+
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        if job.name == HOSTILE and job.injection:
+            raise ValueError(HOSTILE)
+        return {**stub(job, folder), **result(HOSTILE), "filter": HOSTILE, "fit_status": HOSTILE}
+
+    output = tmp_path / HOSTILE.replace("/", "")
+    run_survey(config, output, work)
+    text = (output / "survey.html").read_text(encoding="utf-8")
+    tags = Tags(text).tags
+    assert text.count("&lt;script&gt;") > 8
+    assert not [tag for tag, attributes in tags if tag == "script" or "onerror" in attributes]
+    (picture,) = (attributes for tag, attributes in tags if tag == "img")
+    assert (picture["src"] or "").startswith("data:image/png;base64,iVBOR")
+    links = [attributes["href"] or "" for tag, attributes in tags if tag == "a"]
+    assert links
+    for link in links:
+        assert (output / link).exists()
+
+
+@pytest.mark.usefixtures("_drawn")
+def test_a_survey_of_many_stars_has_one_picture(tmp_path: Path) -> None:
+    (job,) = planned(inputs(tmp_path / "data", 1))
+    record = {"status": "finished", "result": result(), "seconds": 1.0}
+    rows = [(replace(job, name=f"star {k}"), record) for k in range(12)]
+    text = page.page([*rows, (job, None)], "survey")
+    assert "12 of 13 jobs finished, 1 not finished yet" in text
+    assert "12 sequences reduced, 12 companion candidates in 12 of them." in text
+
+
+# -- where it runs ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("missing", ["dask", "pyarrow"])
+def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
+    config = inputs(tmp_path / "data", 1)
+    for name in [each for each in sys.modules if each.split(".")[0] == missing]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, f"{missing}.distributed", None)
+    monkeypatch.setattr(
+        "pyklip_diffrender.surveys.tables.find_spec", lambda name: None if name == missing else 1
+    )
+    if missing == "dask":
+        with pytest.raises(
+            IncompatibleSetupError, match=r"pyklip-diffrender\[survey\].*workers = 0"
+        ):
+            run_survey({**config, "workers": 1}, tmp_path / "out", stub)
+    assert list(run_survey(config, tmp_path / "out", stub)["status"]) == ["finished"]
+    assert (tmp_path / "out" / "results.ecsv").exists()
+    assert (tmp_path / "out" / "results.parquet").exists() == (missing != "pyarrow")
+
+
+def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("mine")
+    with pytest.raises(IncompatibleSetupError, match=r"output: got .*out, expected a folder"):
+        run_survey(inputs(tmp_path / "data", 1), tmp_path / "out", stub)
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_a_table_that_cannot_be_written_stops_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pyklip_diffrender.surveys.driver.write_tables", full)
+    config, output = inputs(tmp_path / "data"), tmp_path / "out"
+    with pytest.raises(IncompatibleSetupError, match="No space left on device"):
+        run_survey(config, output, stub)
+    assert "No space left" in caplog.text
+    monkeypatch.undo()
+    assert list(run_survey(config, output, pytest.fail)["status"]) == ["finished"] * 3
+
+
+def test_a_job_that_another_disk_has_is_a_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(execution, "_PATIENCE", 1)
+    monkeypatch.setattr(execution.time, "sleep", lambda _: None)
+    (job,) = planned(inputs(tmp_path / "data", 1))
+    jobs = folders.prepare(tmp_path / "out")
+
+    class Future:
+        def result(self) -> dict[str, Any]:
+            return {"status": "finished", "host": "node7"}
+
+    record = execution._record_of(Future(), job, jobs)
+    assert record["status"] == "failed"
+    assert "node7 wrote its products to another disk" in record["message"]
+
+
+def test_a_result_that_dies_with_its_worker_is_read_from_the_disk(tmp_path: Path) -> None:
+    (job,) = planned(inputs(tmp_path / "data", 1))
+    jobs = folders.prepare(tmp_path / "out")
+
+    class Future:
+        def result(self) -> dict[str, Any]:
+            raise CancelledError
+
+    with pytest.raises(RefinementError, match="scheduler was lost"):
+        execution._record_of(Future(), job, jobs)
+    record = runs.run_job(job, jobs, stub)
+    assert execution._record_of(Future(), job, jobs) == record
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_the_command_says_what_came_of_it(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    broken: bool,
+) -> None:
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        if broken and job.name.startswith("star1"):
+            raise ValueError("no such star")
+        return stub(job, folder)
+
+    monkeypatch.setattr("pyklip_diffrender.surveys.work.reduce_job", work)
+    path = configuration(tmp_path / "survey.toml", inputs(tmp_path / "data", 2))
+    with path.open("a") as file:
+        file.write("\ninjections = { contrasts = [1e-5], separations = [0.5] }")
+    output = tmp_path / "out"
+    assert main(["survey", str(path), "-o", str(output), "--quiet"]) == int(broken)
+    said = capsys.readouterr().out
+    assert f"{3 - 2 * broken} of 3 jobs finished, {2 * broken} failed" in said
+    # The injected planet, which the stub finds beside star 1, is no candidate.
+    assert said.count("S/N") == 2 - broken
+    assert "star0_calints: S/N 30.0 at 0.820 arcsec" in said
+    assert ("star1_calints failed: ValueError: no such star" in said) == broken
+    assert f"wrote {output / 'survey.html'}" in said
+
+
+def test_an_interrupted_command_says_that_it_can_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        if job.name.startswith("star1"):
+            raise KeyboardInterrupt
+        return stub(job, folder)
+
+    monkeypatch.setattr("pyklip_diffrender.surveys.work.reduce_job", work)
+    path = configuration(tmp_path / "survey.toml", inputs(tmp_path / "data"))
+    output = tmp_path / "out"
+    assert main(["survey", str(path), "-o", str(output), "-q"]) == 130
+    assert "finished jobs are kept" in capsys.readouterr().err
+    table = Table.read(output / "results.ecsv")
+    assert list(table["status"]) == ["finished", "waiting", "waiting"]
+
+
+def test_a_configuration_with_mistakes_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "survey.toml"
+    path.write_text("workers = -1")
+    assert main(["survey", str(path), "-o", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert "survey.toml: nothing was started:\n  workers: got -1" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_public_name() -> None:
+    assert dr.survey is survey
+
+
+# -- the real work ---------------------------------------------------------------------------------
+
+ROLLS = (20.0, 60.0)
+
+
+def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for() -> None:
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    scene, opd = dr.Scene(dr.Star(exposure=200.0)), dr.random_opd(1, npix=128)
+    star = dr.simulate(model, scene, opd, seed=5)
+    nothing = np.zeros((32, 32))
+    values = {"flux": np.array([scene.star.photons]), "background": np.zeros(1)}
+    frames = [
+        FrameFit(
+            model, replace(star, position_angles=np.array([roll])), {}, opd.data, nothing,
+            nothing, values, {}, nothing,
+        )
+        for roll in ROLLS
+    ]  # fmt: skip
+    planet = Injection(1e-4, 0.6, 100.0)
+    sequence = work._with_planet(frames, planet)
+    assert len(sequence.science) == 2
+    for roll, frame in zip(ROLLS, sequence.science, strict=True):
+        light = (frame.data - star.data)[0]
+        # Position angles of planets in a scene are counted from +y of the frame.
+        truth = dr.Planet(planet.contrast, planet.separation, planet.angle - roll)
+        expected = dr.simulate(model, replace(scene, planets=(truth,)), opd, seed=5).data[0]
+        x, y = np.round(np.array(truth.offset) / 0.0624 + 15.5).astype(int)
+        core = (slice(y - 2, y + 3), slice(x - 2, x + 3))
+        assert light[core].max() == light.max()
+        # The photon noise of the star under the planet is 3 % of the planet.
+        assert light[core].sum() == pytest.approx((expected - star.data[0])[core].sum(), rel=0.1)
+
+
+def test_what_is_recovered_is_the_candidate_at_the_place() -> None:
+    planet = Injection(1e-4, 0.6, 100.0)
+    x, y = dr.Planet(1e-4, 0.6, 100.0 - 20.0).offset
+    measured = {"contrast": 9e-5, "contrast_error": 1e-5, "snr": 9.0}
+
+    class Found:
+        north = 20.0
+        table = QTable({"x": [0.5, x + 0.03] * u.arcsec, "y": [0.5, y] * u.arcsec,
+                        **{key: [7.0, value] for key, value in measured.items()}})  # fmt: skip
+
+        def measure(self, offsets: list[Any]) -> QTable:
+            np.testing.assert_allclose(offsets, [[x, y]])
+            return QTable({key: [value / 2] for key, value in measured.items()})
+
+    class Whole:
+        detection = Found()
+
+    assert work._recovered(Whole(), planet) == {**measured, "detected": True}
+    Found.table = Found.table[:1]
+    assert work._recovered(Whole(), planet)["snr"] == 4.5
+    assert work._recovered(Whole(), planet)["detected"] is False
+    Found.table = Found.table[:0]
+    assert work._recovered(Whole(), planet)["detected"] is False
+
+
+@pytest.mark.slow
+def test_real_frames_with_and_without_a_planet(tmp_path: Path, shared_data: Path) -> None:
+    """A small field and a coarse fit: the errors are large, and the planet is ten of them."""
+    config = {
+        "workers": 0,
+        "options": {
+            "size": 40, "systematics": "off", "settings": {"cycles": [8.0], "max_iterations": 6},
+        },
+        "injections": {"contrasts": [3e-3], "separations": [0.8], "angles": [330.0]},
+        "sequence": [
+            {
+                "files": str(shared_data / "hip65426_f444w_calints.fits.gz"),
+                "opd": str(shared_data / "opd_2022-07-30.fits.gz"),
+            }
+        ],
+    }  # fmt: skip
+    table = survey(config, tmp_path)
+    assert list(table["status"]) == ["finished"] * 2
+    assert list(table["target"]) == ["HIP-65426"] * 2
+    planet = table[1]
+    assert planet["recovered_snr"] > 5
+    away = abs(planet["recovered_contrast"] - planet["injected_contrast"])
+    assert away < 3 * planet["recovered_error"]
+    for key in table["key"]:
+        products = {path.name for path in (tmp_path / "jobs" / key).iterdir()}
+        assert {"detection.fits", "candidates.ecsv", "fit.fits", "report.html"} <= products

@@ -1,0 +1,40 @@
+"""Surveys as real processes that are killed, and inputs that are damaged."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+pytestmark = [pytest.mark.slow, pytest.mark.hard]
+
+WITH_DASK = (
+    "workers_killed", "client_killed", "two_surveys", "out_of_memory", "scheduler_killed",
+    "blind_worker",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "scenario", [*WITH_DASK, "read_only", "full_disk", "file_limit", "damaged_inputs"]
+)
+def test_nothing_is_half_done_and_nothing_finished_is_lost(scenario: str) -> None:
+    if scenario in WITH_DASK and importlib.util.find_spec("distributed") is None:
+        pytest.skip("needs dask.distributed")
+    done = subprocess.run(
+        [
+            sys.executable, "-m", "tests.benchmarks.faults", "--seeds", "2", "--mutations", "60",
+            "--only", scenario,
+        ],
+        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"{scenario}: ")
+    if "skipped" in done.stdout:
+        pytest.skip(done.stdout)
