@@ -334,10 +334,10 @@ def test_a_header_that_contradicts_the_data_stops_the_reduction(
 def test_a_fit_whose_algebra_breaks_down_says_what_to_check(
     small: OpticalSystem, frames: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refine(*args: Any, **kw: Any) -> None:
+    def fit(*args: Any, **kw: Any) -> None:
         torch.linalg.cholesky(-torch.eye(2))
 
-    monkeypatch.setattr("pyklip_diffrender.refinement.refine", refine)
+    monkeypatch.setattr("pyklip_diffrender.refinement.fitting.fit_problems", fit)
     observation = Observation.from_arrays(frames, np.sqrt(frames), pixelscale=0.0624, name="roll")
     settings = DiffrenderSettings(model=small)
     with pytest.raises(RefinementError, match=r"roll: the fit broke down.*Check the star's"):

@@ -17,7 +17,6 @@ from pyklip_diffrender.pyklip_backend.pointings import Pointing, pointings_of
 from pyklip_diffrender.pyklip_backend.references import References, pattern_for
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.verdict import (
-    breakdown_explained,
     require_plausible,
     warn_of_status,
 )
@@ -170,8 +169,7 @@ def subtract_by_refinement(
     windows = [Window.about(g.observation.center[0], model.detector.shape) for g in groups]
     cut = [window.of(group.observation) for window, group in zip(windows, groups, strict=True)]
     references = References() if references is None else references
-    with breakdown_explained(cut[0].name):
-        pattern = pattern_for(cut, references, model, opd, settings, tell)
+    pattern = pattern_for(cut, references, model, opd, settings, tell)
     adam = isinstance(settings.fit, Adam)
     # The Adam recipe takes one observation at a time.
     together = [(k,) for k in range(len(groups))] if adam else [tuple(range(len(groups)))]
@@ -183,24 +181,22 @@ def subtract_by_refinement(
     results: list[Refinement] = []
     for chosen in together:
         name = cut[chosen[0]].name
-        with breakdown_explained(name):
-            result = refine(
-                model,
-                [pattern.science[k] for k in chosen],
-                opd,
-                settings=pattern.settings,
-                start=settings.start,
-                systematics=pattern.systematics,
-                plan="auto" if settings.plan is None else settings.plan,
-                seed=seed,
-            )
+        result = refine(
+            model,
+            [pattern.science[k] for k in chosen],
+            opd,
+            settings=pattern.settings,
+            start=settings.start,
+            systematics=pattern.systematics,
+            plan="auto" if settings.plan is None else settings.plan,
+            seed=seed,
+        )
         require_plausible(name, result, settings.max_chi2)
         tell(f"{_described(result)}, {result.seconds:.0f} s")
         results.append(result)
     keep = settings.keep_detected
     if (observation.is_nircam and not adam) if keep is None else keep:
-        with breakdown_explained(cut[0].name):
-            results = _with_companions(results, tell)
+        results = _with_companions(results, tell)
     star = np.full(observation.data.shape, np.nan)
     fits = []
     for chosen, result in zip(together, results, strict=True):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from pyklip_diffrender.errors import DiffrenderWarning, RefinementError
@@ -13,16 +11,11 @@ from pyklip_diffrender.errors import DiffrenderWarning, RefinementError
 if TYPE_CHECKING:
     from pyklip_diffrender.refinement import Refinement
 
-__all__ = ["MAX_CHI2", "breakdown_explained", "require_plausible", "warn_of_status"]
+__all__ = ["MAX_CHI2", "require_plausible", "warn_of_status"]
 
 MAX_CHI2 = 100.0
 """Default of the largest reduced chi-squared of a plausible fit. Fits of real frames have 0.5 to 6,
 12 with a bright disk; with a star in the wrong place it is in the thousands."""
-
-WHAT_TO_CHECK = (
-    "Check the star's position in the header (STARCENX/Y, else CRPIX1/2), the filter, the masks "
-    "and the errors, and the unit, the orientation and the date of the wavefront map."
-)
 
 _ADVICE = {
     "MODEL_MISMATCH": (
@@ -41,20 +34,6 @@ _ADVICE = {
 }
 
 
-@contextmanager
-def breakdown_explained(name: str) -> Iterator[None]:
-    """Turn a breakdown of the linear algebra of a fit into a `RefinementError`."""
-    import torch
-
-    try:
-        yield
-    except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
-        raise RefinementError(
-            f"{name}: the fit broke down, as it does where the frames show something else than the "
-            f"star that the model renders. {WHAT_TO_CHECK} ({error})"
-        ) from error
-
-
 def require_plausible(name: str, result: Refinement, limit: float | None) -> None:
     """Refuse a fit that failed, or that has nothing to do with the frames.
 
@@ -62,6 +41,8 @@ def require_plausible(name: str, result: Refinement, limit: float | None) -> Non
     ------
     RefinementError
     """
+    from pyklip_diffrender.refinement.breakdown import WHAT_TO_CHECK
+
     if not result.status.usable:
         raise RefinementError(f"{name}: {result.status.message}", result)
     chi2, limit = reduced_chi2(result), MAX_CHI2 if limit is None else limit

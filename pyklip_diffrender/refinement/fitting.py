@@ -17,6 +17,7 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import Plan
 from pyklip_diffrender.refinement.adam import adam
+from pyklip_diffrender.refinement.breakdown import breakdown_explained
 from pyklip_diffrender.refinement.planned import choose_plan, fit_problems
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
@@ -87,6 +88,9 @@ def refine(
         For settings, a plan or systematics that do not fit the model and the observations.
     ShapeError, UnitError, NonFiniteError, NoValidPixelsError, CorruptFileError
         As their names say.
+    RefinementError
+        If the frames show something so different from the model that the equations cannot be
+        solved.
 
     Examples
     --------
@@ -140,8 +144,9 @@ def refine(
                 "systematics: the Adam recipe does not support them; use GaussNewton"
             )
         return adam(problems[0], adapted, seed=seed, progress=progress)
-    planned = choose_plan(plan, problems, adapted, seed)
-    return fit_problems(problems, adapted, planned, seed=seed, progress=progress)
+    with breakdown_explained(observations[0].name):
+        planned = choose_plan(plan, problems, adapted, seed)
+        return fit_problems(problems, adapted, planned, seed=seed, progress=progress)
 
 
 def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start]:

@@ -18,6 +18,7 @@ from pyklip_diffrender.linear.response import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import ModelError, Plan, plan
+from pyklip_diffrender.refinement.breakdown import breakdown_explained
 from pyklip_diffrender.refinement.continuation import continue_from, fit_with_growing_basis
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.problem import Problem
@@ -211,4 +212,5 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
         for frame in fit.frames
     ]
     planned = None if fit.plan is None or fit.plan.abandoned else fit.plan
-    return fit_problems(problems, settings, planned, warm, seed=fit.seed, progress=progress)
+    with breakdown_explained(problems[0].observation.name):
+        return fit_problems(problems, settings, planned, warm, seed=fit.seed, progress=progress)
