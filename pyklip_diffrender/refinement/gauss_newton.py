@@ -140,7 +140,7 @@ class Solver:
         if is_known and "flux" not in problem.start:
             raise IncompatibleSetupError(
                 "deviations has 'flux', but start does not: how bright is the star? Give "
-                "start={'flux': stellar_flux(...)}"
+                "start={'flux': ...} in the unit of the frames"
             )
         unknown = tuple(name for name in layout.linear if not (is_known and name == "flux"))
         flux, level = problem.flux_and_background(problem.gain * image, flat, unknown)

@@ -44,7 +44,7 @@ class GaussNewton:
         Prior standard deviations of free parameters about their starting values, where they
         differ from those of the parameter table. That of "flux" is relative, and takes a starting
         value: ``deviations={"flux": 0.05}`` with ``start={"flux": ...}`` ties the contrast scale to
-        the star's known brightness, see `stellar_flux`.
+        the star's known brightness, as the light that the pupil collects in the unit of the frames.
     prior : WavefrontPrior
         Prior on the wavefront's change from the starting map.
     drift : WavefrontPrior, optional
