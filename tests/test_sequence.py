@@ -120,6 +120,31 @@ def test_files_are_sorted_by_their_headers(folder: Path) -> None:
     assert sequence.cutout(10).science[0].shape == (10, 10)
 
 
+def test_rolls_are_cut_alike_if_their_stars_are_on_nearly_the_same_pixel() -> None:
+    rolls = [
+        Observation.from_arrays(
+            np.arange(900.0).reshape(30, 30) + shift,
+            np.ones((30, 30)),
+            pixelscale=0.063,
+            center=(15.0 + shift, 14.6),
+            first_pixel=(600, 1600),
+        )
+        for shift in (0.4, 0.6, 7.0)
+    ]
+    cut = Sequence("star", tuple(rolls)).cutout(10)
+    assert [roll.cutout(10).first_pixel for roll in rolls] == [
+        (611, 1610),
+        (611, 1610),
+        (618, 1610),
+    ]
+    near = Sequence("star", (rolls[0], replace(rolls[1], center=rolls[1].center + 0.6))).cutout(10)
+    assert near.science[1].first_pixel == near.science[0].first_pixel == (611, 1610)
+    np.testing.assert_allclose(near.science[1].center, [[5.2, 5.2]])
+    assert near.science[1].data[0, 0, 0] == rolls[1].data[0, 10, 11]
+    # Farther apart, each has its star in the middle.
+    assert cut.science[2].first_pixel == (618, 1610)
+
+
 def test_what_does_not_belong_is_left_out_with_a_reason(folder: Path) -> None:
     calints(
         folder / "d.fits", "HIP1", 20.0, "2022-10-03T08:00:00", CORONMSK="MASKA430R", IS_PSF=True

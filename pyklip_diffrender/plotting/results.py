@@ -171,7 +171,8 @@ def plot_detection(detection: Detection, ax: Any = None) -> NDArray[Any]:
     right.set_box_aspect(1.0)
     right.set_xlabel("separation (arcsec)")
     right.set_ylabel(f"contrast at {curve.meta['sigmas']:g} sigma")
-    right.legend(frameon=False)
+    # Below the axes: candidates may be anywhere in them.
+    right.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
     return np.array([snr_axes, right])
 
 

@@ -254,8 +254,15 @@ class Observation:
             return 0.0
         return other.position_angle - self.position_angle
 
-    def cutout(self, size: int) -> Observation:
+    def cutout(self, size: int, *, first_pixel: tuple[int, int] | None = None) -> Observation:
         """The `size` x `size` pixels about the star (whole pixels, without resampling).
+
+        Parameters
+        ----------
+        size : int
+        first_pixel : tuple of int, optional
+            Column and row on the full detector at which the square begins, for frames that say
+            where their pixels are. By default the star is in the middle of the square.
 
         Raises
         ------
@@ -263,6 +270,8 @@ class Observation:
             If the square is not inside the frame.
         """
         corners = np.round(self.center - (size - 1) / 2).astype(int)
+        if first_pixel is not None and self.first_pixel is not None:
+            corners = np.tile(np.subtract(first_pixel, self.first_pixel), (len(self), 1))
         ny, nx = self.shape
         if corners.min() < 0 or (corners + size > (nx, ny)).any():
             raise ShapeError(

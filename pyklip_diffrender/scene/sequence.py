@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 from astropy.time import Time
@@ -18,6 +19,9 @@ from pyklip_diffrender.scene.observation import Observation
 __all__ = ["Sequence"]
 
 _SUFFIXES = (".fits", ".fits.gz")
+
+_NEARLY_THE_SAME = 2
+"""Pixels by which the stars of two rolls may be apart for one window on the detector."""
 
 
 @dataclass(frozen=True)
@@ -154,10 +158,21 @@ class Sequence:
         return table
 
     def cutout(self, size: int) -> Sequence:
-        """Cut the `size` x `size` pixels about the star out of every frame."""
+        """Cut the `size` x `size` pixels about the star out of every frame.
+
+        Rolls whose stars are on nearly the same pixel of the detector are cut alike, so that
+        they share its pattern.
+        """
+        science = [each.cutout(size) for each in self.science]
+        origin = science[0].first_pixel
+        for k, cut in enumerate(science):
+            if origin is None or cut.first_pixel is None or cut.first_pixel == origin:
+                continue
+            if np.abs(np.subtract(cut.first_pixel, origin)).max() <= _NEARLY_THE_SAME:
+                science[k] = self.science[k].cutout(size, first_pixel=origin)
         return replace(
             self,
-            science=tuple(each.cutout(size) for each in self.science),
+            science=tuple(science),
             references=tuple(each.cutout(size) for each in self.references),
         )
 
