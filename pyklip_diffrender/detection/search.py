@@ -15,6 +15,7 @@ from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_inflation import error_inflation, snr_scatter
 from pyklip_diffrender.detection.field import (
     curve_separations,
+    far_from,
     pixel_width,
     ring_pixels,
     separation_of,
@@ -289,7 +290,8 @@ def _search(
     # A fit may have taken a residual for a companion while its wavefront was still wrong.
     while len(candidates) and _weakest(candidates)[1] < threshold:
         candidates = _without_weakest(groups, candidates, pixel)
-    rejected = 0
+    # A peak that is no candidate once its position is fitted would be the highest one for ever.
+    dismissed = torch.zeros(0, 2, dtype=torch.float64)
     while True:
         snr = maps.snr(maps.without(candidates))
         if scatter is not None:
@@ -302,16 +304,22 @@ def _search(
                 # Errors that neighbouring pixels share do not show in chi-squared per pixel.
                 if is_nircam and scattered > _CORRELATED * factor:
                     factor = scattered
+        allowed = np.where(far_from(grid, dismissed, 2 * pixel), snr, 0.0)
         peak = strongest_peak(
-            snr / factor, grid, candidates.offsets, threshold=threshold, inner=inner, distance=pixel
+            allowed / factor,
+            grid,
+            candidates.offsets,
+            threshold=threshold,
+            inner=inner,
+            distance=pixel,
         )
-        if peak is None or len(candidates) >= _MAX_CANDIDATES:
+        if peak is None or max(len(candidates), len(dismissed)) >= _MAX_CANDIDATES:
             # The factor may have grown since a candidate was accepted.
             if not len(candidates) or _weakest(candidates)[1] >= threshold * factor:
                 return candidates, factor
-            if rejected >= _MAX_CANDIDATES:
-                return candidates, factor
-            candidates, rejected = _without_weakest(groups, candidates, pixel), rejected + 1
+            weakest = _weakest(candidates)[0]
+            dismissed = torch.cat([dismissed, candidates.offsets[weakest, None]])
+            candidates = _without_weakest(groups, candidates, pixel)
             continue
         contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
         candidates = candidates.with_one_more(grid[peak], contrast)
