@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -26,8 +27,10 @@ from pyklip_diffrender.refinement import (
     Refinement,
     Systematics,
     learn_systematics,
+    pattern_choice,
     refine,
 )
+from pyklip_diffrender.refinement.pattern_choice import PatternChoice
 from pyklip_diffrender.scene.objects import Planet, Scene, Star
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
@@ -312,3 +315,39 @@ def test_references_are_fitted_only_where_they_are_needed(
     assert patterns[-1] is (None if systematics == "off" else known)
     assert result.systematics is patterns[-1]
     assert len(result.references) == len(fits) - 1
+
+
+def test_rolls_share_an_unknown_pattern_where_nothing_is_known(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pattern_choice, "known_systematics", lambda *_: None)
+    header = fits.Header({"INSTRUME": "NIRCAM"})
+    roll = Observation.from_arrays(
+        np.ones((12, 12)),
+        np.ones((12, 12)),
+        unit=u.MJy / u.sr,
+        pixelscale=0.063,
+        filter="F335M",
+        first_pixel=(600, 1600),
+        header=header,
+    )
+
+    def chosen(*rolls: Observation, request: str = "auto") -> PatternChoice:
+        system, opd = cast(OpticalSystem, None), cast(OPDMap, None)
+        return pattern_choice.choose_systematics(rolls, [], system, opd, systematics=request)
+
+    pattern = chosen(roll, roll).systematics
+    assert pattern is not None
+    assert pattern.name == "the rolls themselves"
+    values, errors = pattern.at(roll)
+    assert (values == 0).all()
+    assert (errors == 0.03).all()
+    assert pattern.pedestal == 1.9
+    assert chosen(roll, roll).settings == GaussNewton.nircam(min_model_error=0.002)
+    assert chosen(roll, replace(roll, unit=u.DN / u.s)).systematics is not None
+    # One roll, different pixels, pixels that are not known, other instruments, and "off".
+    elsewhere = replace(roll, first_pixel=(601, 1600))
+    lost, simulated = replace(roll, first_pixel=None), replace(roll, header=fits.Header())
+    for rolls in ((roll,), (roll, elsewhere), (lost, lost), (simulated, simulated)):
+        assert chosen(*rolls).systematics is None
+    assert chosen(roll, roll, request="off").systematics is None

@@ -7,6 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
+from astropy import units as u
+
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -28,6 +31,11 @@ _log = logging.getLogger(__name__)
 _KNOWN_MODEL_ERROR = 0.002
 """Smallest model error, as a fraction of the star, where the pattern of the model's error is known
 from other stars: the pattern's own error is counted apart."""
+
+
+_TYPICAL_PATTERN = 0.03
+_TYPICAL_PEDESTAL = 1.9
+"""Rms of the pattern, and pedestal in MJy/sr, of the library's stars in both of its filters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +98,8 @@ def choose_systematics(
         The wavefront to start from.
     systematics : Systematics, "auto", "references" or "off"
         "auto" takes the pattern of the library, and fits the references only where it has none;
-        "references" fits them in any case and uses both.
+        "references" fits them in any case and uses both. Where neither knows anything, rolls that
+        show the same pixels of the detector share a pattern of which only the size is known.
     settings : GaussNewton or Adam, optional
         Of the fits; default those of `refine`.
     progress : bool
@@ -117,10 +126,34 @@ def choose_systematics(
         if pattern is None and references:
             fits, failed = _fit_references(references, model, opd, common)
             pattern = known_systematics(first, fits)
+        if pattern is None:
+            pattern = _unknown_pattern(science)
         _log.info("pattern of the model's error: %s", pattern)
     if pattern is not None and settings is None and science[0].is_nircam:
         settings = GaussNewton.nircam(min_model_error=_KNOWN_MODEL_ERROR)
     return PatternChoice(tuple(science), pattern, settings, tuple(fits), tuple(failed))
+
+
+def _unknown_pattern(science: Sequence[Observation]) -> Systematics | None:
+    """A pattern of which only the size is known, where rolls tell it from a planet; else None."""
+    first = science[0]
+    same = all(
+        each.first_pixel == first.first_pixel and each.shape == first.shape for each in science
+    )
+    if len(science) < 2 or not first.is_nircam or first.first_pixel is None or not same:
+        return None
+    zeros = np.zeros(first.shape)
+    x, y = first.center[0]
+    return Systematics(
+        pattern=zeros,
+        error=zeros + _TYPICAL_PATTERN,
+        center=(float(x), float(y)),
+        unknown=_TYPICAL_PATTERN,
+        pedestal=_TYPICAL_PEDESTAL if first.unit == u.MJy / u.sr else 0.0,
+        first_pixel=first.first_pixel,
+        filter=first.filter,
+        name="the rolls themselves",
+    )
 
 
 def _fit_references(
