@@ -242,7 +242,7 @@ def survey(run: Run, /, plan: Path, output: Path, scheduler: str | None) -> int:
     PLAN is a TOML file with the sequences and their options. The same command goes on where an
     earlier one was stopped.
     """
-    from pyklip_diffrender.surveys.command import run as run_survey
+    from pyklip_diffrender.cli.survey import run as run_survey
 
     return run_survey(plan, output, scheduler, progress=run.progress)
 

@@ -147,6 +147,7 @@ class Reduction:
     def _tell(self, line: str) -> None:
         """Say what is being done, as pyKLIP does."""
         logger.info(line)
+        # Its verbose=True prints, and whoever asks for it has no handler for our log.
         if self.arguments["verbose"]:
             print(f"diffrender: {line}", flush=True)
 
