@@ -229,6 +229,23 @@ def test_frames_of_the_same_pixels_share_what_is_unknown_of_the_pattern() -> Non
     )
     assert shared.status is Status.CONVERGED
     assert shared.chi2_per_pixel == pytest.approx(1.0, abs=0.1)
+    # The equations that were solved are those of the covariance between the frames.
+    linear = shared.linear
+    assert linear is not None
+    jacobian = torch.stack(
+        [
+            each.onto_unknowns(each.jacobian.double().flatten(1), len(linear.vector))
+            for each in linear.frames
+        ]
+    )
+    weight = torch.stack([each.weight.flatten() for each in linear.frames]) ** 2
+    common = torch.stack([each.common.flatten() for each in linear.frames])
+    summed = (jacobian * (weight * common)[:, None]).sum(dim=0)
+    own = torch.einsum("fap,fp,fbp->ab", jacobian, weight, jacobian)
+    difference = linear.curvature - (own - summed @ summed.T)
+    scale = own.diagonal().sqrt()
+    assert float((difference / scale[:, None] / scale).abs().max()) < 1e-5
+    assert float((summed @ summed.T).diagonal().div(own.diagonal()).max()) > 0.2
     # The pattern is in the same pixels, the planet is not.
     limits = [
         dr.contrast_curve(fit, [0.6], scatter=1.0)["known_star"][0] for fit in (shared, apart)
