@@ -195,7 +195,9 @@ def test_other_algorithms_are_bit_identical(algo: str, imgs: np.ndarray, tmp_pat
 
 @pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("save_ints", [pytest.param(False, marks=pytest.mark.slow), True])
-@pytest.mark.parametrize("collapse", ["mean", "weighted-mean"])
+@pytest.mark.parametrize(
+    "collapse", [pytest.param("mean", marks=pytest.mark.slow), "weighted-mean"]
+)
 @pytest.mark.parametrize(
     ("mode", "wvs"),
     [

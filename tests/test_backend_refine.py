@@ -114,6 +114,7 @@ def reduce(made: Any, folder: Path, algo: str = "klip") -> tuple[NDArray[np.floa
     return cube[0].astype(np.float64), header
 
 
+@pytest.mark.slow
 def test_star_goes_companion_stays(
     small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path
 ) -> None:

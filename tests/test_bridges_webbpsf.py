@@ -101,6 +101,7 @@ def test_the_flip_of_the_internal_wavefront_is_recorded_and_can_be_chosen(
     assert error(other(), truth[1].data) > 1e-3
 
 
+@pytest.mark.slow
 def test_keywords_and_extensions_are_those_of_stpsf(nircam: Callable[..., Any]) -> None:
     instrument = nircam(source_offset_r=0.1, source_offset_theta=20.0)
     truth = instrument.calc_psf(**FAST)
@@ -157,6 +158,7 @@ def test_the_users_object_and_the_model_do_not_touch_each_other(
     assert torch.equal(model.with_fidelity(monochromatic=4.5e-6)(), image)
 
 
+@pytest.mark.slow
 def test_a_refined_wavefront_goes_back(nircam: Callable[..., Any]) -> None:
     instrument = nircam()
     model = from_webbpsf(instrument, add_distortion=True, **FAST)

@@ -99,6 +99,7 @@ def test_an_opd_with_absorption_and_none_at_all(opd: torch.Tensor) -> None:
     assert worst(system(), None, PIXELS) < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampling", [1.2, 3.0, 6.0])
 def test_finer_cells_give_the_same_templates(sampling: float, opd: torch.Tensor) -> None:
     """One, two and three cells a pixel: the inverse transform of a folded spectrum."""
@@ -195,7 +196,13 @@ def both_routes(**changes: Any) -> tuple[OpticalSystem, OpticalSystem]:
     ],
     ids=str,
 )
-@pytest.mark.parametrize("offset", [None, (0.31, -0.22)], ids=["axis", "beside"])
+@pytest.mark.parametrize(
+    "offset",
+    [
+        pytest.param(None, id="axis", marks=pytest.mark.slow),
+        pytest.param((0.31, -0.22), id="beside"),
+    ],
+)
 def test_both_routes_converge_to_one_image(
     settings: dict[str, Any], offset: tuple[float, float] | None
 ) -> None:

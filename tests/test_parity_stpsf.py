@@ -69,9 +69,6 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 QUICK = ("on axis",)
 """The others need ``--full``."""
 
-QUICK_EMBEDDED = ("MASK335R",)
-"""Of STScI's own files."""
-
 
 def nircam(
     folder: Path,
@@ -256,10 +253,8 @@ def differences(official: Path, case: str, wrong: dict[str, Any]) -> list[float]
     return [float(error[ring].mean() / truth[ring].mean()) for ring in rings]
 
 
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(k, marks=() if k in QUICK_EMBEDDED else pytest.mark.slow) for k in EMBEDDED],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", EMBEDDED)
 def test_the_embedded_coronagraph_is_that_of_the_official_files(official: Path, case: str) -> None:
     """What is left: the outlines of pupil (0.2 %) and stop (0.1 %), and poppy's Zernike circle."""
     assert max(differences(official, case, {})) < EMBEDDED[case][-1]

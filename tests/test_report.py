@@ -277,8 +277,10 @@ report.textContent = JSON.stringify({
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs chromium or google-chrome in PATH")
-@pytest.mark.parametrize("width", [390, 1280])
-@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", [390, pytest.param(1280, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "dark", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["light", "dark"]
+)
 def test_the_page_fits_the_screen(folder: Path, tmp_path: Path, width: int, dark: bool) -> None:
     page = (folder / "report.html").read_text(encoding="utf-8")
     holder = tmp_path / "holder.html"

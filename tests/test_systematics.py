@@ -256,6 +256,7 @@ def test_frames_of_the_same_pixels_share_what_is_unknown_of_the_pattern() -> Non
     assert abs(rows[0]["contrast"] - PLANET.contrast) < 3 * rows[0]["contrast_error"]
 
 
+@pytest.mark.slow
 def test_the_pattern_multiplies_the_pedestal(tmp_path: Path) -> None:
     pedestal = 1e4
     measured = Systematics(
