@@ -172,7 +172,10 @@ class Annealing:
             "damping": self.solver.damping,
         }
         self.history.append(record)
-        _log.debug("%s, scales %s", record, self.solver.scales.tolist())
+        _log.debug(
+            "step %d: chi2 %.4g per pixel, model error %.2g %% of the star, gain %.2g, damping %.2g",
+            record["iteration"], chi2, 100 * error, gain, self.solver.damping,
+        )  # fmt: skip
 
     def _modes_for(self, kappa: float) -> int:
         """Number of leading modes to fit while the model error is kappa."""

@@ -90,7 +90,7 @@ class PointSources:
             self.route = "lattice" if self._waves else "model"
             if any(isinstance(p, SampledOcculter) for p in model.planes) and not self._agrees():
                 self._waves, self.route = [], "model"
-        _log.debug("point sources by the route %r", self.route)
+        _log.debug("images of point sources: method %r", self.route)
 
     def _prepared(self, sampling: float) -> list[_Wave]:
         """Prepare all wavelengths; an empty list if `_one_mask` returns None."""
