@@ -31,7 +31,7 @@ __all__ = ["demo", "detect_in_file", "psf", "reduce_frames", "survey"]
 _DEMO = ("demo.fits", "demo.ecsv", "candidates.ecsv", "demo.png")
 _REDUCTION = (
     "detection.fits", "candidates.ecsv", "contrast.ecsv", "fit.fits", "systematics.fits",
-    "report.html", "summary.json", "detection.png",
+    "astrometry.csv", "report.html", "summary.json", "detection.png",
 )  # fmt: skip
 
 

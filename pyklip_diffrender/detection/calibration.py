@@ -37,23 +37,27 @@ def calibration_errors(groups: Sequence[Group], offsets: Tensor, snr: Tensor) ->
 
     Returns
     -------
-    Tensor, (k,), float64
+    Tensor, (2, k), float64
+        Those of the contrasts, and those of the sources' own fluxes, which do not depend on the
+        star's.
     """
+    count = len(offsets)
     frames = sum(len(templates.frames) for _, templates in groups)
-    variance = torch.zeros(len(offsets), dtype=torch.float64)
+    variance = torch.zeros(2 * count, dtype=torch.float64)
     for linear, templates in groups:
-        changes = torch.zeros(len(linear.vector), len(offsets), dtype=torch.float64)
+        changes = torch.zeros(len(linear.vector), 2 * count, dtype=torch.float64)
         for k, fitted in templates.frames.items():
             frame = linear.frames[k]
-            on_rows = torch.zeros(len(frame.rows), len(offsets), dtype=torch.float64)
+            on_rows = torch.zeros(len(frame.rows), 2 * count, dtype=torch.float64)
             for row, unknown in enumerate(frame.rows[: frame.first_mode].tolist()):
                 if linear.unknowns[unknown].name == "flux":
-                    on_rows[row] = 1 / fitted.flux
+                    on_rows[row, :count] = 1 / fitted.flux
             for j in torch.nonzero(snr > _CLEAR).flatten().tolist():
-                on_rows[frame.first_mode :, j] = _by_modes(templates, k, frame, offsets[j])
+                by_modes = _by_modes(templates, k, frame, offsets[j])
+                on_rows[frame.first_mode :, [j, count + j]] = by_modes[:, None]
             changes += frame.onto_unknowns(on_rows, len(linear.vector)) / frames
         variance += linear.variances(changes)
-    return variance.sqrt()
+    return variance.sqrt().reshape(2, count)
 
 
 def _by_modes(templates: Templates, k: int, frame: LinearFrame, offset: Tensor) -> Tensor:

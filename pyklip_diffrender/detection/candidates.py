@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from astropy import units as u
-from astropy.table import QTable
 from numpy.typing import ArrayLike
 from torch import Tensor
 
@@ -20,7 +18,7 @@ from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.companions import local_maxima
 from pyklip_diffrender.scene.objects import Planet
 
-__all__ = ["Candidates", "candidate_table", "refine_candidates", "strongest_peak"]
+__all__ = ["Candidates", "refine_candidates", "strongest_peak"]
 
 _log = logging.getLogger(__name__)
 
@@ -170,55 +168,3 @@ def strongest_peak(
     allowed = (separation_of(grid) >= inner) & far_from(grid, sources, distance)
     peaks = local_maxima(snr, allowed, threshold, size=3)
     return peaks[0] if peaks else None
-
-
-def candidate_table(
-    candidates: Candidates, scatter: float, calibration: Image, north: float
-) -> QTable:
-    """Make the table of candidates, highest S/N first; see `Detection.table`.
-
-    Parameters
-    ----------
-    candidates : Candidates
-    scatter : float
-        Factor by which their errors are multiplied.
-    calibration : ndarray, (k,)
-        Relative calibration errors of their contrasts.
-    north : float
-        Position angle of +y, degrees east of north.
-    """
-    count = len(candidates)
-    x, y = candidates.offsets.T.numpy()
-    contrast = candidates.contrasts.numpy()
-    errors = scatter * candidates.errors.numpy().reshape(-1, 3)
-    covariance = candidates.covariance.numpy().reshape(3, count, 3, count)
-    places = scatter**2 * np.einsum("akbk->kab", covariance)[:, 1:, 1:]
-    separation = np.hypot(x, y)
-    along = np.stack([x, y], axis=1) / separation[:, None]
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    radial, tangential = (
-        np.sqrt(np.einsum("ka,kab,kb->k", unit, places, unit)) for unit in (along, across)
-    )
-    angle = np.deg2rad(north) + np.arctan2(-x, y)
-    contrast_error = np.hypot(errors[:, 0], contrast * calibration)
-    columns = {
-        "separation": (separation * u.arcsec, ".4f"),
-        "separation_error": (radial * u.arcsec, ".4f"),
-        "position_angle": (np.rad2deg(angle) % 360 * u.deg, ".2f"),
-        "position_angle_error": (np.rad2deg(tangential / separation) * u.deg, ".2f"),
-        "contrast": (contrast, ".3e"),
-        "contrast_error": (contrast_error, ".1e"),
-        "delta_mag": (-2.5 * np.log10(contrast) * u.mag, ".3f"),
-        "delta_mag_error": (2.5 / np.log(10) * contrast_error / contrast * u.mag, ".3f"),
-        "snr": (contrast / errors[:, 0], ".1f"),
-        "delta_ra": (separation * np.sin(angle) * u.arcsec, ".4f"),
-        "delta_dec": (separation * np.cos(angle) * u.arcsec, ".4f"),
-        "x": (x * u.arcsec, ".4f"),
-        "y": (y * u.arcsec, ".4f"),
-        "x_error": (errors[:, 1] * u.arcsec, ".4f"),
-        "y_error": (errors[:, 2] * u.arcsec, ".4f"),
-    }
-    table = QTable({name: values for name, (values, _) in columns.items()})
-    for name, (_, form) in columns.items():
-        table[name].info.format = form
-    return table[np.argsort(-table["snr"])]

@@ -10,10 +10,22 @@ from astropy.table import QTable
 from numpy.typing import NDArray
 from scipy import stats
 
-__all__ = ["contrast_table", "small_sample_factor"]
+__all__ = ["contrast_table", "described", "small_sample_factor"]
 
 _SIGMAS = 5.0
 """S/N of a contrast curve."""
+
+_COLUMNS = {
+    "separation": (".3f", "from the star"),
+    "contrast": (".2e", "median of the ring"),
+    "delta_mag": (".2f", "magnitude difference of the median"),
+    "lowest": (".2e", "of the ring"),
+    "highest": (".2e", "of the ring"),
+    "known_star": (".2e", "median if the image of the star were known"),
+    "small_sample": (".2e", "median with the small-sample correction"),
+    "flux_density": (".2e", "of the median, in the photometric calibration of the frames"),
+}
+"""Formats and descriptions of the columns."""
 
 
 def small_sample_factor(
@@ -51,6 +63,7 @@ def contrast_table(
     errors: list[NDArray[np.float64]],
     photon: list[NDArray[np.float64]],
     resolution: float,
+    star: float | None = None,
 ) -> QTable:
     """Make the table of a 5-sigma contrast curve.
 
@@ -64,13 +77,16 @@ def contrast_table(
         The same for a known star.
     resolution : float
         lambda/D, arcsec.
+    star : float, optional
+        Flux density of the star, Jy.
 
     Returns
     -------
     QTable
-        Separation; median, lowest and highest contrast of the ring; the median for a known star
-        (the photon limit of a matched filter); the median with the small-sample correction, which
-        applies where errors were scaled to the measured scatter.
+        Separation; median contrast of the ring and its magnitude difference; lowest and highest
+        contrast; the median for a known star (the photon limit of a matched filter); the median
+        with the small-sample correction, which applies where errors were scaled to the measured
+        scatter; if `star` is known, the flux density of the median.
     """
     rows = []
     factor = small_sample_factor(separations, resolution, _SIGMAS)
@@ -82,10 +98,22 @@ def contrast_table(
         limit = _SIGMAS * np.asarray(error)
         middle = float(np.median(limit))
         bound = _SIGMAS * float(np.median(photon_error))
-        rows.append((separation, middle, limit.min(), limit.max(), bound, middle * correction))
-    names = ("separation", "contrast", "lowest", "highest", "known_star", "small_sample")
+        magnitude = -2.5 * math.log10(middle)
+        rows.append(
+            (separation, middle, magnitude, limit.min(), limit.max(), bound, middle * correction)
+        )
+    names = [name for name in _COLUMNS if name != "flux_density"]
     table = QTable(rows=rows, names=names, dtype=(float,) * len(names))
-    table["separation"].unit = u.arcsec
-    table["separation"] = u.Quantity(table["separation"])
+    for name, unit in (("separation", u.arcsec), ("delta_mag", u.mag)):
+        table[name] = np.asarray(table[name]) * unit
+    if star is not None:
+        table["flux_density"] = star * np.asarray(table["contrast"]) * u.Jy
     table.meta = {"sigmas": _SIGMAS, "resolution_arcsec": resolution}
+    return described(table)
+
+
+def described(table: QTable) -> QTable:
+    """Give the columns of a contrast curve their formats and descriptions."""
+    for name in table.colnames:
+        table[name].info.format, table[name].info.description = _COLUMNS[name]
     return table

@@ -29,8 +29,18 @@ _SETTLED = 0.2
 """The refinements end when its amplitude changes by less than this many standard deviations."""
 
 
-def contrasts_at(groups: Sequence[Group], offsets: ArrayLike, scatter: float) -> QTable:
-    """Contrasts of point sources at known positions, one at a time; see `Detection.measure`."""
+def contrasts_at(
+    groups: Sequence[Group], offsets: ArrayLike, scatter: float
+) -> tuple[QTable, Image]:
+    """Contrasts of point sources at known positions, one at a time; see `Detection.measure`.
+
+    Returns
+    -------
+    table : QTable
+        x, y, contrast, contrast_error, snr.
+    calibration : ndarray, (2, k)
+        See `calibration.calibration_errors`.
+    """
     places = torch.from_numpy(np.atleast_2d(to_arcsec(offsets, "offsets")))
     if places.ndim != 2 or places.shape[1] != 2:
         raise ShapeError(f"offsets: got shape {tuple(places.shape)}, expected (k, 2)")
@@ -40,15 +50,16 @@ def contrasts_at(groups: Sequence[Group], offsets: ArrayLike, scatter: float) ->
     contrast = (products.numerator / products.information).numpy()
     snr = contrast / error
     calibration = scatter * calibration_errors(groups, places, torch.from_numpy(snr)).numpy()
-    return QTable(
+    table = QTable(
         {
             "x": places[:, 0].numpy() * u.arcsec,
             "y": places[:, 1].numpy() * u.arcsec,
             "contrast": contrast,
-            "contrast_error": np.hypot(error, contrast * calibration),
+            "contrast_error": np.hypot(error, contrast * calibration[0]),
             "snr": snr,
         }
     )
+    return table, calibration
 
 
 def measured_shape(

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.io.fits import HDUList, PrimaryHDU
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.detection.calibration import calibration_errors
-from pyklip_diffrender.detection.candidates import Candidates, candidate_table
+from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.contrast import described
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.detection.measurement import (
@@ -23,26 +23,25 @@ from pyklip_diffrender.detection.measurement import (
     measured_shape,
     subtracted_frames,
 )
+from pyklip_diffrender.detection.orbits import write_astrometry
+from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.storage import (
-    MAPS,
     candidates_of,
     digest,
     fit_beside,
     groups_of_searched,
-    image_hdu,
+    hdus_of,
     maps_of,
-    table_facts,
     table_of,
 )
+from pyklip_diffrender.detection.tables import candidate_table, measured_table
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.files import replacing, write_fits
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.storage import (
     image,
-    observation_hdus,
     observation_of,
     reading,
-    text_hdu,
 )
 from pyklip_diffrender.scene.observation import Observation
 
@@ -130,41 +129,54 @@ class Detection:
         return self.observation.position_angle
 
     @cached_property
+    def sky(self) -> Sky:
+        """Orientation, epoch, and flux density of the star, as far as they are known."""
+        return Sky.of(self.fits, self.scatter)
+
+    @cached_property
     def table(self) -> QTable:
-        """The candidates, highest S/N first.
+        """The candidates, highest S/N first; every column has a description.
 
         Columns are separation; position angle east of north (counter-clockwise from +y of the
-        first frame if its orientation is not known); contrast; magnitude difference; S/N; offsets
-        in right ascension and declination; and x, y from the star on the first frame. Errors are
-        standard deviations, with all parameters of the star marginalised. The error of the
+        first frame if its orientation is not known); contrast; magnitude difference; S/N; angle
+        and x, y from the star on the first frame. With a known orientation there are the offsets
+        in right ascension and declination and their correlation, with a date the epoch, and for
+        calibrated frames the flux density and the AB magnitude.
+
+        Errors are standard deviations, with all parameters of the star marginalised. Those of
+        positions do not include errors of the pixel scale and of the roll angle. The error of the
         contrast includes the errors of the star's flux and of the source's own image (see
-        `calibration.calibration_errors`). The S/N does not include them, because they do not
-        change the significance of a source.
+        `calibration.calibration_errors`); that of the flux density does not depend on the star's
+        flux. The S/N includes neither, because they do not change the significance of a source.
         """
-        table = candidate_table(self.candidates, self.scatter, self._calibration_errors, self.north)
+        table = candidate_table(self.candidates, self.scatter, self._calibration_errors, self.sky)
         table.meta = dict(self._provenance)
         return table
 
     @cached_property
     def _calibration_errors(self) -> Image:
-        """Relative calibration errors of the candidates' contrasts, (k,)."""
+        """Relative calibration errors of the candidates' contrasts and fluxes, (2, k)."""
         candidates = self.candidates
         snr = candidates.contrasts / (self.scatter * candidates.errors[:, 0])
         return self.scatter * calibration_errors(self.groups, candidates.offsets, snr).numpy()
 
-    def measure(self, offsets: ArrayLike) -> QTable:
+    def measure(self, offsets: ArrayLike, *, sigmas: float = 5.0) -> QTable:
         """Contrast of a point source at given positions, one at a time.
 
         Parameters
         ----------
         offsets : (k, 2)
             x, y from the star, arcsec, image orientation of the first frame.
+        sigmas : float
+            S/N of a detection, below which an upper limit is stated; 3 and 5 are usual.
 
         Returns
         -------
         QTable
-            x, y, contrast, contrast_error, snr; errors as in `table`. The candidates are not
-            removed from the data.
+            x, y, contrast, its error and S/N as in `table`; upper_limit, the contrast (at least 0)
+            plus `sigmas` errors, NaN where the S/N is `sigmas` or more; separation and position
+            angle, and what else is known of `table`. Positions are as given, without errors, and
+            the candidates are not removed from the data.
 
         Raises
         ------
@@ -173,7 +185,8 @@ class Detection:
             fit; see `read`.
         NonFiniteError, ShapeError, UnitError
         """
-        return contrasts_at(self._searched[1], offsets, self.scatter)
+        raw, calibration = contrasts_at(self._searched[1], offsets, self.scatter)
+        return measured_table(raw, calibration, self.sky, sigmas)
 
     def measure_shape(self, image: ArrayLike, *, relinearise: float = 25.0) -> tuple[float, float]:
         """Measure an extended source of known shape in the first frame, such as a ring.
@@ -239,6 +252,7 @@ class Detection:
             **self.fits[0].summary(),
             "scatter": self.scatter,
             "threshold": self.threshold,
+            **self.sky.facts,
             "orientation": (
                 "position angles counter-clockwise from +y of the first frame"
                 if self.observation.position_angles is None
@@ -268,56 +282,41 @@ class Detection:
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write maps (FITS), candidates and contrast curve (ECSV); returns the paths.
 
-        `read` needs only the first file, detection.fits.
+        `read` needs only the first file, detection.fits. For frames with a date and a position
+        angle there is also astrometry.csv, see `write_astrometry`.
         """
         folder = Path(folder)
         maps = folder / "detection.fits"
-        write_fits(self._hdus(), maps)
+        write_fits(hdus_of(self), maps)
         written = [maps]
         for name, table in (("candidates", self.table), ("contrast", self.contrast_curve)):
             path = folder / f"{name}.ecsv"
             with replacing(path) as temporary:
                 table.write(temporary, format="ascii.ecsv", overwrite=True)
             written.append(path)
+        if self.sky.north is not None and self.sky.mjd is not None:
+            written.append(self.write_astrometry(folder / "astrometry.csv"))
         return written
 
-    def _hdus(self) -> HDUList:
-        """The FITS extensions that `read` reads."""
-        primary = PrimaryHDU()
-        for key, value in self._provenance.items():
-            text = ", ".join(value) if isinstance(value, list) else value
-            primary.header[f"HIERARCH {key}"] = text
-        unit = self.observation.unit.to_string("fits")
-        about, data = observation_hdus(self.observation, 0)
-        facts = {
-            "scatter": self.scatter,
-            "threshold": self.threshold,
-            "candidates": vars(self.candidates),
-            "calibration_errors": self._calibration_errors,
-            "contrast_curve": table_facts(self.contrast_curve),
-            "observation": about,
-            "provenance": self._provenance,
-            "fits": self._digests,
-        }
-        return HDUList(
-            [
-                primary,
-                *(
-                    image_hdu(getattr(self, attribute), name, "")
-                    for name, attribute in MAPS.items()
-                ),
-                image_hdu(self.left_out[0], "LEFT_OUT", unit),
-                image_hdu(self.left_out[1], "LEFT_OUT_ERROR", unit),
-                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec"),
-                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec"),
-                *(
-                    image_hdu(each, "SUBTRACTED", unit, k)
-                    for k, each in enumerate(self.subtracted, 1)
-                ),
-                *data,
-                text_hdu("FACTS", facts),
-            ]
-        )
+    def write_astrometry(self, path: str | os.PathLike[str], *, format: str = "orbitize") -> Path:
+        """Write epoch and positions of the candidates for a program that fits orbits.
+
+        Candidates are numbered in the order of `table`, which may differ between epochs. Errors
+        have no share of the pixel scale and of the roll angle; add those that you assume.
+
+        Parameters
+        ----------
+        path : path
+        format : "orbitize" or "orvara"
+            The CSV file of orbitize! (MJD, mas, degrees), or the text file with relative
+            astrometry of orvara (JD, arcsec, degrees).
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If the frames have no date or no position angle.
+        """
+        return write_astrometry(self.table, path, format)
 
     @classmethod
     def read(
@@ -356,6 +355,7 @@ class Detection:
                 "subtracted": tuple(image(hdus, "SUBTRACTED", k) for k in range(stars)),
                 "left_out": (image(hdus, "LEFT_OUT", 0), image(hdus, "LEFT_OUT_ERROR", 0)),
                 "_calibration_errors": np.array(facts["calibration_errors"], dtype=float),
+                "sky": Sky(**facts["sky"]),
                 "_provenance": {
                     key: list(value) if isinstance(value, tuple) else value
                     for key, value in facts["provenance"].items()
@@ -368,7 +368,7 @@ class Detection:
                 scatter=facts["scatter"],
                 threshold=facts["threshold"],
                 candidates=candidates_of(facts["candidates"]),
-                contrast_curve=table_of(facts["contrast_curve"]),
+                contrast_curve=described(table_of(facts["contrast_curve"])),
                 path=path,
                 **maps_of(hdus),
             )

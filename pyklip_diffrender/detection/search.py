@@ -14,6 +14,7 @@ from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_inflation import error_inflation, snr_scatter
 from pyklip_diffrender.detection.field import (
+    Image,
     curve_separations,
     far_from,
     pixel_width,
@@ -25,6 +26,8 @@ from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.measurement import contrasts_at
 from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
 from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.sky import Sky
+from pyklip_diffrender.detection.tables import measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, to_arcsec
 from pyklip_diffrender.refinement import Refinement
@@ -142,6 +145,7 @@ def detect(
             [error[*ring] for ring in rings],
             [photon[*ring] for ring in rings],
             _resolution(fits[0]),
+            Sky.of(fits).star_jansky,
         ),
         grid=maps.grid,
     )
@@ -153,6 +157,7 @@ def measure(
     *,
     scatter: float | None = None,
     relinearise: float = 25.0,
+    sigmas: float = 5.0,
 ) -> QTable:
     """Measure the contrasts of point sources at given positions, one at a time.
 
@@ -166,11 +171,13 @@ def measure(
         above 5 removed; 1 for fits that do not explain their data.
     relinearise : float
         See `detect`.
+    sigmas : float
+        S/N of a detection, below which an upper limit is stated; 3 and 5 are usual.
 
     Returns
     -------
     QTable
-        x, y, contrast, contrast_error, snr; see `Detection.table` for the errors.
+        See `Detection.measure`.
 
     Raises
     ------
@@ -179,24 +186,30 @@ def measure(
     NonFiniteError, ShapeError, UnitError
     """
     fits = _checked(fits)
-    _require_positive(scatter=scatter)
-    table = _measured(fits, offsets, scatter)
+    _require_positive(scatter=scatter, sigmas=sigmas)
+    table, calibration, factor = _measured(fits, offsets, scatter)
     bright = table[table["snr"] > relinearise]
     if len(bright):
-        table = _measured(with_companions(fits, _as_candidates(bright)), offsets, scatter)
-    return table
+        fits = with_companions(fits, _as_candidates(bright))
+        table, calibration, factor = _measured(fits, offsets, scatter)
+    return measured_table(table, calibration, Sky.of(fits, factor), sigmas)
 
 
-def _measured(fits: Sequence[Refinement], offsets: ArrayLike, scatter: float | None) -> QTable:
+def _measured(
+    fits: Sequence[Refinement], offsets: ArrayLike, scatter: float | None
+) -> tuple[QTable, Image, float]:
+    """Contrasts, their calibration errors, and the factor by which all errors are multiplied."""
     groups = groups_of(fits)
-    table = contrasts_at(groups, offsets, 1.0 if scatter is None else scatter)
+    factor = 1.0 if scatter is None else scatter
+    table, calibration = contrasts_at(groups, offsets, factor)
     if scatter is None:
         sources = _as_candidates(table[table["snr"] > _SOURCE])
         companions = Candidates.of_fit(fits[0])
         factor = error_inflation(fits, groups, torch.cat([companions.offsets, sources.offsets]))
         table["contrast_error"] *= factor
         table["snr"] /= factor
-    return table
+        calibration = factor * calibration
+    return table, calibration, factor
 
 
 def _as_candidates(table: QTable) -> Candidates:
@@ -253,7 +266,8 @@ def contrast_curve(
     ends = np.cumsum([len(ring[0]) for ring in rings])[:-1]
     errors = np.split(scatter * products.information.numpy() ** -0.5, ends)
     photon = np.split(products.photon.numpy() ** -0.5, ends)
-    return contrast_table(separations, errors, photon, _resolution(fits[0]))
+    star = Sky.of(fits).star_jansky
+    return contrast_table(separations, errors, photon, _resolution(fits[0]), star)
 
 
 def _checked(fits: Fits) -> list[Refinement]:

@@ -17,7 +17,7 @@ from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group, groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.storage import image
+from pyklip_diffrender.refinement.storage import image, observation_hdus, text_hdu
 
 __all__ = [
     "MAPS",
@@ -25,6 +25,7 @@ __all__ = [
     "digest",
     "fit_beside",
     "groups_of_searched",
+    "hdus_of",
     "image_hdu",
     "maps_of",
     "table_facts",
@@ -46,6 +47,46 @@ def image_hdu(array: Image, name: str, unit: str, version: int = 1) -> fits.Imag
     hdu = fits.ImageHDU(np.asarray(array, dtype=np.float64), name=name, ver=version)
     hdu.header["BUNIT"] = unit
     return hdu
+
+
+def hdus_of(detection: Any) -> fits.HDUList:
+    """The FITS extensions of a `Detection`, which it reads again."""
+    primary = fits.PrimaryHDU()
+    for key, value in detection._provenance.items():
+        text = ", ".join(value) if isinstance(value, list) else value
+        primary.header[f"HIERARCH {key}"] = text
+    unit = detection.observation.unit.to_string("fits")
+    about, data = observation_hdus(detection.observation, 0)
+    facts = {
+        "scatter": detection.scatter,
+        "threshold": detection.threshold,
+        "candidates": vars(detection.candidates),
+        "calibration_errors": detection._calibration_errors,
+        "sky": vars(detection.sky),
+        "contrast_curve": table_facts(detection.contrast_curve),
+        "observation": about,
+        "provenance": detection._provenance,
+        "fits": detection._digests,
+    }
+    return fits.HDUList(
+        [
+            primary,
+            *(
+                image_hdu(getattr(detection, attribute), name, "")
+                for name, attribute in MAPS.items()
+            ),
+            image_hdu(detection.left_out[0], "LEFT_OUT", unit),
+            image_hdu(detection.left_out[1], "LEFT_OUT_ERROR", unit),
+            image_hdu(detection.grid[..., 0], "OFFSET_X", "arcsec"),
+            image_hdu(detection.grid[..., 1], "OFFSET_Y", "arcsec"),
+            *(
+                image_hdu(each, "SUBTRACTED", unit, k)
+                for k, each in enumerate(detection.subtracted, 1)
+            ),
+            *data,
+            text_hdu("FACTS", facts),
+        ]
+    )
 
 
 def maps_of(hdus: fits.HDUList) -> dict[str, Image]:

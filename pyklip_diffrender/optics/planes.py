@@ -49,6 +49,7 @@ __all__ = [
     "Plane",
     "Values",
     "Wavefront",
+    "is_occulter",
     "phase_factor",
 ]
 
@@ -85,6 +86,11 @@ class Plane(Protocol):
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Propagate; `onto` is the window that the planes behind need."""
+
+
+def is_occulter(plane: Plane) -> bool:
+    """Whether a plane is a mask in a focus rather than an optic in a pupil."""
+    return hasattr(plane, "focal_field") or hasattr(plane, "focal_sample")
 
 
 def phase_factor(opd: Tensor, wavelength: float, dtype: torch.dtype) -> Tensor:

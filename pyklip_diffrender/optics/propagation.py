@@ -6,6 +6,7 @@ linearly, and the detector samples it. The image is the weighted sum of the inte
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Mapping, Sequence
 
@@ -26,6 +27,7 @@ from pyklip_diffrender.optics.planes import (
     Plane,
     Values,
     Wavefront,
+    is_occulter,
 )
 from pyklip_diffrender.parameters import parameter
 
@@ -206,6 +208,26 @@ class Propagation:
         for plane, onto in zip(self.planes, windows, strict=True):
             wavefront = plane.apply(wavefront, values, onto)
         return self.detector.field(wavefront, values)
+
+    def transmission(self, opd: Value | None = None, **parameters: Value) -> float:
+        """Fraction of the collected light of a source far from the occulter that is detected.
+
+        It is that of the planes in pupils, such as the Lyot stop, at the mean wavelength.
+
+        Parameters
+        ----------
+        opd, **parameters
+            As in a call of the system.
+        """
+        open_path = copy.copy(self)
+        open_path.planes = tuple(each for each in self.planes if not is_occulter(each))
+        values = self.values(parameters)
+        with torch.no_grad():
+            wavefront = self.pupil_field(self.opd(opd), self.bandpass.mean_wavelength, values)
+            for plane, onto in zip(open_path.planes, open_path.windows(values), strict=True):
+                wavefront = plane.apply(wavefront, values, onto)
+        power = wavefront.field.abs().double().square().sum(dim=(-2, -1))
+        return float(power * wavefront.grid.spacing**2)
 
     def _field(self, opd: Tensor, wavelength: float, values: Values) -> Tensor:
         if self._lattice is not None:

@@ -194,6 +194,7 @@ def observation_hdus(observation: Observation, frame: int) -> tuple[dict[str, An
         "center": combined.center,
         "filter": combined.filter,
         "date": None if combined.date is None else combined.date.isot,
+        "mid_date": None if combined.mid_date is None else combined.mid_date.isot,
         "position_angles": combined.position_angles,
         "name": combined.name,
         "reference": combined.reference,
@@ -211,7 +212,7 @@ def observation_hdus(observation: Observation, frame: int) -> tuple[dict[str, An
 
 def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Observation:
     """Make an observation from the metadata and extensions of `observation_hdus`."""
-    angles, date = facts["position_angles"], facts["date"]
+    angles, date, middle = facts["position_angles"], facts["date"], facts.get("mid_date")
     offset, first_pixel = facts.get("star_offset"), facts.get("first_pixel")
     return Observation.from_arrays(
         image(hdus, "DATA", frame),
@@ -222,6 +223,7 @@ def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Obs
         center=np.array(facts["center"]),
         filter=facts["filter"],
         date=None if date is None else Time(date),
+        mid_date=None if middle is None else Time(middle),
         position_angles=None if angles is None else np.array(angles),
         name=facts["name"],
         reference=facts["reference"],

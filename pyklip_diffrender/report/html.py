@@ -36,6 +36,7 @@ _PRODUCTS = {
     "detection.fits": "maps, star-subtracted frames and candidates, for Detection.read",
     "candidates.ecsv": "the candidates with all columns",
     "contrast.ecsv": "the contrast curve",
+    "astrometry.csv": "epoch and positions of the candidates, for orbitize!",
     "fit.fits": "the fit, for Refinement.read",
     "systematics.fits": "the pattern of the model's error, for other reductions",
     "summary.json": "the content of this page, for programs",
@@ -164,7 +165,40 @@ def _candidates(summary: Mapping[str, Any]) -> str:
         "errors of the star model are not Gaussian and can be more frequent. One epoch does "
         "not show whether a candidate is bound or in the background."
     )
-    return "<h3>Candidates</h3>" + pieces.table(header, rows) + pieces.note(note)
+    return (
+        "<h3>Candidates</h3>"
+        + pieces.table(header, rows)
+        + pieces.note(note)
+        + _on_sky(summary["candidates"])
+    )
+
+
+_SKY = (
+    ("Mid-exposure (UTC)", "epoch", None, str),
+    ("ΔRA cos Dec (arcsec)", "delta_ra_arcsec", "delta_ra_error_arcsec", plus_minus),
+    ("ΔDec (arcsec)", "delta_dec_arcsec", "delta_dec_error_arcsec", plus_minus),
+    ("Correlation of the two", "radec_corr", None, "{:.2f}".format),
+    ("Flux density (Jy)", "flux_density_Jy", "flux_density_error_Jy", scientific),
+    ("AB magnitude", "ab_mag", "ab_mag_error", plus_minus),
+)
+"""Titles of columns, keys of their values and errors, and how they are written."""
+
+
+def _on_sky(candidates: Sequence[Mapping[str, Any]]) -> str:
+    """Astrometry and photometry, as far as the headers of the frames allow them."""
+    columns = [each for each in _SKY if each[1] in candidates[0]]
+    if not columns:
+        return ""
+    rows = [
+        [str(k), *(form(*(each[key] for key in keys if key)) for _, *keys, form in columns)]
+        for k, each in enumerate(candidates, 1)
+    ]
+    note = (
+        "Errors of positions do not include those of the pixel scale and of the roll angle; errors "
+        "of flux densities do not include that of the photometric calibration."
+    )
+    titles = ["", *(title for title, *_ in columns)]
+    return "<h3>Astrometry and photometry</h3>" + pieces.table(titles, rows) + pieces.note(note)
 
 
 def _limits(summary: Mapping[str, Any]) -> str:

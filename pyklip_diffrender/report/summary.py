@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from astropy import units as u
+from astropy.table import QTable
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -54,6 +55,8 @@ def summarise(reduction: Reduction) -> dict[str, Any]:
         "program": first.header.get("PROGRAM"),
         "first_date": min(dates).isot if dates else None,
         "last_date": max(dates).isot if dates else None,
+        "epoch_mjd": detection.sky.mjd,
+        "star": _star(detection),
         "threshold_snr": detection.threshold,
         "oriented": first.position_angles is not None,
         "status": {
@@ -132,16 +135,27 @@ def _systematics(reduction: Reduction) -> dict[str, Any] | None:
     return {"name": used.name, **provenance}
 
 
+def _star(detection: Detection) -> dict[str, Any] | None:
+    """Flux density of the star; None for frames without photometric calibration."""
+    if detection.sky.star is None:
+        return None
+    value, error = detection.sky.star
+    return {"flux_density_Jy": value, "flux_density_error_Jy": error}
+
+
+def _label(table: QTable, name: str) -> str:
+    """Name of a column with its unit; those of magnitudes include it."""
+    unit = table[name].unit
+    return name if unit in (None, u.mag) else f"{name}_{unit}"
+
+
 def _candidates(detection: Detection) -> list[dict[str, Any]]:
     """The table of candidates, with the unit in the names and the probability of a false alarm."""
     table, rows = detection.table, []
     for row in table:
-        values = {}
-        for name in table.colnames:
-            unit = table[name].unit
-            # The names of magnitudes include their unit.
-            label = name if unit in (None, u.mag) else f"{name}_{unit}"
-            values[label] = getattr(row[name], "value", row[name])
+        values = {
+            _label(table, name): getattr(row[name], "value", row[name]) for name in table.colnames
+        }
         chance = _false_alarm(detection, float(row["snr"]), row["separation"].to_value("arcsec"))
         rows.append({**values, "false_alarm_probability": chance})
     return rows
@@ -167,12 +181,8 @@ def _false_alarm(detection: Detection, snr: float, separation: float) -> float:
 
 def _curve(detection: Detection) -> dict[str, Any]:
     curve = detection.contrast_curve
-    columns = {name: np.asarray(curve[name]) for name in curve.colnames if name != "separation"}
-    return {
-        "sigmas": curve.meta["sigmas"],
-        "separation_arcsec": curve["separation"].to_value("arcsec"),
-        **columns,
-    }
+    columns = {_label(curve, name): np.asarray(curve[name]) for name in curve.colnames}
+    return {"sigmas": curve.meta["sigmas"], **columns}
 
 
 def _limits(detection: Detection) -> list[dict[str, Any]]:
@@ -188,11 +198,14 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
             name: float(np.exp(np.interp(separation_arcsec, separation, np.log(curve[name]))))
             for name in ("contrast", "lowest", "highest", "known_star", "small_sample")
         }
+        star = detection.sky.star_jansky
+        known = {} if star is None else {"flux_density_Jy": star * values["contrast"]}
         rows.append(
             {
                 "separation_arcsec": float(separation_arcsec),
                 "delta_mag": -2.5 * math.log10(values["contrast"]),
                 **values,
+                **known,
             }
         )
     return rows

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
+from astropy.time import Time
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, ShapeError, UnitError
@@ -97,7 +98,8 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
         number(key, number(fallback, np.nan)) for key, fallback in
         (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
     ]  # fmt: skip
-    angle = number("ROLL_REF", 0.0) - number("V3I_YANG", 0.0) * number("VPARITY", -1)
+    angle = number("ROLL_REF", np.nan) - number("V3I_YANG", 0.0) * number("VPARITY", -1)
+    middle = header_number(header, "EXPMID", name)
     area = number("PIXAR_A2", 0.0)
     if area == 0:
         raise UnitError(f"{name}: the header has no PIXAR_A2 (pixel area, arcsec^2)")
@@ -112,7 +114,8 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
         "center": None if np.isnan(star).any() else np.array(star) - 1,
         "filter": header_text(header, "FILTER", name),
         "date": header_date(header, ("DATE-BEG", "DATE-OBS"), name),
-        "position_angles": np.full(frames, angle),
+        "mid_date": None if middle is None else Time(middle, format="mjd", scale="utc"),
+        "position_angles": None if np.isnan(angle) else np.full(frames, angle),
         "name": name,
         "header": header,
     }

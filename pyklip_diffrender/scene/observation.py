@@ -59,8 +59,11 @@ class Observation:
         Approximate x, y of the star, 0-indexed pixels.
     filter : str or None
     date : Time or None
-    position_angles : ndarray, (frames,)
-        Degrees.
+        Beginning of the exposure, UTC.
+    mid_date : Time or None
+        Middle of the exposure, UTC.
+    position_angles : ndarray, (frames,), or None
+        Position angles of the +y axis, degrees east of north; None where they are not known.
     star_offset : tuple of float or None
         x, y of the star relative to the occulter from the file, arcsec; the start of a fit.
     reference : bool
@@ -81,6 +84,7 @@ class Observation:
     center: NDArray[np.float64]
     filter: str | None = None
     date: Time | None = None
+    mid_date: Time | None = None
     position_angles: NDArray[np.float64] | None = None
     name: str = "observation"
     reference: bool = False
@@ -185,10 +189,11 @@ class Observation:
     def from_fits(cls, path: str | os.PathLike[str]) -> Observation:
         """Read a JWST stage-2 coronagraphic file (calints).
 
-        Uses SCI, ERR and DQ, BUNIT, FILTER, DATE-BEG, the aperture's pixel area, and the star's
-        position from STARCENX/Y, else CRPIX1/2 (1-indexed). Of spaceKLIP's aligned files also
-        MASKOFFS, the position of the mask from the star, and IMSHIFTS: the shift is undone, so that
-        the pixels are those of the detector, whose flat-field errors then stay in their pixels.
+        Uses SCI, ERR and DQ, BUNIT, FILTER, DATE-BEG and EXPMID, ROLL_REF and V3I_YANG, the
+        aperture's pixel area, and the star's position from STARCENX/Y, else CRPIX1/2 (1-indexed).
+        Of spaceKLIP's aligned files also MASKOFFS, the position of the mask from the star, and
+        IMSHIFTS: the shift is undone, so that the pixels are those of the detector, whose
+        flat-field errors then stay in their pixels.
         Errors of NIRCam frames are corrected for the noise that is measured far from the star, see
         `pyklip_diffrender.scene.noise.calibrated_errors`.
 

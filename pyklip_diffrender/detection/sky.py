@@ -1,0 +1,173 @@
+"""From frames to the sky: orientation, epoch and photometric scale of a detection."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from astropy import units as u
+from astropy.time import Time
+from numpy.typing import NDArray
+
+from pyklip_diffrender.detection.field import Image
+from pyklip_diffrender.refinement import FrameFit, Refinement
+
+__all__ = ["Positions", "Sky"]
+
+_BRIGHTNESS = u.MJy / u.sr
+
+
+@dataclass(frozen=True)
+class Sky:
+    """What relates the frames of a detection to the sky.
+
+    Attributes
+    ----------
+    north : float or None
+        Position angle of the first frame's +y axis, degrees east of north; None if not known.
+    mjd : float or None
+        Mean of the target's mid-exposures, UTC; None if no frame has a date.
+    star : (float, float) or None
+        Flux density of the star and its standard deviation, Jy; None where the frames have no
+        photometric calibration. See `star_flux_density`.
+    """
+
+    north: float | None = None
+    mjd: float | None = None
+    star: tuple[float, float] | None = None
+
+    @classmethod
+    def of(cls, fits: Sequence[Refinement], scatter: float = 1.0) -> Sky:
+        """Of the frames of the target, with errors multiplied by `scatter`."""
+        first = fits[0].frames[0].observation
+        frames = [f for fit in fits for f in fit.frames if not f.observation.reference]
+        # Where the middle of an exposure is not known, its beginning is near enough for an orbit.
+        dates = [
+            f.observation.date if f.observation.mid_date is None else f.observation.mid_date
+            for f in frames
+        ]
+        known = [date.mjd for date in dates if date is not None]
+        stars = [star_flux_density(frame) for frame in frames]
+        star = None
+        if all(each is not None for each in stars):
+            value, error = np.mean(np.array(stars), axis=0)
+            star = (float(value), float(scatter * error))
+        return cls(
+            None if first.position_angles is None else first.position_angle,
+            float(np.mean(known)) if known else None,
+            star,
+        )
+
+    @property
+    def star_jansky(self) -> float | None:
+        """Flux density of the star alone."""
+        return None if self.star is None else self.star[0]
+
+    @property
+    def facts(self) -> dict[str, float | str]:
+        """What is known of epoch and star, for headers."""
+        known = {"epoch": self.date, "star_flux_density_jy": self.star_jansky}
+        return {name: value for name, value in known.items() if value is not None}
+
+    @property
+    def date(self) -> str | None:
+        """The epoch in words, to the second."""
+        return None if self.mjd is None else Time(self.mjd, format="mjd").isot[:19]
+
+
+def star_flux_density(frame: FrameFit) -> tuple[float, float] | None:
+    """Flux density of a star and its standard deviation, Jy.
+
+    The fitted flux is the light that the entrance pupil collects, in the unit of the pixels. What
+    the pipeline calibrates is the light of a source far from the occulter, all of its image
+    through the Lyot stop. That is the fitted flux times the transmission of the stop, times the
+    solid angle of a pixel for which the pipeline calculated its surface brightness (PIXAR_SR).
+
+    Returns
+    -------
+    tuple of float or None
+        None for frames that are not NIRCam's, that are not in units of surface brightness, or
+        whose header has no PIXAR_SR.
+    """
+    observation = frame.observation
+    area = observation.header.get("PIXAR_SR")
+    if not (observation.is_nircam and observation.unit.is_equivalent(_BRIGHTNESS)):
+        return None
+    if isinstance(area, bool) or not isinstance(area, float) or not area > 0:
+        return None
+    # A tensor, because the wavefront is complex where the pupil's amplitude was fitted.
+    opd = torch.from_numpy(np.ascontiguousarray(frame.opd))
+    transmission = frame.model.transmission(opd, **frame.optical_values)
+    scale = transmission * area * observation.unit.to(_BRIGHTNESS) * 1e6
+    return scale * frame.flux, scale * float(frame.errors["flux"][0])
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Positions relative to the star with their covariances, on the first frame and on the sky.
+
+    Attributes
+    ----------
+    offsets : ndarray, (k, 2)
+        x, y on the first frame, arcsec.
+    covariance : ndarray, (k, 2, 2)
+        Of x and y, arcsec^2.
+    north : float
+        Position angle of +y, degrees east of north.
+    """
+
+    offsets: Image
+    covariance: Image
+    north: float = 0.0
+
+    @property
+    def separation(self) -> Image:
+        """Separation, arcsec, (k,)."""
+        return np.asarray(np.hypot(*self.offsets.T))
+
+    @property
+    def frame_angle(self) -> Image:
+        """Angle from +y of the first frame, counter-clockwise, degrees, (k,)."""
+        x, y = self.offsets.T
+        return np.asarray(np.rad2deg(np.arctan2(-x, y)) % 360)
+
+    @property
+    def position_angle(self) -> Image:
+        """Position angle, degrees east of north, (k,)."""
+        return (self.frame_angle + self.north) % 360
+
+    @property
+    def on_sky(self) -> Image:
+        """Offsets to the east (dRA cos Dec) and to the north (dDec), arcsec, (k, 2)."""
+        return self.offsets @ self._to_sky.T
+
+    @property
+    def _to_sky(self) -> NDArray[np.float64]:
+        """Matrix from x, y to east, north: a reflection, because east is left of north."""
+        sine, cosine = np.sin(np.deg2rad(self.north)), np.cos(np.deg2rad(self.north))
+        return np.array([[-cosine, sine], [sine, cosine]])
+
+    @property
+    def sky_covariance(self) -> Image:
+        """Covariance of the offsets to the east and to the north, arcsec^2, (k, 2, 2)."""
+        turn = self._to_sky
+        return np.asarray(turn @ self.covariance @ turn.T)
+
+    @property
+    def polar_covariance(self) -> Image:
+        """Covariance of separation and position angle, arcsec and degrees, (k, 2, 2)."""
+        radial = self.offsets / self.separation[:, None]
+        # The position angle grows counter-clockwise, from +y towards -x.
+        tangential = np.stack([-radial[:, 1], radial[:, 0]], axis=1)
+        degrees = np.rad2deg(tangential / self.separation[:, None])
+        jacobian = np.stack([radial, degrees], axis=1)
+        return np.asarray(jacobian @ self.covariance @ jacobian.transpose(0, 2, 1))
+
+
+def deviations_and_correlation(covariance: Image) -> tuple[Image, Image, Image]:
+    """Standard deviations and correlation of pairs, (k,) each, from covariances (k, 2, 2)."""
+    first, second = np.sqrt(covariance[:, 0, 0]), np.sqrt(covariance[:, 1, 1])
+    with np.errstate(invalid="ignore"):
+        return first, second, covariance[:, 0, 1] / (first * second)

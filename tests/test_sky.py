@@ -1,0 +1,332 @@
+"""What an astronomer reports: positions on the sky, fluxes, limits and epochs, and their errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+from astropy.coordinates import SkyCoord, get_sun
+from astropy.io import ascii, fits
+from astropy.table import QTable
+from astropy.time import Time
+from astropy.wcs import WCS
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.contrast import contrast_table
+from pyklip_diffrender.detection.orbits import write_astrometry
+from pyklip_diffrender.detection.sky import Positions, Sky, star_flux_density
+from pyklip_diffrender.detection.tables import candidate_table, measured_table
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.refinement import FrameFit
+from pyklip_diffrender.scene.observation import Observation
+
+# Of jw01184005001_03106_00001_nrcalong_calints.fits. The linear part of its WCS is the pipeline's,
+# made from the calibrated distortion; ROLL_REF and V3I_YANG are what this package reads.
+REAL = {
+    "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CUNIT1": "deg", "CUNIT2": "deg",
+    "CRPIX1": 11.0, "CRPIX2": 8.0, "CRVAL1": 64.32809808222, "CRVAL2": 8.8205266314574,
+    "CD1_1": 1.5631483447774e-06, "CD1_2": -1.7416402091741e-05,
+    "CD2_1": -1.7160783488561e-05, "CD2_2": -1.5037827653561e-06,
+    "ROLL_REF": 265.015559386916, "V3I_YANG": 0.05428612, "VPARITY": -1,
+    "PIXAR_A2": 0.003918172030450555, "PIXAR_SR": 9.20944023299612e-14, "BUNIT": "MJy/sr",
+    "EXPMID": 59855.61227794953, "DATE-BEG": "2022-10-03T14:26:41.218", "INSTRUME": "NIRCAM",
+}  # fmt: skip
+NORTH = REAL["ROLL_REF"] + REAL["V3I_YANG"]
+COVARIANCE = np.array([[4.0, 1.5], [1.5, 1.0]]) * 1e-6
+"""Of x and y, arcsec^2: tilted, so that a wrong turn shows."""
+
+SKY = Sky(north=NORTH, mjd=59855.5, star=(0.4, 0.04))
+
+
+def observation(folder: Path, **changes: object) -> Observation:
+    science = fits.ImageHDU(np.ones((1, 16, 20), "f4"), name="SCI")
+    for key, value in {**REAL, **changes}.items():
+        if value is not None:
+            science.header[key] = value
+    error = fits.ImageHDU(np.ones((1, 16, 20), "f4"), name="ERR")
+    quality = fits.ImageHDU(np.zeros((1, 16, 20), "i4"), name="DQ")
+    fits.HDUList([fits.PrimaryHDU(), science, error, quality]).writeto(folder / "calints.fits")
+    return Observation.from_fits(folder / "calints.fits")
+
+
+def candidates(offsets: list[list[float]], contrasts: list[float]) -> Candidates:
+    count = len(contrasts)
+    covariance = np.zeros((3, count, 3, count))
+    for k, contrast in enumerate(contrasts):
+        covariance[0, k, 0, k] = (0.1 * contrast) ** 2
+        covariance[1:, k, 1:, k] = COVARIANCE
+    start = Candidates.at(offsets, contrasts)
+    flat = torch.from_numpy(covariance.reshape(3 * count, 3 * count))
+    return Candidates(start.offsets, start.contrasts, flat)
+
+
+def table(sky: Sky = SKY) -> QTable:
+    known = candidates([[-0.3, 0.5], [0.2, -0.8]], [1e-4, 2e-4])
+    return candidate_table(known, 1.0, np.array([[0.1, 0.1], [0.02, 0.02]]), sky)
+
+
+# -- orientation -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pixels", [(10, 0), (0, 10), (-9, 13), (7, -12), (-20, -4)])
+def test_the_sky_is_where_the_frames_own_wcs_has_it(
+    tmp_path: Path, pixels: tuple[int, int]
+) -> None:
+    """A flipped axis or a wrong sign is wrong by the whole offset; the scales agree to 0.2 %."""
+    got = observation(tmp_path)
+    mask = ROUND_MASKS["MASK335R"]
+    # As in `Templates.grid`: the detector's scales and shear about the star.
+    x = pixels[0] * mask.siaf_pixelscale[0]
+    y = pixels[1] * mask.siaf_pixelscale[1] + mask.siaf_shear * x
+    here = Positions(np.array([[x, y]]), COVARIANCE[None], got.position_angle)
+    wcs = WCS(fits.Header({k: v for k, v in REAL.items() if k[:2] in ("CT", "CU", "CR", "CD")}))
+    star = wcs.pixel_to_world(*got.center[0])
+    place = wcs.pixel_to_world(*(got.center[0] + pixels))
+    east, north = star.spherical_offsets_to(place)
+    distance = star.separation(place).arcsec
+    np.testing.assert_allclose(
+        here.on_sky[0], [east.arcsec, north.arcsec], rtol=0, atol=4e-3 * distance
+    )
+    assert here.separation[0] == pytest.approx(distance, rel=3e-3)
+    away = star.position_angle(place).deg - here.position_angle[0]
+    assert (away + 180) % 360 - 180 == pytest.approx(0, abs=0.2)
+
+
+def test_a_planet_in_an_image_is_on_the_side_of_the_sky_where_the_wcs_has_it() -> None:
+    """From the model's own pixels: `Planet.offset` and the table have the same x and y."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=33)
+    planet = dr.Planet(1.0, 0.8, 35.0)
+    with torch.no_grad():
+        image = model(None, planet.offset).numpy()
+    row, column = np.unravel_index(image.argmax(), image.shape)
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.crpix = ["RA---TAN", "DEC--TAN"], [17.0, 17.0]
+    wcs.wcs.crval = [30.0, -40.0]
+    # A frame whose +y axis is at position angle 50 degrees, east counter-clockwise of north.
+    sine, cosine = np.sin(np.deg2rad(50.0)), np.cos(np.deg2rad(50.0))
+    wcs.wcs.cd = np.array([[-cosine, sine], [sine, cosine]]) * model.detector.pixelscale[0] / 3600
+    star, place = wcs.pixel_to_world(16, 16), wcs.pixel_to_world(column, row)
+    known = candidate_table(
+        candidates([list(planet.offset)], [1.0]), 1.0, np.zeros((2, 1)), Sky(north=50.0)
+    )
+    assert known["position_angle"][0].to_value("deg") == pytest.approx(85.0)
+    assert known["frame_angle"][0].to_value("deg") == pytest.approx(35.0)
+    assert star.position_angle(place).deg == pytest.approx(85.0, abs=4)
+    east, north = star.spherical_offsets_to(place)
+    assert known["delta_ra"][0].to_value("arcsec") == pytest.approx(east.arcsec, abs=0.05)
+    assert known["delta_dec"][0].to_value("arcsec") == pytest.approx(north.arcsec, abs=0.05)
+
+
+def test_without_a_roll_angle_nothing_is_said_about_the_sky(tmp_path: Path) -> None:
+    assert observation(tmp_path, ROLL_REF=None).position_angles is None
+    blind = table(Sky(mjd=59855.5))
+    assert not {"delta_ra", "delta_dec", "radec_corr"} & set(blind.colnames)
+    assert "not known" in blind["position_angle"].info.description
+    np.testing.assert_array_equal(blind["position_angle"], blind["frame_angle"])
+
+
+# -- errors ------------------------------------------------------------------------------------
+
+
+def test_the_covariance_turns_with_the_frame(rng: np.random.Generator) -> None:
+    """Against draws, turned as complex numbers: north + i east is y - i x times exp(i north)."""
+    row = table()[1]
+    place = np.array([row["x"].value, row["y"].value])
+    drawn = rng.multivariate_normal(place, COVARIANCE, size=40_000)
+    sky = (drawn[:, 1] - 1j * drawn[:, 0]) * np.exp(1j * np.deg2rad(NORTH))
+    sky_names = ("delta_ra", "delta_dec", "radec_corr")
+    polar_names = ("separation", "position_angle", "seppa_corr")
+    for pair, (first, second, corr) in (
+        ((sky.imag, sky.real), sky_names),
+        ((np.abs(sky), np.rad2deg(np.angle(sky)) % 360), polar_names),
+    ):
+        for values, name in zip(pair, (first, second), strict=True):
+            error = row[f"{name}_error"].value
+            assert row[name].value == pytest.approx(values.mean(), abs=0.02 * error)
+            assert error == pytest.approx(values.std(), rel=0.02)
+        assert abs(row[corr]) > 0.1
+        assert row[corr] == pytest.approx(np.corrcoef(*pair)[0, 1], abs=0.02)
+
+
+def test_the_flux_of_a_planet_does_not_have_the_error_of_the_stars_flux() -> None:
+    row = table()[0]
+    # 10 % of noise; 10 % of the star's flux and its image, of which 2 % of the image alone.
+    assert row["contrast_error"] / row["contrast"] == pytest.approx(np.hypot(0.1, 0.1))
+    share = (row["flux_density_error"] / row["flux_density"]).value
+    assert share == pytest.approx(np.hypot(0.1, 0.02))
+    assert row["flux_density"].to_value("Jy") == pytest.approx(0.4 * row["contrast"])
+    assert row["ab_mag"].value == pytest.approx(row["flux_density"].to_value(u.ABmag))
+    assert row["ab_mag_error"].value == pytest.approx(2.5 / np.log(10) * share)
+
+
+# -- limits ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigmas", [3.0, 5.0])
+def test_what_is_not_detected_has_an_upper_limit(sigmas: float) -> None:
+    snr = np.array([-1.0, 2.0, 4.0, 9.0])
+    raw = QTable({"x": [0.5] * 4 * u.arcsec, "y": [0.1] * 4 * u.arcsec, "contrast": 1e-6 * snr,
+                  "contrast_error": np.full(4, 1e-6), "snr": snr})  # fmt: skip
+    got = measured_table(raw, np.zeros((2, 4)), SKY, sigmas)
+    expected = np.array([sigmas, 2 + sigmas, 4 + sigmas, np.nan]) * 1e-6
+    expected[snr >= sigmas] = np.nan
+    np.testing.assert_allclose(got["upper_limit"], expected)
+    np.testing.assert_allclose(got["upper_limit_delta_mag"].value, -2.5 * np.log10(expected))
+    np.testing.assert_allclose(got["upper_limit_flux_density"].to_value("Jy"), 0.4 * expected)
+    # A negative flux has no magnitude.
+    np.testing.assert_array_equal(np.isnan(got["delta_mag"].value), snr < 0)
+    assert got.meta["sigmas"] == sigmas
+    place = Positions(np.array([[0.5, 0.1]]), COVARIANCE[None], NORTH).on_sky[0]
+    np.testing.assert_allclose([got["delta_ra"][0].value, got["delta_dec"][0].value], place)
+
+
+@pytest.mark.parametrize("made", ["candidates", "measured", "curve"])
+def test_a_table_shows_its_contrasts_on_80_columns(made: str) -> None:
+    ring = [np.full(4, 1.23456789e-6)] * 2
+    raw = QTable({"x": [0.5] * u.arcsec, "y": [0.1] * u.arcsec, "contrast": [1.23e-6],
+                  "contrast_error": [1e-6], "snr": [1.23]})  # fmt: skip
+    shown = {
+        "candidates": table(),
+        "measured": measured_table(raw, np.zeros((2, 1)), SKY, 5.0),
+        "curve": contrast_table(np.array([0.5, 0.6]), ring, ring, 0.14, 0.4),
+    }[made]
+    header, *lines = shown.pformat(max_width=80)
+    assert max(map(len, (header, *lines))) <= 80
+    assert "contrast" in header.split()
+    assert ("snr" in header.split()) == (made != "curve")
+    assert all(shown[name].info.description for name in shown.colnames)
+
+
+# -- flux and epoch ----------------------------------------------------------------------------
+
+
+def fitted(observation: Observation) -> FrameFit:
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=16)
+    return cast(
+        "FrameFit",
+        SimpleNamespace(
+            observation=observation, model=model, opd=np.zeros((128, 128)), flux=2e7,
+            optical_values={}, errors={"flux": np.array([1e6])},
+        ),
+    )  # fmt: skip
+
+
+def test_the_stop_passes_what_arrives_of_a_star_without_the_occulter() -> None:
+    options: Any = {"monochromatic": 4.5e-6, "npix": 256, "si_wfe": False}
+    model = dr.nircam_coronagraph("F444W", fov_pixels=16, **options)
+    bare = dr.nircam_coronagraph("F444W", fov_pixels=160, image_mask=None, **options)
+    share = model.transmission()
+    assert share == bare.transmission()
+    with torch.no_grad():
+        arrived = float(bare(None).sum())
+    # Some of it falls beyond 5 arcsec.
+    assert 0.96 * share < arrived < share
+    moved = model.transmission(lyot_shift=(0.1, 0.0))
+    assert moved < 0.9 * share
+
+
+def test_a_stars_flux_density_is_that_of_its_unocculted_image(tmp_path: Path) -> None:
+    got = observation(tmp_path)
+    frame = fitted(got)
+    value, error = cast("tuple[float, float]", star_flux_density(frame))
+    expected = 2e7 * frame.model.transmission() * REAL["PIXAR_SR"] * 1e6
+    assert value == pytest.approx(expected)
+    assert error == pytest.approx(0.05 * expected)
+    # What is not calibrated has no flux density.
+    del got.header["PIXAR_SR"]
+    assert star_flux_density(fitted(got)) is None
+
+
+def test_simulated_frames_have_no_flux_density() -> None:
+    frames = Observation.from_arrays(np.ones((4, 4)), np.ones((4, 4)), pixelscale=0.06)
+    assert star_flux_density(fitted(frames)) is None
+
+
+def test_the_epoch_is_the_middle_of_the_exposures(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
+    first = observation(tmp_path / "a")
+    later = observation(tmp_path / "b", EXPMID=None, **{"DATE-BEG": "2022-10-03T16:00:00"})
+    assert first.mid_date is not None
+    assert first.mid_date.mjd == REAL["EXPMID"]
+    fits_ = cast("Any", [SimpleNamespace(frames=[fitted(first), fitted(later)])])
+    sky = Sky.of(fits_)
+    assert sky.mjd == pytest.approx((REAL["EXPMID"] + 59855 + 16 / 24) / 2, abs=1e-8)
+    assert sky.date == Time(sky.mjd, format="mjd").isot[:19]
+    assert set(table(sky)["epoch_mjd"]) == {sky.mjd}
+
+
+# -- orbits ------------------------------------------------------------------------------------
+
+
+def test_orbitize_reads_the_astrometry(tmp_path: Path) -> None:
+    """As its `read_file` does: astropy's reader, MJD, integers, mas and degrees."""
+    known = table()
+    path = write_astrometry(known, tmp_path / "astrometry.csv", "orbitize")
+    read = ascii.read(path)
+    assert list(read["object"]) == [1, 2]
+    assert isinstance(read[0]["object"], np.int64)
+    np.testing.assert_allclose(read["epoch"], 59855.5)
+    for name, column in (("raoff", "delta_ra"), ("decoff", "delta_dec"), ("sep", "separation")):
+        np.testing.assert_allclose(read[name], known[column].to_value("mas"), rtol=1e-6)
+        error = known[f"{column}_error"].to_value("mas")
+        np.testing.assert_allclose(read[f"{name}_err"], error, rtol=1e-5)
+    np.testing.assert_allclose(read["pa"], known["position_angle"].to_value("deg"), rtol=1e-6)
+    np.testing.assert_allclose(read["radec_corr"], known["radec_corr"], rtol=1e-5)
+
+
+def test_orvara_reads_the_astrometry(tmp_path: Path) -> None:
+    known = table()
+    path = write_astrometry(known, tmp_path / "relAst.txt", "orvara")
+    read = np.genfromtxt(path, usecols=range(7))
+    np.testing.assert_allclose(read[:, 0], 2459856.0)
+    np.testing.assert_allclose(read[:, 1], known["separation"].to_value("arcsec"), rtol=1e-6)
+    np.testing.assert_allclose(read[:, 4], known["position_angle_error"].to_value("deg"), rtol=1e-5)
+    np.testing.assert_allclose(read[:, 5], known["seppa_corr"], rtol=1e-5)
+    np.testing.assert_array_equal(read[:, 6], [0, 1])
+
+
+@pytest.mark.parametrize(
+    ("sky", "format", "message"),
+    [
+        (Sky(north=1.0), "orbitize", "no date"),
+        (Sky(mjd=59855.0), "orbitize", "no position angle"),
+        (SKY, "csv", "expected one of orbitize, orvara"),
+    ],
+)
+def test_an_orbit_needs_angle_and_date(sky: Sky, format: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(IncompatibleSetupError, match=message):
+        write_astrometry(table(sky), tmp_path / "astrometry.csv", format)
+    assert not list(tmp_path.iterdir())
+
+
+# -- real frames -------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_companion_of_hip_65426_is_on_its_side_of_the_star(shared_data: Path) -> None:
+    """The header's roll is a placeholder, but the telescope keeps its shade towards the sun.
+
+    Its V3 axis points away from the sun, within some degrees. The companion's published position
+    angle, 149.9 degrees, minus that of the frame, is the angle of this axis. A mirrored image
+    would be wrong by 58 degrees.
+    """
+    frames = shared_data / "hip65426_f444w_calints.fits.gz"
+    opd = shared_data / "opd_2022-07-30.fits.gz"
+    found = dr.reduce(frames, opd, size=48).detection
+    row = found.table[0]
+    assert row["separation"].to_value("mas") == pytest.approx(820, abs=25)
+    header = found.observation.header
+    star = SkyCoord(header["CRVAL1"], header["CRVAL2"], unit="deg")
+    sun = get_sun(Time("2022-07-30"))
+    nominal = star.position_angle(SkyCoord(sun.ra, sun.dec)).deg + 180
+    v3 = 149.9 - row["position_angle"].to_value("deg")
+    assert (v3 - nominal + 180) % 360 - 180 == pytest.approx(0, abs=8)
+    # 15.47 mag in F444W, of which magnitude 0 is 184 Jy.
+    assert row["flux_density"].to_value("Jy") == pytest.approx(1.2e-4, rel=0.5)
