@@ -19,6 +19,7 @@ from astropy.wcs import WCS
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.orbits import write_astrometry
 from pyklip_diffrender.detection.sky import Positions, Sky, star_flux_density
 from pyklip_diffrender.detection.tables import candidate_table, measured_table
@@ -195,7 +196,9 @@ def test_a_table_shows_its_contrasts_on_80_columns(made: str) -> None:
     shown = {
         "candidates": table(),
         "measured": measured_table(raw, np.zeros((2, 1)), SKY, 5.0),
-        "curve": contrast_table(np.array([0.5, 0.6]), ring, ring, 0.14, 0.4),
+        "curve": contrast_table(
+            np.array([0.5, 0.6]), ring, ring, 0.14, ErrorFactor.constant(1.5), 0.4
+        ),
     }[made]
     header, *lines = shown.pformat(max_width=80)
     assert max(map(len, (header, *lines))) <= 80

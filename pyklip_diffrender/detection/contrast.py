@@ -10,6 +10,8 @@ from astropy.table import QTable
 from numpy.typing import NDArray
 from scipy import stats
 
+from pyklip_diffrender.detection.error_factor import ErrorFactor
+
 __all__ = ["contrast_table", "described", "small_sample_factor"]
 
 _SIGMAS = 5.0
@@ -23,6 +25,7 @@ _COLUMNS = {
     "highest": (".2e", "of the ring"),
     "known_star": (".2e", "median if the image of the star were known"),
     "small_sample": (".2e", "median with the small-sample correction"),
+    "error_factor": (".2f", "by which errors were multiplied, included in all but known_star"),
     "flux_density": (".2e", "of the median, in the photometric calibration of the frames"),
 }
 """Formats and descriptions of the columns."""
@@ -63,6 +66,7 @@ def contrast_table(
     errors: list[NDArray[np.float64]],
     photon: list[NDArray[np.float64]],
     resolution: float,
+    factor: ErrorFactor,
     star: float | None = None,
 ) -> QTable:
     """Make the table of a 5-sigma contrast curve.
@@ -72,11 +76,12 @@ def contrast_table(
     separations : ndarray
         arcsec.
     errors : list of ndarray
-        Standard deviations of contrasts at the pixels of each ring.
+        Standard deviations of contrasts at the pixels of each ring, multiplied by the factor.
     photon : list of ndarray
         The same for a known star.
     resolution : float
         lambda/D, arcsec.
+    factor : ErrorFactor
     star : float, optional
         Flux density of the star, Jy.
 
@@ -86,12 +91,12 @@ def contrast_table(
         Separation; median contrast of the ring and its magnitude difference; lowest and highest
         contrast; the median for a known star (the photon limit of a matched filter); the median
         with the small-sample correction, which applies where errors were scaled to the measured
-        scatter; if `star` is known, the flux density of the median.
+        scatter; the factor; if `star` is known, the flux density of the median.
     """
     rows = []
-    factor = small_sample_factor(separations, resolution, _SIGMAS)
+    small_sample = small_sample_factor(separations, resolution, _SIGMAS)
     for separation, error, photon_error, correction in zip(
-        separations, errors, photon, factor, strict=True
+        separations, errors, photon, small_sample, strict=True
     ):
         if not len(error):
             continue
@@ -102,10 +107,11 @@ def contrast_table(
         rows.append(
             (separation, middle, magnitude, limit.min(), limit.max(), bound, middle * correction)
         )
-    names = [name for name in _COLUMNS if name != "flux_density"]
+    names = [name for name in _COLUMNS if name not in ("error_factor", "flux_density")]
     table = QTable(rows=rows, names=names, dtype=(float,) * len(names))
     for name, unit in (("separation", u.arcsec), ("delta_mag", u.mag)):
         table[name] = np.asarray(table[name]) * unit
+    table["error_factor"] = factor.at(table["separation"].value)
     if star is not None:
         table["flux_density"] = star * np.asarray(table["contrast"]) * u.Jy
     table.meta = {"sigmas": _SIGMAS, "resolution_arcsec": resolution}

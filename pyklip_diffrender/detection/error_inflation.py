@@ -10,17 +10,13 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.field import Image, far_from, separation_of
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.refinement import Refinement
 
-__all__ = ["error_inflation", "snr_scatter"]
+__all__ = ["error_inflation"]
 
 _DEGENERATE = 1e-6
 """Relative eigenvalue below which sources are degenerate with each other."""
-
-_WINGS = 0.4
-"""arcsec; closer to a candidate, its own light dominates the S/N."""
 
 
 def error_inflation(fits: Sequence[Refinement], groups: Sequence[Group], offsets: Tensor) -> float:
@@ -50,26 +46,6 @@ def error_inflation(fits: Sequence[Refinement], groups: Sequence[Group], offsets
     # A ratio, because robust fits give outliers less weight in their linear models.
     share = _reduced_chi2(groups, offsets) / _reduced_chi2(groups, companions)
     return math.sqrt(max(1.0, reduced * share))
-
-
-def snr_scatter(snr: Image, grid: Image, offsets: Tensor, inner: float) -> float:
-    """Clipped standard deviation of the S/N away from sources, at least 1.
-
-    Parameters
-    ----------
-    snr : ndarray, (ny, nx)
-    grid : ndarray, (ny, nx, 2)
-        x, y of the pixels from the star, arcsec.
-    offsets : Tensor, (k, 2)
-        x, y of the sources.
-    inner : float
-        Pixels closer to the star than this are ignored, arcsec.
-    """
-    clear = (separation_of(grid) >= inner) & np.isfinite(snr) & far_from(grid, offsets, _WINGS)
-    values = snr[clear]
-    deviation = 1.4826 * float(np.median(np.abs(values - np.median(values))))
-    # Clipped, so that sources that are not yet candidates do not raise their own threshold.
-    return max(1.0, float(np.clip(values, -5 * deviation, 5 * deviation).std()))
 
 
 def _reduced_chi2(groups: Sequence[Group], offsets: Tensor) -> float:

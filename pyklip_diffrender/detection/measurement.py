@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from pyklip_diffrender.detection.calibration import calibration_errors
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image, require_inside
 from pyklip_diffrender.detection.groups import Group, has_only_reference_stars, weigh
 from pyklip_diffrender.detection.relinearise import without_light
@@ -30,9 +31,11 @@ _SETTLED = 0.2
 
 
 def contrasts_at(
-    groups: Sequence[Group], offsets: ArrayLike, scatter: float
+    groups: Sequence[Group], offsets: ArrayLike, factor: ErrorFactor
 ) -> tuple[QTable, Image]:
     """Contrasts of point sources at known positions, one at a time; see `Detection.measure`.
+
+    All errors are multiplied by the factor of their position.
 
     Returns
     -------
@@ -46,10 +49,11 @@ def contrasts_at(
         raise ShapeError(f"offsets: got shape {tuple(places.shape)}, expected (k, 2)")
     require_inside(places.numpy(), groups[0][1].grid)
     products = weigh(groups, lambda templates: templates.at(places))
-    error = scatter / products.information.sqrt().numpy()
+    factors = factor.of(places)
+    error = factors / products.information.sqrt().numpy()
     contrast = (products.numerator / products.information).numpy()
     snr = contrast / error
-    calibration = scatter * calibration_errors(groups, places, torch.from_numpy(snr)).numpy()
+    calibration = factors * calibration_errors(groups, places, torch.from_numpy(snr)).numpy()
     table = QTable(
         {
             "x": places[:, 0].numpy() * u.arcsec,

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.detection.calibration import calibration_errors
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import described
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.detection.measurement import (
@@ -65,16 +67,16 @@ class Detection:
     contrast : ndarray, (ny, nx)
         Flux of a point source at every pixel over that of the star, before the coronagraph.
     error : ndarray, (ny, nx)
-        Standard deviation of `contrast`, with the factor `scatter`.
+        Standard deviation of `contrast`, with the factor `error_factor`.
     photon_error : ndarray, (ny, nx)
         Standard deviation of `contrast` for a known star.
     snr : ndarray, (ny, nx)
         contrast / error.
     residual_snr : ndarray, (ny, nx)
         The same after the candidates are removed from the data.
-    scatter : float
-        Factor by which all errors were multiplied, so that the S/N away from sources has a
-        standard deviation of 1.
+    error_factor : ErrorFactor
+        Factor by which errors were multiplied, as a function of separation:
+        ``error_factor.at(0.5)`` is that at 0.5 arcsec.
     candidates : Candidates
     threshold : float
         Smallest S/N of a candidate.
@@ -93,7 +95,7 @@ class Detection:
     photon_error: Image
     snr: Image
     residual_snr: Image
-    scatter: float
+    error_factor: ErrorFactor
     candidates: Candidates
     threshold: float
     contrast_curve: QTable
@@ -128,6 +130,11 @@ class Detection:
         """Position angle of the first frame's +y axis, degrees east of north; 0 if not known."""
         return self.observation.position_angle
 
+    @property
+    def scatter(self) -> float:
+        """The typical factor by which errors were multiplied: the median over separations."""
+        return self.error_factor.typical
+
     @cached_property
     def sky(self) -> Sky:
         """Orientation, epoch, and flux density of the star, as far as they are known."""
@@ -149,7 +156,9 @@ class Detection:
         `calibration.calibration_errors`); that of the flux density does not depend on the star's
         flux. The S/N includes neither, because they do not change the significance of a source.
         """
-        table = candidate_table(self.candidates, self.scatter, self._calibration_errors, self.sky)
+        table = candidate_table(
+            self.candidates, self.error_factor, self._calibration_errors, self.sky
+        )
         table.meta = dict(self._provenance)
         return table
 
@@ -157,8 +166,9 @@ class Detection:
     def _calibration_errors(self) -> Image:
         """Relative calibration errors of the candidates' contrasts and fluxes, (2, k)."""
         candidates = self.candidates
-        snr = candidates.contrasts / (self.scatter * candidates.errors[:, 0])
-        return self.scatter * calibration_errors(self.groups, candidates.offsets, snr).numpy()
+        factors = torch.from_numpy(self.error_factor.of(candidates.offsets))
+        snr = candidates.contrasts / (factors * candidates.errors[:, 0])
+        return (factors * calibration_errors(self.groups, candidates.offsets, snr)).numpy()
 
     def measure(self, offsets: ArrayLike, *, sigmas: float = 5.0) -> QTable:
         """Contrast of a point source at given positions, one at a time.
@@ -185,7 +195,7 @@ class Detection:
             fit; see `read`.
         NonFiniteError, ShapeError, UnitError
         """
-        raw, calibration = contrasts_at(self._searched[1], offsets, self.scatter)
+        raw, calibration = contrasts_at(self._searched[1], offsets, self.error_factor)
         return measured_table(raw, calibration, self.sky, sigmas)
 
     def measure_shape(self, image: ArrayLike, *, relinearise: float = 25.0) -> tuple[float, float]:
@@ -365,7 +375,9 @@ class Detection:
             detection = cls(
                 fits=fits,
                 groups=groups_of_searched(fits, facts["fits"], path) if fits else (),
-                scatter=facts["scatter"],
+                error_factor=ErrorFactor(
+                    **{key: np.atleast_1d(v) for key, v in facts["error_factor"].items()}
+                ),
                 threshold=facts["threshold"],
                 candidates=candidates_of(facts["candidates"]),
                 contrast_curve=described(table_of(facts["contrast_curve"])),

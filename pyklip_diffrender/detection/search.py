@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from pyklip_diffrender.detection.candidates import Candidates, refine_candidates, strongest_peak
 from pyklip_diffrender.detection.contrast import contrast_table
-from pyklip_diffrender.detection.error_inflation import error_inflation, snr_scatter
+from pyklip_diffrender.detection.error_factor import ErrorFactor, scatter_profile
+from pyklip_diffrender.detection.error_inflation import error_inflation
 from pyklip_diffrender.detection.field import (
     Image,
     curve_separations,
@@ -40,11 +41,6 @@ _log = logging.getLogger(__name__)
 
 _MAX_CANDIDATES = 20
 
-_CORRELATED = 1.15
-"""Scatter of S/N, in units of what chi-squared per pixel predicts, above which the errors of the
-model in real frames are taken to be correlated between pixels. Without such errors, a map of a
-hundred independent positions scatters by 1 within 7 %."""
-
 _SOURCE = 5.0
 """S/N above which `measure` removes a source before it computes the default `scatter`."""
 
@@ -71,9 +67,10 @@ def detect(
         Smallest separation of candidates, arcsec.
     scatter : float, optional
         Factor by which all errors are multiplied. By default it is the square root of the reduced
-        chi-squared with the candidates removed if every fit explains its data, otherwise the
-        standard deviation of the S/N away from candidates; at least 1. On real frames it is that
-        standard deviation as well where it is larger by 15 % or more.
+        chi-squared with the candidates removed if every fit explains its data, and at least 1. On
+        real frames, and where a fit does not explain its data, the errors are increased at every
+        separation to the standard deviation of the S/N there, away from candidates, if that is
+        larger: errors of the model that neighbouring pixels share do not show in chi-squared.
     separations : array or Quantity, optional
         Separations of the contrast curve, arcsec. Default every 0.1 from 0.2 to the nearest edge.
     relinearise : float
@@ -111,8 +108,8 @@ def detect(
     candidates, factor = _search(maps, fits, threshold, inner, scatter, Candidates.of_fit(fits[0]))
     if not all(fit.status.calibrated for fit in fits):
         relinearise = min(relinearise, threshold)
-    bright = candidates.contrasts > relinearise * factor * candidates.errors[:, 0]
-    if bool(bright.any()) and lacks_candidates(fits, candidates):
+    bright = _snr(candidates, factor) > relinearise
+    if bright.any() and lacks_candidates(fits, candidates):
         fits = with_companions(fits, candidates, progress)
         maps = Maps(groups_of(fits), progress)
         candidates, factor = _search(maps, fits, threshold, inner, scatter, candidates)
@@ -123,7 +120,8 @@ def detect(
         )  # fmt: skip
     information = np.where(maps.information > 0, maps.information, np.nan)
     photon = np.where(maps.photon > 0, maps.photon, np.nan) ** -0.5
-    error = factor / np.sqrt(information)
+    factors = factor.at(separation_of(maps.grid))
+    error = factors / np.sqrt(information)
     separations = curve_separations(maps.grid, separations)
     rings = [
         np.array(ring)[:, np.isfinite(error[ring])]
@@ -135,9 +133,9 @@ def detect(
         contrast=maps.numerator / information,
         error=error,
         photon_error=photon,
-        snr=maps.snr() / factor,
-        residual_snr=maps.snr(maps.without(candidates)) / factor,
-        scatter=factor,
+        snr=maps.snr() / factors,
+        residual_snr=maps.snr(maps.without(candidates)) / factors,
+        error_factor=factor,
         candidates=candidates,
         threshold=threshold,
         contrast_curve=contrast_table(
@@ -145,6 +143,7 @@ def detect(
             [error[*ring] for ring in rings],
             [photon[*ring] for ring in rings],
             _resolution(fits[0]),
+            factor,
             Sky.of(fits).star_jansky,
         ),
         grid=maps.grid,
@@ -201,7 +200,7 @@ def _measured(
     """Contrasts, their calibration errors, and the factor by which all errors are multiplied."""
     groups = groups_of(fits)
     factor = 1.0 if scatter is None else scatter
-    table, calibration = contrasts_at(groups, offsets, factor)
+    table, calibration = contrasts_at(groups, offsets, ErrorFactor.constant(factor))
     if scatter is None:
         sources = _as_candidates(table[table["snr"] > _SOURCE])
         companions = Candidates.of_fit(fits[0])
@@ -266,8 +265,14 @@ def contrast_curve(
     ends = np.cumsum([len(ring[0]) for ring in rings])[:-1]
     errors = np.split(scatter * products.information.numpy() ** -0.5, ends)
     photon = np.split(products.photon.numpy() ** -0.5, ends)
-    star = Sky.of(fits).star_jansky
-    return contrast_table(separations, errors, photon, _resolution(fits[0]), star)
+    return contrast_table(
+        separations,
+        errors,
+        photon,
+        _resolution(fits[0]),
+        ErrorFactor.constant(scatter),
+        Sky.of(fits).star_jansky,
+    )
 
 
 def _checked(fits: Fits) -> list[Refinement]:
@@ -295,32 +300,25 @@ def _search(
     inner: float,
     scatter: float | None,
     start: Candidates,
-) -> tuple[Candidates, float]:
+) -> tuple[Candidates, ErrorFactor]:
     """Candidates in the order in which they were found, and the factor for the errors."""
     groups, grid, pixel = maps.groups, maps.grid, pixel_width(maps.grid)
-    explained = all(fit.status.calibrated for fit in fits)
-    is_nircam = fits[0].frames[0].observation.is_nircam
     candidates = refine_candidates(groups, start, reach=pixel / 2)
     # A fit may have taken a residual for a companion while its wavefront was still wrong.
-    while len(candidates) and _weakest(candidates)[1] < threshold:
-        candidates = _without_weakest(groups, candidates, pixel)
+    unscaled = ErrorFactor.constant(1.0)
+    while len(candidates) and _snr(candidates, unscaled).min() < threshold:
+        candidates = _without_weakest(groups, candidates, unscaled, pixel)
     # A peak that is no candidate once its position is fitted would be the highest one for ever.
     dismissed = torch.zeros(0, 2, dtype=torch.float64)
     while True:
         snr = maps.snr(maps.without(candidates))
         if scatter is not None:
-            factor = scatter
+            factor = ErrorFactor.constant(scatter)
         else:
-            scattered = snr_scatter(snr, grid, candidates.offsets, inner)
-            factor = scattered
-            if explained:
-                factor = error_inflation(fits, groups, candidates.offsets)
-                # Errors that neighbouring pixels share do not show in chi-squared per pixel.
-                if is_nircam and scattered > _CORRELATED * factor:
-                    factor = scattered
+            factor = _error_factor(snr, maps, fits, candidates.offsets, inner)
         allowed = np.where(far_from(grid, dismissed, 2 * pixel), snr, 0.0)
         peak = strongest_peak(
-            allowed / factor,
+            allowed / factor.at(separation_of(grid)),
             grid,
             candidates.offsets,
             threshold=threshold,
@@ -329,11 +327,11 @@ def _search(
         )
         if peak is None or max(len(candidates), len(dismissed)) >= _MAX_CANDIDATES:
             # The factor may have grown since a candidate was accepted.
-            if not len(candidates) or _weakest(candidates)[1] >= threshold * factor:
+            if not len(candidates) or _snr(candidates, factor).min() >= threshold:
                 return candidates, factor
-            weakest = _weakest(candidates)[0]
+            weakest = int(_snr(candidates, factor).argmin())
             dismissed = torch.cat([dismissed, candidates.offsets[weakest, None]])
-            candidates = _without_weakest(groups, candidates, pixel)
+            candidates = _without_weakest(groups, candidates, factor, pixel)
             continue
         contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
         candidates = candidates.with_one_more(grid[peak], contrast)
@@ -341,15 +339,30 @@ def _search(
         _log.info("candidates at %s arcsec", candidates.offsets.tolist())
 
 
-def _weakest(candidates: Candidates) -> tuple[int, float]:
-    """Which candidate has the smallest S/N, before errors are scaled, and that S/N."""
-    snrs = candidates.contrasts / candidates.errors[:, 0]
-    return int(snrs.argmin()), float(snrs.min())
+def _error_factor(
+    snr: Image, maps: Maps, fits: Sequence[Refinement], offsets: torch.Tensor, inner: float
+) -> ErrorFactor:
+    """The default factor, from chi-squared and from the S/N with the sources removed."""
+    explained = all(fit.status.calibrated for fit in fits)
+    least = error_inflation(fits, maps.groups, offsets)
+    if explained and not fits[0].frames[0].observation.is_nircam:
+        return ErrorFactor.constant(least)
+    measured = scatter_profile(snr, maps.grid, offsets, inner, _resolution(fits[0]))
+    return measured.at_least(least)
 
 
-def _without_weakest(groups: Sequence[Group], candidates: Candidates, pixel: float) -> Candidates:
+def _snr(candidates: Candidates, factor: ErrorFactor) -> Image:
+    """S/N of the candidates."""
+    errors = candidates.errors[:, 0].numpy() * factor.of(candidates.offsets)
+    return np.asarray(candidates.contrasts.numpy() / errors)
+
+
+def _without_weakest(
+    groups: Sequence[Group], candidates: Candidates, factor: ErrorFactor, pixel: float
+) -> Candidates:
     """The other candidates, fitted again."""
-    return refine_candidates(groups, candidates.without(_weakest(candidates)[0]), reach=pixel / 2)
+    weakest = int(_snr(candidates, factor).argmin())
+    return refine_candidates(groups, candidates.without(weakest), reach=pixel / 2)
 
 
 def _resolution(fit: Refinement) -> float:

@@ -58,7 +58,7 @@ def hdus_of(detection: Any) -> fits.HDUList:
     unit = detection.observation.unit.to_string("fits")
     about, data = observation_hdus(detection.observation, 0)
     facts = {
-        "scatter": detection.scatter,
+        "error_factor": vars(detection.error_factor),
         "threshold": detection.threshold,
         "candidates": vars(detection.candidates),
         "calibration_errors": detection._calibration_errors,

@@ -10,6 +10,7 @@ from astropy import units as u
 from astropy.table import QTable
 
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.sky import Positions, Sky, deviations_and_correlation
 
@@ -24,14 +25,16 @@ _AB_ZERO = float(u.AB.to(u.Jy))
 """Flux density of AB magnitude 0, Jy."""
 
 
-def candidate_table(candidates: Candidates, scatter: float, calibration: Image, sky: Sky) -> QTable:
+def candidate_table(
+    candidates: Candidates, factor: ErrorFactor, calibration: Image, sky: Sky
+) -> QTable:
     """Make the table of candidates, highest S/N first; see `Detection.table`.
 
     Parameters
     ----------
     candidates : Candidates
-    scatter : float
-        Factor by which their errors are multiplied.
+    factor : ErrorFactor
+        By which their errors are multiplied.
     calibration : ndarray, (2, k)
         Relative calibration errors of their contrasts and of their fluxes; see
         `calibration.calibration_errors`.
@@ -39,11 +42,12 @@ def candidate_table(candidates: Candidates, scatter: float, calibration: Image, 
     """
     count = len(candidates)
     contrast = candidates.contrasts.numpy()
-    error = scatter * candidates.errors.numpy()[:, 0]
+    factors = factor.of(candidates.offsets)
+    error = factors * candidates.errors.numpy()[:, 0]
     covariance = candidates.covariance.numpy().reshape(3, count, 3, count)
     positions = Positions(
         candidates.offsets.numpy(),
-        scatter**2 * np.einsum("akbk->kab", covariance)[:, 1:, 1:],
+        factors[:, None, None] ** 2 * np.einsum("akbk->kab", covariance)[:, 1:, 1:],
         sky.north or 0.0,
     )
     separation_error, angle_error, polar = deviations_and_correlation(positions.polar_covariance)

@@ -158,7 +158,7 @@ def plot_detection(detection: Detection, ax: Any = None) -> NDArray[Any]:
         label="range of angles",
     )  # fmt: skip
     right.semilogy(separation, curve["contrast"], color=ACCENT, label="median")
-    if detection.scatter > 1:
+    if detection.error_factor.is_needed:
         right.semilogy(
             separation, curve["small_sample"], ":", color=ACCENT, label="median, few samples"
         )

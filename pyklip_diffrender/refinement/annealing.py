@@ -173,7 +173,8 @@ class Annealing:
         }
         self.history.append(record)
         _log.debug(
-            "step %d: chi2 %.4g per pixel, model error %.2g %% of the star, gain %.2g, damping %.2g",
+            "step %d: chi2 %.4g per pixel, model error %.2g %% of the star, gain %.2g"
+            ", damping %.2g",
             record["iteration"], chi2, 100 * error, gain, self.solver.damping,
         )  # fmt: skip
 

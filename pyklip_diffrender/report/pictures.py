@@ -46,13 +46,19 @@ def search_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Pi
     )
     circles = "Circles mark the candidates. " if count else ""
     compass = "N and E point to north and east. " if summary["oriented"] else ""
-    scaled = f"Errors were multiplied by {detection.scatter:.2f}, " + (
-        "the square root of the reduced chi-squared without the candidates."
-        if summary["status"]["calibrated"]
-        else "so that S/N away from candidates has a standard deviation of 1."
-    )
-    if detection.scatter == 1:
+    factors = detection.error_factor.factors
+    if not detection.error_factor.is_needed:
         scaled = "Errors are those of the fit, not scaled."
+    elif len(factors) == 1:
+        scaled = (
+            f"Errors were multiplied by {factors[0]:.2f}, the square root of the reduced "
+            "chi-squared without the candidates."
+        )
+    else:
+        scaled = (
+            f"Errors were multiplied by {factors.min():.2f} to {factors.max():.2f}, depending on "
+            "the separation, so that the S/N away from candidates has a standard deviation of 1."
+        )
     limits = "; ".join(
         f"{row['contrast']:.1e} at {row['separation_arcsec']:.3g} arcsec"
         for row in summary["limits"]
@@ -60,7 +66,7 @@ def search_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Pi
     sigmas = summary["contrast_curve"]["sigmas"]
     small_sample = (
         " Dotted: the median, corrected for the small number of resolution elements near the star."
-        if detection.scatter > 1
+        if detection.error_factor.is_needed
         else ""
     )
     return _pictures(
