@@ -70,7 +70,9 @@ def candidates(offsets: list[list[float]], contrasts: list[float]) -> Candidates
 
 def table(sky: Sky = SKY) -> QTable:
     known = candidates([[-0.3, 0.5], [0.2, -0.8]], [1e-4, 2e-4])
-    return candidate_table(known, 1.0, np.array([[0.1, 0.1], [0.02, 0.02]]), sky)
+    return candidate_table(
+        known, ErrorFactor.constant(1.0), np.array([[0.1, 0.1], [0.02, 0.02]]), sky
+    )
 
 
 # -- orientation -------------------------------------------------------------------------------
@@ -115,7 +117,10 @@ def test_a_planet_in_an_image_is_on_the_side_of_the_sky_where_the_wcs_has_it() -
     wcs.wcs.cd = np.array([[-cosine, sine], [sine, cosine]]) * model.detector.pixelscale[0] / 3600
     star, place = wcs.pixel_to_world(16, 16), wcs.pixel_to_world(column, row)
     known = candidate_table(
-        candidates([list(planet.offset)], [1.0]), 1.0, np.zeros((2, 1)), Sky(north=50.0)
+        candidates([list(planet.offset)], [1.0]),
+        ErrorFactor.constant(1.0),
+        np.zeros((2, 1)),
+        Sky(north=50.0),
     )
     assert known["position_angle"][0].to_value("deg") == pytest.approx(85.0)
     assert known["frame_angle"][0].to_value("deg") == pytest.approx(35.0)

@@ -1,0 +1,84 @@
+"""The factor by which errors of a search are multiplied, against simulated maps of S/N."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from pyklip_diffrender.detection.error_factor import ErrorFactor, scatter_profile
+
+PIXEL = 0.06
+RESOLUTION = 0.15
+Image = NDArray[np.float64]
+
+
+def field(size: int = 80) -> Image:
+    """x, y of the pixels from the star, arcsec."""
+    axis = PIXEL * (np.arange(size) - (size - 1) / 2)
+    return np.stack(np.meshgrid(axis, axis), axis=-1)
+
+
+def snr_map(seed: int, scale: Image) -> Image:
+    """Gaussian noise, smooth over a resolution element, with a standard deviation of `scale`."""
+    white = np.random.default_rng(seed).normal(size=scale.shape)
+    smooth = gaussian_filter(white, RESOLUTION / PIXEL / 2.355)
+    return np.asarray(scale * smooth / smooth.std())
+
+
+def test_errors_follow_the_scatter_of_the_snr_at_their_separation() -> None:
+    grid = field()
+    distance = np.hypot(grid[..., 0], grid[..., 1])
+    scale = 1 + 1.5 * np.exp(-((distance / 0.8) ** 2))
+    ratios = []
+    for seed in range(20):
+        snr = snr_map(seed, scale)
+        factor = scatter_profile(snr, grid, torch.zeros(0, 2), 0.2, RESOLUTION)
+        ratios.append([factor.at(s) / (1 + 1.5 * np.exp(-((s / 0.8) ** 2))) for s in (0.6, 1.2, 2)])
+    # Rings are a little broad, and pulled towards the whole field.
+    np.testing.assert_allclose(np.mean(ratios, axis=0), 1, atol=0.12)
+    assert np.std(ratios, axis=0).max() < 0.12
+    # One factor for the whole map would be wrong by 60 % near the star.
+    assert snr_map(0, scale).std() < 0.75 * scale[distance < 0.6].mean()
+
+
+def test_where_the_errors_are_right_the_factor_is_nearly_one() -> None:
+    grid = field()
+    factors = [
+        scatter_profile(snr_map(seed, np.ones((80, 80))), grid, torch.zeros(0, 2), 0.2, RESOLUTION)
+        .at_least(1.0)
+        .at([0.4, 1.0, 2.0])
+        for seed in range(20)
+    ]
+    assert np.mean(factors) < 1.06
+    assert np.max(factors) < 1.25
+
+
+def test_sources_do_not_raise_their_own_threshold() -> None:
+    grid, ones = field(), np.ones((80, 80))
+    source = np.hypot(grid[..., 0] - 1.0, grid[..., 1]) < 0.12
+    snr = snr_map(3, ones)
+    known = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
+    alone = scatter_profile(snr, grid, known, 0.2, RESOLUTION)
+    masked = scatter_profile(np.where(source, 300.0, snr), grid, known, 0.2, RESOLUTION)
+    np.testing.assert_allclose(masked.factors, alone.factors)
+    unmasked = scatter_profile(np.where(source, 300.0, snr), grid, known[:0], 0.2, RESOLUTION)
+    assert float(unmasked.at(1.0)) == pytest.approx(float(alone.at(1.0)), abs=0.35)
+
+
+def test_factors_are_interpolated_and_never_below_their_floor() -> None:
+    factor = ErrorFactor(np.array([0.5, 1.0]), np.array([2.0, 0.8]))
+    np.testing.assert_allclose(factor.at([0.1, 0.75, 3.0]), [2.0, 1.4, 0.8])
+    offsets = torch.tensor([[0.3, 0.4], [0.0, -1.0]], dtype=torch.float64)
+    np.testing.assert_allclose(factor.of(offsets), [2.0, 0.8])
+    np.testing.assert_allclose(factor.at_least(1.0).factors, [2.0, 1.0])
+    assert factor.typical == pytest.approx(1.4)
+    assert factor.is_needed
+    assert not ErrorFactor.constant(1.0).is_needed
+
+
+def test_a_map_without_valid_pixels_needs_no_factor() -> None:
+    factor = scatter_profile(np.full((80, 80), np.nan), field(), torch.zeros(0, 2), 0.2, RESOLUTION)
+    assert not factor.is_needed
