@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -14,9 +15,10 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.linear.forward_mode import jacfwd
 from pyklip_diffrender.optics.fast.point_sources import PointSources
+from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
-__all__ = ["Templates"]
+__all__ = ["Templates", "pixel_grid"]
 
 _FINE = 3
 """Positions of sources per pixel, along x and y, in frames where they are not at pixel centres. A
@@ -63,17 +65,7 @@ class Templates:
             k: frame.observation.roll_from(origin.observation) for k, frame in self.frames.items()
         }
         self._sources: dict[tuple[int, int, int], PointSources] = {}
-        ny, nx = origin.model.detector.shape
-        rows, columns = np.divmod(np.arange(ny * nx), nx)
-        detector = origin.model.detector
-        x, y = (
-            (axis.reshape(-1, detector.oversample).mean(dim=1) / ARCSEC).cpu().numpy()
-            for axis in detector.axes(origin.optical_values)
-        )
-        star = self._star(origin).numpy()
-        self.grid = np.stack(
-            [x[columns] - star[0], y[rows] + detector.shear * x[columns] - star[1]], axis=-1
-        ).reshape(ny, nx, 2)
+        self.grid = pixel_grid(origin.model, origin.optical_values)
         """x, y of all the first frame's pixels from the star, (ny, nx, 2), arcsec."""
 
     @staticmethod
@@ -202,6 +194,18 @@ class Templates:
         values = {**frame.optical_values, "star_offset": star}
         opd = _as_tensor(frame.opd)
         return frame.model(opd if change is None else opd + change, **values).double()
+
+
+def pixel_grid(model: OpticalSystem, values: Mapping[str, Tensor]) -> NDArray[np.float64]:
+    """x, y of all pixels from the star, (ny, nx, 2), arcsec."""
+    detector = model.detector
+    x, y = (
+        (axis.reshape(-1, detector.oversample).mean(dim=1) / ARCSEC).cpu().numpy()
+        for axis in detector.axes(values)
+    )
+    star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu().numpy()
+    across, up = np.meshgrid(x, y)
+    return np.stack([across - star[0], up + detector.shear * across - star[1]], axis=-1)
 
 
 def _as_tensor(opd: NDArray[np.float64]) -> Tensor:

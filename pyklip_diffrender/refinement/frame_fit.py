@@ -109,6 +109,18 @@ class FrameFit:
         ndarray, (ny, nx)
             In the unit of the observation, without the pattern of the model's error.
         """
+        model, values = self.on_pixels(fov_pixels, center)
+        with torch.no_grad():
+            image = model(torch.from_numpy(self.opd), **values).double().cpu().numpy()
+        level = float(self.values["background"][0]) if background else 0.0
+        return np.asarray(self.flux * image + level)
+
+    def on_pixels(
+        self,
+        fov_pixels: int | tuple[int, int] | None = None,
+        center: tuple[float, float] | None = None,
+    ) -> tuple[OpticalSystem, dict[str, Tensor]]:
+        """Return the model on another array of pixels, and its parameters; see `render`."""
         model = self.model
         if fov_pixels is not None and fov_pixels != self.model.detector.shape:
             model = model.with_fidelity(fov_pixels=fov_pixels, fov_arcsec=None)
@@ -119,10 +131,7 @@ class FrameFit:
             moved = np.array(center) - (np.array([nx, ny]) - 1) / 2 - old
             shift = torch.from_numpy(moved * np.array(model.detector.pixelscale))
             values["detector_shift"] = shift + values.get("detector_shift", torch.zeros(2))
-        with torch.no_grad():
-            image = model(torch.from_numpy(self.opd), **values).double().cpu().numpy()
-        level = float(self.values["background"][0]) if background else 0.0
-        return np.asarray(self.flux * image + level)
+        return model, values
 
     def to_hdus(self, k: int) -> tuple[dict[str, Any], list[Any]]:
         """Return metadata and FITS extensions of the frame, with EXTVER k + 1."""
