@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pyklip_diffrender.archive import fetch_calints, list_calints
     from pyklip_diffrender.bridges import from_poppy, from_webbpsf
     from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
@@ -69,11 +70,13 @@ __all__ = [
     "contrast_curve",
     "detect",
     "drift",
+    "fetch_calints",
     "from_poppy",
     "from_webbpsf",
     "known_systematics",
     "learn_prior",
     "learn_systematics",
+    "list_calints",
     "measure",
     "model_for",
     "nircam_coronagraph",
@@ -90,6 +93,7 @@ __all__ = [
 ]
 
 _NAMES = {
+    "archive": "fetch_calints list_calints",
     "bridges": "from_poppy from_webbpsf",
     "detection": "Detection contrast_curve detect measure",
     "instrument.nircam": "nircam_coronagraph",

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 __all__ = [
+    "ArchiveError",
     "CorruptFileError",
     "DiffrenderError",
     "DiffrenderWarning",
@@ -53,6 +54,10 @@ class MissingOPDError(DiffrenderError, ValueError):
 
 class CorruptFileError(DiffrenderError, OSError):
     """A file is missing, truncated, or not of the expected type."""
+
+
+class ArchiveError(DiffrenderError, OSError):
+    """The archive cannot be reached, or does not give what it was asked for."""
 
 
 class RefinementError(DiffrenderError, RuntimeError):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.detection import Detection, detect
+from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.io.units import require_bound
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Systematics, refine
@@ -55,6 +56,19 @@ class Reduction:
             f"{self.sequence!r}\n{self.fit.status.message}\n"
             f"pattern of the model's error: {known}\n{self.detection}"
         )
+
+    def _repr_html_(self) -> str:
+        facts = {
+            "Status": self.fit.status.message,
+            "Frames": f"{len(self.sequence.science)} of the target, "
+            f"{len(self.sequence.references)} of reference stars",
+            "Filter": self.sequence.filter,
+            "Pattern of the model's error": (
+                "none" if self.systematics is None else self.systematics.name
+            ),
+        }
+        head = html_summary(f"Reduction of {self.sequence.target}", facts)
+        return f"{head}\n{self.detection._repr_html_()}"
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write maps, tables, the fit, the systematics and a report; returns the paths."""

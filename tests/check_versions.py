@@ -5,8 +5,8 @@
     python tests/check_versions.py -- tests/test_optics.py -x
 
 Each end gets a fresh virtual environment with this interpreter and is removed afterwards. The
-oldest end pins every lower bound of ``pyproject.toml`` (the dependencies and the extra
-``webbpsf``); the newest takes what pip prefers. What follows ``--`` goes to pytest.
+oldest end pins every lower bound of ``pyproject.toml`` (the dependencies and the extras that users
+have); the newest takes what pip prefers. What follows ``--`` goes to pytest.
 
 At the oldest end, deprecation warnings are not errors: old releases get them from newer libraries
 underneath, and only their authors could act on them.
@@ -26,6 +26,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 ENDS = ("oldest", "newest")
+EXTRAS = ("archive", "survey", "webbpsf")
 LENIENT = (
     "-Wdefault::DeprecationWarning",
     "-Wdefault::PendingDeprecationWarning",
@@ -44,8 +45,10 @@ def lower_bounds(pyproject: Path = ROOT / "pyproject.toml") -> dict[str, str]:
     """
     project = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]
     bounds = {}
-    for requirement in [*project["dependencies"], *project["optional-dependencies"]["webbpsf"]]:
-        found = re.match(r"([\w.-]+)\s*>=\s*([\w.]+)", requirement)
+    extras = project["optional-dependencies"]
+    optional = [each for name in EXTRAS for each in extras.get(name, ())]
+    for requirement in [*project["dependencies"], *optional]:
+        found = re.match(r"([\w.-]+)(?:\[\w+\])?\s*>=\s*([\w.]+)", requirement)
         if not found:
             raise ValueError(f"{pyproject}: {requirement!r} has no lower bound (>=)")
         bounds[found[1]] = found[2]

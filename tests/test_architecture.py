@@ -20,6 +20,7 @@ PACKAGES = (
     "errors",
     "parameters",
     "io",
+    "archive",
     "optics",
     "instrument",
     "bridges",
@@ -48,6 +49,7 @@ LATE = ("plotting", "report")
 """What a method may import when it is called."""
 
 OWNERS = {
+    "astroquery": "archive",
     "dask": "surveys",
     "distributed": "surveys",
     "matplotlib": "plotting",

@@ -11,15 +11,18 @@ from functools import cache
 from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from astropy import units as u
 from astropy.io import fits
+from astropy.table import QTable
 from astropy.time import Time
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.planning.choice import ModelError
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.report import summarise, write_report
 from pyklip_diffrender.report.words import (
@@ -192,6 +195,9 @@ def test_the_summary_has_the_numbers_of_the_result(folder: Path) -> None:
     assert entry["separation_arcsec"] == row["separation"].to_value(u.arcsec)
     assert entry["position_angle_deg"] == row["position_angle"].to_value(u.deg)
     assert entry["delta_mag"] == row["delta_mag"].value
+    assert entry["delta_ra_arcsec"] == row["delta_ra"].value
+    assert entry["epoch"] == "2022-10-03T00:00:00"
+    assert summary["star"] is None  # Photons of a simulation.
     assert summary["target"] == "HD 1"
     assert summary["status"]["name"] == result.fit.status.name
     assert summary["fit"]["reduced_chi2"] == result.fit.reduced_chi2
@@ -205,6 +211,11 @@ def test_the_summary_has_the_numbers_of_the_result(folder: Path) -> None:
     assert summary["versions"]["pyklip_diffrender"] == dr.__version__
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert summary["sentence"] in page.replace("\u00a0", " ")
+    words = Tags(page).words
+    at = words.index("Astrometry and photometry")
+    offset = plus_minus(entry["delta_ra_arcsec"], entry["delta_ra_error_arcsec"])
+    assert offset in words[at:]
+    assert "Flux density (Jy)" not in words
 
 
 def test_every_picture_has_words_and_nothing_is_loaded(folder: Path) -> None:
@@ -256,6 +267,75 @@ def test_a_report_that_fails_leaves_the_old_one(
         write_report(reduction(), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "old"
+
+
+# -- in a notebook ---------------------------------------------------------------------------------
+
+
+def plan() -> dr.Plan:
+    error = ModelError(0.05, 0.2)
+    table = QTable({"what": ["pupil grid"], "why": [HOSTILE], "error": [0.05]})
+    return dr.Plan(
+        cast("Any", None), cast("Any", None), cast("Any", None), {}, table, 0.1, error, error, 2.0,
+        8.0, 0,
+    )  # fmt: skip
+
+
+def shown() -> dict[str, Any]:
+    """Everything with a summary in HTML, of frames with a hostile header and name."""
+    whole = reduction()
+    header = fits.Header({"TARGPROP": HOSTILE})
+    evil = replace(whole.sequence.science[0], header=header, name=HOSTILE, filter=HOSTILE)
+    sequence = dr.Sequence(HOSTILE, (evil,), (), ((HOSTILE, HOSTILE),))
+    fit = replace(
+        whole.fit,
+        frames=(replace(whole.fit.frames[0], observation=evil),),
+        initial=replace(whole.fit.initial, name=HOSTILE),
+    )
+    flat = np.zeros((4, 4))
+    known = dr.Systematics(
+        flat, flat, (1.0, 1.0), 0.02, name=HOSTILE, filter=HOSTILE, provenance={"stars": [HOSTILE]}
+    )
+    detection = replace(whole.detection, fits=(fit,))
+    again = replace(whole, sequence=sequence, fit=fit, detection=detection, systematics=known)
+    values = (evil, sequence, fit, detection, again, whole.fit.model, plan(), known)
+    return {type(value).__name__: value for value in values}
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["Observation", "Sequence", "Refinement", "Detection", "Reduction", "OpticalSystem", "Plan",
+     "Systematics"],
+)  # fmt: skip
+def test_a_notebook_shows_a_small_escaped_summary(name: str) -> None:
+    value = shown()[name]
+    text = value._repr_html_()
+    assert len(text) < 4000
+    page = Tags(text)
+    assert not {tag for tag, _ in page.tags} - {"div", "strong", "table", "tr", "th", "td"}
+    assert all(set(attributes) <= {"style"} for _, attributes in page.tags)
+    said = " ".join(page.words)
+    assert name in said
+    assert (HOSTILE in said) == (name != "OpticalSystem")
+    assert len(repr(value)) < 400
+    assert "array(" not in repr(value)
+
+
+def test_a_notebook_shows_the_numbers_of_a_candidate() -> None:
+    detection = reduction().detection
+    (row,) = detection.table
+    said = Tags(detection._repr_html_()).words
+    assert f"{row['contrast']:.3e}" in said
+    assert f"{row['position_angle'].value:.2f}" in said
+    assert "separation (arcsec)" in said
+    assert "2022-10-03T00:00:00" in said
+
+
+def test_a_long_table_is_cut() -> None:
+    text = html_summary("Many", {"left out": None}, QTable({"n": np.arange(30)}), ["n", "absent"])
+    assert text.count("<td>") == 20
+    assert "and 10 more" in text
+    assert "left out" not in text
 
 
 # -- in a browser ----------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from packaging.version import Version
 def test_what_is_installed_is_no_older_than_the_metadata_allow() -> None:
     bounds = lower_bounds()
     assert {"torch", "numpy", "scipy", "astropy", "photutils", "poppy", "pyklip"} <= set(bounds)
+    assert {"dask", "pyarrow", "astroquery"} <= set(bounds)
     for name, bound in bounds.items():
         assert Version(version(name)) >= Version(bound), name
 

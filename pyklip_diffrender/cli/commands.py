@@ -108,28 +108,61 @@ def demo(
 Examples:
   pyklip-diffrender reduce frames --opd-folder maps -o products
   pyklip-diffrender reduce frames --target G-7-34 --filter F444W --opd map.fits -o products
-  pyklip-diffrender reduce frames --opd-folder maps -o products --dry-run""",
+  pyklip-diffrender reduce frames --opd-folder maps -o products --dry-run
+  pyklip-diffrender reduce --program 1184 --target G-7-34 --filter F444W --opd map.fits -o out""",
 )
-@click.argument("frames", type=file_type(), nargs=-1, required=True)
+@click.argument("frames", type=file_type(), nargs=-1)
 @option("--target", metavar="STAR", section="Frames",
         help="Name of the target; the other stars are references.")  # fmt: skip
 @option("--filter", metavar="NAME", section="Frames", help="Which filter, if there are several.")
+@option(
+    "--program",
+    type=int,
+    metavar="NUMBER",
+    section="Frames",
+    help="Fetch the frames of this JWST programme from MAST, in place of FRAMES.",
+)
+@option(
+    "--cache",
+    type=file_type(),
+    metavar="FOLDER",
+    section="Frames",
+    help="Folder for fetched frames; default: in the user's cache.",
+)
 @wavefront
 @search
 @outputs()
 @click.pass_obj
 def reduce_frames(
-    run: Run, /, frames: tuple[Path, ...], target: str | None, filter: str | None, **options: Any
+    run: Run,
+    /,
+    frames: tuple[Path, ...],
+    target: str | None,
+    filter: str | None,
+    program: int | None,
+    cache: Path | None,
+    **options: Any,
 ) -> None:
     """Search all rolls of a target, with what its reference stars teach.
 
-    FRAMES are calints files, or one folder of them.
+    FRAMES are calints files, or one folder of them. With --program they come from MAST.
     """
+    if not frames and program is None:
+        raise click.UsageError("Missing argument 'FRAMES...', or the option --program.")
+    if frames and program is not None:
+        raise click.UsageError("Give either FRAMES or --program.")
+    if program is not None and options["dry_run"] and _is_to_fetch(program, target, filter, cache):
+        return
 
     def read() -> Sequence:
+        from pyklip_diffrender.archive import fetch_calints
         from pyklip_diffrender.scene.sequence import Sequence
 
-        files = frames[0] if len(frames) == 1 else frames
+        files: Any = frames[0] if len(frames) == 1 else frames
+        if program is not None:
+            files = fetch_calints(
+                program, target, filter=filter, folder=cache, progress=run.progress
+            )
         return Sequence.from_files(files, target=target, filter=filter)
 
     _reduction(run, read, **options)
@@ -306,6 +339,19 @@ def _reduction(
     if json:
         summary = loads((output / "summary.json").read_text(encoding="utf-8"))
         click.echo(dumps(summary, indent=2))
+
+
+def _is_to_fetch(program: int, target: str | None, filter: str | None, cache: Path | None) -> bool:
+    """List the files of a programme; whether some of them would have to be fetched."""
+    from pyklip_diffrender.archive import list_calints
+
+    listing = list_calints(program, target, filter=filter, folder=cache)
+    names = ["file", "filter", "size", "access", "complete"]
+    click.echo("\n".join(listing[names].pformat(max_lines=-1, max_width=-1)))
+    missing = listing[~listing["complete"]]
+    size = missing["size"].to_value("Mbyte").sum()
+    click.echo(f"to fetch: {len(missing)} of {len(listing)} files, {size:.0f} MB")
+    return len(missing) > 0
 
 
 def _show(sequence: Sequence) -> None:

@@ -39,6 +39,7 @@ from pyklip_diffrender.detection.storage import (
 from pyklip_diffrender.detection.tables import candidate_table, measured_table
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.files import replacing, write_fits
+from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.storage import (
     image,
@@ -104,7 +105,7 @@ class Detection:
 
     def __repr__(self) -> str:
         return (
-            f"<Detection: {len(self.candidates)} candidates above {self.threshold:g} sigma, "
+            f"<Detection: {self._count} above {self.threshold:g} sigma, "
             f"errors scaled by {self.scatter:.3g}>"
         )
 
@@ -119,6 +120,26 @@ class Detection:
         title = "    separation             position angle     contrast               S/N"
         no_candidates = [f"no candidate above S/N {self.threshold:g}"]
         return "\n".join([title, *lines] if lines else no_candidates)
+
+    @property
+    def _count(self) -> str:
+        count = len(self.candidates)
+        return f"{count} candidate{'' if count == 1 else 's'}"
+
+    def _repr_html_(self) -> str:
+        star = self.sky.star_jansky
+        return html_summary(
+            f"Detection: {self._count} above {self.threshold:g} sigma",
+            {
+                "Star": self.observation.target,
+                "Epoch (UTC)": self.sky.date,
+                "Flux density of the star": None if star is None else f"{star:.3g} Jy",
+                "Errors multiplied by": f"{self.scatter:.3g}",
+            },
+            self.table,
+            ("separation", "separation_error", "position_angle", "position_angle_error",
+             "contrast", "contrast_error", "delta_mag", "snr"),
+        )  # fmt: skip
 
     @cached_property
     def observation(self) -> Observation:

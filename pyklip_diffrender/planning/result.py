@@ -9,6 +9,7 @@ from typing import Any
 from astropy import units as u
 from astropy.table import QTable
 
+from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning.choice import Choice, Economy, ModelError, Option
 from pyklip_diffrender.planning.trial import Trial
@@ -74,6 +75,18 @@ class Plan:
         return (
             f"<Plan: {self.verified_error.rms:.3g} sigma of {self.budget:g}, "
             f"{self.seconds_given / self.seconds:.2g} times cheaper>"
+        )
+
+    def _repr_html_(self) -> str:
+        return html_summary(
+            "Plan",
+            {
+                "Error": f"{self.verified_error.rms:.3g} sigma of {self.budget:g} allowed",
+                "Time of a refinement": f"about {self.seconds:.2g} s on one core, "
+                f"{self.seconds_given:.2g} s with the full model",
+            },
+            self.table,
+            self.table.colnames,
         )
 
     def __str__(self) -> str:

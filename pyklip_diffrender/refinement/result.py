@@ -19,6 +19,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import write_fits
+from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -126,6 +127,21 @@ class Refinement:
         return (
             f"<Refinement: {self.status.name}, {count} frame{'s' if count > 1 else ''}, "
             f"chi2/pixel {self.chi2_per_pixel:.3g}, {self.seconds:.1f} s>"
+        )
+
+    def _repr_html_(self) -> str:
+        return html_summary(
+            "Refinement",
+            {
+                "Status": self.status.message,
+                "Frames": ", ".join(frame.observation.name for frame in self.frames),
+                "Chi-squared per pixel": f"{self.chi2_per_pixel:.3g}",
+                "Model error": f"{100 * self.model_error:.2g} % of the star",
+                "Wavefront map": self.initial.name,
+                "Systematics": None if self.systematics is None else self.systematics.name,
+                "Companions in the fit": len(self.companions) or None,
+                "Time": f"{self.seconds:.1f} s",
+            },
         )
 
     @property

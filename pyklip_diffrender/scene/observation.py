@@ -18,6 +18,7 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
+from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import (
     native_float64,
     require_finite,
@@ -226,6 +227,30 @@ class Observation:
 
     def __len__(self) -> int:
         return len(self.data)
+
+    def __repr__(self) -> str:
+        ny, nx = self.shape
+        day = "no date" if self.date is None else self.date.isot[:10]
+        return (
+            f"<Observation {self.name!r}: {len(self)} frame{'s' if len(self) > 1 else ''} of "
+            f"{nx} x {ny} pixels, {self.filter or 'no filter'}, {self.unit}, {day}>"
+        )
+
+    def _repr_html_(self) -> str:
+        ny, nx = self.shape
+        return html_summary(
+            f"Observation {self.name}",
+            {
+                "Star": f"{self.target}{' (reference)' if self.reference else ''}",
+                "Filter": self.filter,
+                "Date (UTC)": None if self.date is None else self.date.isot[:19],
+                "Frames": f"{len(self)} of {nx} x {ny} pixels, {self.unit}",
+                "Pixels used": f"{100 * self.valid.mean():.1f} %",
+                "Position angle of +y": (
+                    None if self.position_angles is None else f"{self.position_angle:.2f} deg"
+                ),
+            },
+        )
 
     @property
     def shape(self) -> tuple[int, int]:

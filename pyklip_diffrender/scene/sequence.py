@@ -14,6 +14,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["Sequence"]
@@ -54,6 +55,11 @@ class Sequence:
             f"<Sequence: {self.target} in {self.filter}, {len(self.science)} of the "
             f"target, {len(self.references)} of reference stars>"
         )
+
+    def _repr_html_(self) -> str:
+        facts = {"Filter": self.filter, "Left out": len(self.excluded) or None}
+        table = self.table
+        return html_summary(f"Sequence of {self.target}", facts, table, table.colnames)
 
     @property
     def filter(self) -> str | None:

@@ -1,0 +1,275 @@
+"""Files from MAST, by a stub of astroquery that answers and fails as the real one does."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.table import MaskedColumn, Table
+from requests import ConnectionError as NoConnection
+
+from pyklip_diffrender import archive
+from pyklip_diffrender.cli import main
+from pyklip_diffrender.errors import ArchiveError, DiffrenderWarning, IncompatibleSetupError
+
+SIZE = 2880
+NAMES = ("jw01184005001_03106_00001_nrcalong", "jw01184006001_03106_00001_nrcalong")
+
+
+class NoResults(UserWarning):
+    pass
+
+
+class Observations:
+    """The part of astroquery's `Observations` that is used, with its way of failing."""
+
+    def __init__(self) -> None:
+        self.rows = [("1", "G-7-34", "F444W;MASKRND"), ("2", "G-7-34", "F356W;MASKRND"),
+                     ("3", "AU-MIC", "F444W;MASKRND")]  # fmt: skip
+        self.rights = {name: "PUBLIC" for name in NAMES}
+        self.short: set[str] = set()
+        self.offline: Any = None
+        self.asked: dict[str, Any] = {}
+        self.fetched: list[str] = []
+        self.tokens: list[str] = []
+
+    def query_criteria(self, **criteria: Any) -> Table:
+        self._online("query")
+        self.asked = criteria
+        return Table(rows=self.rows, names=("obsid", "target_name", "filters"))
+
+    def get_unique_product_list(self, observations: Table) -> Table:
+        self.asked["obsid"] = list(observations["obsid"])
+        files = [f"{name}_{kind}.fits" for name in NAMES for kind in ("calints", "rateints")]
+        files += ["jw01184005001_03106_00001_nrcalong_calints.jpg", "jw01184_f356w_calints.fits"]
+        return Table(
+            {
+                "productFilename": MaskedColumn(files),
+                "dataURI": [f"mast:JWST/product/{each}" for each in files],
+                "size": MaskedColumn([SIZE] * len(files)),
+                "filters": ["F444W;MASKRND"] * (len(files) - 1) + ["F356W;MASKRND"],
+                "dataRights": [self.rights.get(each[:34], "PUBLIC") for each in files],
+            }
+        )
+
+    def login(self, token: str | None = None) -> None:
+        assert token, "astroquery would ask for it on the terminal"
+        self.tokens.append(token)
+
+    def download_file(
+        self, uri: str, *, local_path: str, cache: bool, verbose: bool
+    ) -> tuple[str, str | None, str | None]:
+        name = uri.rpartition("/")[2]
+        self.fetched.append(name)
+        path = Path(local_path)
+        # Astroquery takes a path without a suffix for a folder.
+        assert path.suffix
+        assert not cache
+        self._online(name)
+        if self.rights.get(name[:34]) != "PUBLIC" and not self.tokens:
+            return "ERROR", "HTTPError: 401 Client Error: Unauthorized", uri
+        path.write_bytes(b"S" * (SIZE // 2 if name[:34] in self.short else SIZE))
+        return "COMPLETE", None, None
+
+    def _online(self, what: str) -> None:
+        if self.offline == what:
+            raise NoConnection("Failed to resolve 'mast.stsci.edu'")
+        if self.offline == f"interrupted {what}":
+            raise KeyboardInterrupt
+
+
+@pytest.fixture
+def mast(monkeypatch: pytest.MonkeyPatch) -> Observations:
+    stub = Observations()
+    monkeypatch.setattr(archive, "_mast", lambda: archive._Mast(stub, (NoConnection,), NoResults))
+    monkeypatch.delenv("MAST_API_TOKEN", raising=False)
+    return stub
+
+
+def left(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+FILES = [f"{name}_calints.fits" for name in NAMES]
+
+
+@pytest.mark.slow
+def test_the_stub_has_the_interface_of_astroquery() -> None:
+    real = pytest.importorskip("astroquery.mast").Observations
+    for name in ("query_criteria", "get_unique_product_list", "download_file", "login"):
+        needed = inspect.signature(getattr(Observations, name)).parameters
+        had = inspect.signature(getattr(real, name)).parameters
+        kinds = {each.kind for each in had.values()}
+        keywords = set(needed) - {"self", "criteria"}
+        assert keywords <= set(had) or inspect.Parameter.VAR_KEYWORD in kinds, name
+    failures = archive._mast().failures
+    assert issubclass(NoConnection, failures)
+
+
+def test_a_target_is_fetched_once(mast: Observations, tmp_path: Path) -> None:
+    paths = archive.fetch_calints(1184, "G 7-34", filter="f444w", folder=tmp_path)
+    assert paths == [tmp_path / name for name in FILES]
+    assert left(tmp_path) == FILES
+    assert mast.asked["instrument_name"] == "NIRCAM/CORON"
+    assert mast.asked["proposal_id"] == ["1184", "01184"]
+    assert mast.asked["obsid"] == ["1"]
+    assert archive.fetch_calints("01184", "G 7-34", filter="F444W", folder=tmp_path) == paths
+    assert mast.fetched == FILES
+
+
+def test_a_listing_fetches_nothing(mast: Observations, tmp_path: Path) -> None:
+    (tmp_path / FILES[0]).write_bytes(b"S" * SIZE)
+    (tmp_path / FILES[1]).write_bytes(b"S" * (SIZE - 1))
+    listing = archive.list_calints(1184, "G-7-34", filter="F444W", folder=tmp_path)
+    assert list(listing["file"]) == FILES
+    assert list(listing["complete"]) == [True, False]
+    np.testing.assert_allclose(listing["size"].to_value("kbyte"), SIZE / 1e3)
+    assert mast.fetched == []
+
+
+def test_without_a_filter_all_files_of_the_star_are_listed(mast: Observations) -> None:
+    listing = archive.list_calints(1184, "G-7-34", folder="nowhere")
+    assert mast.asked["obsid"] == ["1", "2"]
+    assert list(listing["filter"]) == ["F444W;MASKRND"] * 2 + ["F356W;MASKRND"]
+
+
+@pytest.mark.parametrize("failure", ["short", "offline", "interrupted"])
+def test_a_part_of_a_file_is_not_taken_for_a_file(
+    mast: Observations, tmp_path: Path, failure: str
+) -> None:
+    if failure == "short":
+        mast.short = {NAMES[1]}
+    else:
+        mast.offline = FILES[1] if failure == "offline" else f"interrupted {FILES[1]}"
+    expected = KeyboardInterrupt if failure == "interrupted" else ArchiveError
+    with pytest.raises(expected) as raised:
+        archive.fetch_calints(1184, filter="F444W", folder=tmp_path)
+    assert left(tmp_path) == FILES[:1]
+    if failure != "interrupted":
+        assert "1 of 2 files are complete" in str(raised.value)
+    # The next call fetches only what is missing.
+    mast.short, mast.offline, mast.fetched = set(), None, []
+    archive.fetch_calints(1184, filter="F444W", folder=tmp_path)
+    assert mast.fetched == FILES[1:]
+    assert left(tmp_path) == FILES
+
+
+def test_a_file_that_has_changed_in_the_archive_is_fetched_again(
+    mast: Observations, tmp_path: Path
+) -> None:
+    (tmp_path / FILES[0]).write_bytes(b"old")
+    archive.fetch_calints(1184, filter="F444W", folder=tmp_path)
+    assert (tmp_path / FILES[0]).stat().st_size == SIZE
+
+
+def test_a_file_of_unknown_size_has_to_be_a_whole_one(mast: Observations, tmp_path: Path) -> None:
+    products = mast.get_unique_product_list(Table({"obsid": ["1"]}))
+    products["size"].mask = True
+    mast.get_unique_product_list = lambda _: products  # type: ignore[method-assign]
+    with pytest.raises(OSError, match="FITS"):
+        archive.fetch_calints(1184, filter="F444W", folder=tmp_path)
+    assert left(tmp_path) == []
+
+
+def test_proprietary_files_need_a_token(
+    mast: Observations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mast.rights[NAMES[1]] = "EXCLUSIVE_ACCESS"
+    with pytest.warns(DiffrenderWarning, match=rf"proprietary.*{FILES[1]}"):
+        paths = archive.fetch_calints(1184, filter="F444W", folder=tmp_path)
+    assert paths == [tmp_path / FILES[0]]
+    mast.rights = dict.fromkeys(NAMES, "EXCLUSIVE_ACCESS")
+    with pytest.raises(ArchiveError, match=r"all files are proprietary.*MAST_API_TOKEN"):
+        archive.fetch_calints(1184, filter="F444W", folder=tmp_path / "other")
+    monkeypatch.setenv("MAST_API_TOKEN", "secret")
+    assert len(archive.fetch_calints(1184, filter="F444W", folder=tmp_path)) == 2
+    assert mast.tokens == ["secret"]
+
+
+def test_a_refused_file_is_an_error_with_the_archives_words(
+    mast: Observations, tmp_path: Path
+) -> None:
+    """The archive's list may say public what its server does not give."""
+    products = mast.get_unique_product_list(Table({"obsid": ["1"]}))
+    mast.get_unique_product_list = lambda _: products  # type: ignore[method-assign]
+    mast.rights[NAMES[0]] = "EXCLUSIVE_ACCESS"
+    with pytest.raises(ArchiveError, match=r"401 Client Error.*0 of 2 files"):
+        archive.fetch_calints(1184, filter="F444W", folder=tmp_path)
+    assert left(tmp_path) == []
+
+
+def test_without_a_network_the_message_says_so(mast: Observations, tmp_path: Path) -> None:
+    mast.offline = "query"
+    with pytest.raises(ArchiveError, match=r"MAST cannot be reached .*download the files"):
+        archive.fetch_calints(1184, folder=tmp_path / "new")
+    assert left(tmp_path) == []
+
+
+def test_without_astroquery_the_message_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "astroquery", None)
+    with pytest.raises(ArchiveError, match=r"pyklip-diffrender\[archive\]"):
+        archive.fetch_calints(1184)
+
+
+@pytest.mark.parametrize(
+    ("program", "options", "message"),
+    [
+        ("GTO", {}, "expected the number of a JWST programme"),
+        (1184, {"target": "Vega"}, r"target: got 'Vega', the programme has \['AU-MIC', 'G-7-34'\]"),
+        (1184, {"filter": "F200W"}, "filter: got 'F200W'"),
+    ],
+)
+def test_what_the_programme_does_not_have(
+    mast: Observations, program: int, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(IncompatibleSetupError, match=message):
+        archive.fetch_calints(program, **options)
+
+
+def test_a_programme_without_coronagraphy_is_an_error(mast: Observations) -> None:
+    mast.rows = []
+    with pytest.raises(ArchiveError, match="no coronagraphic frames of NIRCam of programme 1"):
+        archive.list_calints(1)
+
+
+def test_the_cache_is_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert archive.cache_folder() == tmp_path / "pyklip_diffrender" / "mast"
+
+
+# -- command line ------------------------------------------------------------------------------
+
+REDUCE = ["reduce", "--program", "1184", "--filter", "F444W", "--opd", "opd.fits"]
+
+
+def test_a_dry_run_lists_what_would_be_fetched(
+    mast: Observations, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = ["--cache", str(tmp_path / "cache"), "-o", str(tmp_path / "out")]
+    assert main([*REDUCE, *folders, "--dry-run"]) == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in FILES)
+    assert "to fetch: 2 of 2 files, 0 MB" in shown
+    assert left(tmp_path) == []
+    assert mast.fetched == []
+
+
+def test_a_run_fetches_and_reads_the_files(
+    mast: Observations, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = ["--cache", str(tmp_path / "cache"), "-o", str(tmp_path / "out")]
+    assert main([*REDUCE, *folders]) == 1
+    assert left(tmp_path / "cache") == FILES
+    # The stub's files hold nothing.
+    assert "none of 2 files can be used" in capsys.readouterr().err
+
+
+def test_frames_or_a_programme_but_not_both(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*REDUCE, "frames", "-o", "out"]) == 2
+    assert "either FRAMES or --program" in capsys.readouterr().err
