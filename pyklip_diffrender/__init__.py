@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pyklip_diffrender.archive import fetch_calints, list_calints
     from pyklip_diffrender.bridges import from_poppy, from_webbpsf
-    from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
+    from pyklip_diffrender.detection import (
+        Detection,
+        WideField,
+        contrast_curve,
+        detect,
+        measure,
+        wide_field,
+    )
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
     from pyklip_diffrender.linear.model import LinearModel
     from pyklip_diffrender.optics.system import OpticalSystem
@@ -64,6 +71,7 @@ __all__ = [
     "Status",
     "Systematics",
     "WavefrontPrior",
+    "WideField",
     "__version__",
     "backend",
     "choose_map",
@@ -90,12 +98,13 @@ __all__ = [
     "simulate",
     "survey",
     "unregister",
+    "wide_field",
 ]
 
 _NAMES = {
     "archive": "fetch_calints list_calints",
     "bridges": "from_poppy from_webbpsf",
-    "detection": "Detection contrast_curve detect measure",
+    "detection": "Detection WideField contrast_curve detect measure wide_field",
     "instrument.nircam": "nircam_coronagraph",
     "linear.model": "LinearModel",
     "optics.system": "OpticalSystem",

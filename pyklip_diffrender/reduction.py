@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pyklip_diffrender.detection import Detection, detect
+from pyklip_diffrender.detection import Detection, WideField, detect, wide_field
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.io.units import require_bound
@@ -38,6 +38,8 @@ class Reduction:
         The pattern of the model's error that was used.
     failed : tuple of (str, str)
         Reference stars that could not be fitted, and why.
+    wide : WideField or None
+        The search of the whole frames, if it was asked for.
     """
 
     sequence: Sequence
@@ -46,15 +48,17 @@ class Reduction:
     references: tuple[Refinement, ...] = ()
     systematics: Systematics | None = None
     failed: tuple[tuple[str, str], ...] = ()
+    wide: WideField | None = None
 
     def __repr__(self) -> str:
         return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"
 
     def __str__(self) -> str:
         known = "none" if self.systematics is None else f"from {self.systematics.name}"
+        search = self.detection if self.wide is None else self.wide
         return (
             f"{self.sequence!r}\n{self.fit.status.message}\n"
-            f"pattern of the model's error: {known}\n{self.detection}"
+            f"pattern of the model's error: {known}\n{search}"
         )
 
     def _repr_html_(self) -> str:
@@ -79,6 +83,8 @@ class Reduction:
         # With the candidates in the model if the star was refined again, so that `Detection.read`
         # measures in the same linear model.
         written.append(self.detection.fits[0].write(folder / "fit.fits"))
+        if self.wide is not None:
+            written += self.wide.write(folder)
         if self.systematics is not None:
             written.append(self.systematics.write(folder / "systematics.fits"))
         return written + report.write_report(self, folder, written)
@@ -94,6 +100,7 @@ def reduce(
     systematics: PatternRequest = "auto",
     settings: GaussNewton | None = None,
     threshold: float = 5.0,
+    wide: bool = False,
     device: str = "cpu",
     progress: bool = False,
 ) -> Reduction:
@@ -122,6 +129,9 @@ def reduce(
         Of the fits; default those of `refine`.
     threshold : float
         S/N of a candidate.
+    wide : bool
+        Search the whole frames as well, see `wide_field`. If sources beyond the fitted pixels are
+        bright enough to be seen in these, the star is fitted once more without their light.
     device : str
         PyTorch device of the optical model.
     progress : bool
@@ -142,7 +152,7 @@ def reduce(
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
     wavefront = wavefront_for(opd, sequence.date)
     model = model_for(sequence.science[0], size, device=device)
-    sequence = sequence.cutout(size)
+    whole, sequence = sequence.science, sequence.cutout(size)
     choice = choose_systematics(
         sequence.science,
         sequence.references,
@@ -153,15 +163,28 @@ def reduce(
         progress=progress,
     )
     sequence = replace(sequence, science=choice.science)
+    options: dict[str, Any] = {
+        "systematics": choice.systematics,
+        "settings": choice.settings,
+        "progress": progress,
+    }
     with stage("2 of 4: wavefront"):
-        fit = refine(
-            model,
-            sequence.science,
-            wavefront,
-            systematics=choice.systematics,
-            settings=choice.settings,
-            progress=progress,
-        )
+        fit = refine(model, sequence.science, wavefront, **options)
     with stage("3 of 4: search"):
         detection = detect(fit, threshold=threshold, progress=progress)
-    return Reduction(sequence, fit, detection, choice.references, choice.systematics, choice.failed)
+        outside = wide_field(detection, whole) if wide else None
+    cleaned = None if outside is None else outside.subtracted(whole, sequence.science)
+    if cleaned is not None:
+        with stage("3 of 4: star and search without the light of sources beyond the fitted pixels"):
+            fit = refine(model, cleaned, wavefront, **options)
+            detection = detect(fit, threshold=threshold, progress=progress)
+            outside = wide_field(detection, whole)
+    return Reduction(
+        sequence,
+        fit,
+        detection,
+        choice.references,
+        choice.systematics,
+        choice.failed,
+        outside,
+    )

@@ -31,7 +31,8 @@ __all__ = ["demo", "detect_in_file", "psf", "reduce_frames", "survey"]
 _DEMO = ("demo.fits", "demo.ecsv", "candidates.ecsv", "demo.png")
 _REDUCTION = (
     "detection.fits", "candidates.ecsv", "contrast.ecsv", "fit.fits", "systematics.fits",
-    "astrometry.csv", "report.html", "summary.json", "detection.png",
+    "astrometry.csv", "wide_field.fits", "wide_field_candidates.ecsv", "wide_field_contrast.ecsv",
+    "report.html", "summary.json", "detection.png",
 )  # fmt: skip
 
 
@@ -290,6 +291,7 @@ def _reduction(
     dry_run: bool,
     size: int,
     threshold: float,
+    wide: bool,
     systematics: str,
     opd: Path | None,
     opd_folder: Path | None,
@@ -326,6 +328,7 @@ def _reduction(
             size=size,
             systematics=known,
             threshold=threshold,
+            wide=wide,
             device=run.device,
             progress=run.progress,
         )

@@ -222,6 +222,8 @@ search = _all(
            section="Fit and search", help="Side of the fitted square about the star, pixels."),
     option("--threshold", type=float, default=5.0, show_default=True, metavar="S/N",
            section="Fit and search", help="S/N of a candidate."),
+    option("--wide", is_flag=True, section="Fit and search",
+           help="Search the whole frames as well, to their edge."),
     option("--systematics", default="auto", show_default=True, metavar="CHOICE",
            section="Fit and search",
            help="Pattern of the model's error: auto (the package's library, else the reference "

@@ -60,6 +60,11 @@ class ErrorFactor:
         return self.at(separation_of(offsets.numpy().reshape(-1, 2)))
 
     @property
+    def is_measured(self) -> bool:
+        """Whether it follows the scatter of the S/N, and not chi-squared alone."""
+        return len(self.factors) > 1
+
+    @property
     def is_needed(self) -> bool:
         """Whether any errors are multiplied by more than 1."""
         return bool(self.factors.max() > 1)

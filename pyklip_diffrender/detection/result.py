@@ -36,7 +36,7 @@ from pyklip_diffrender.detection.storage import (
     maps_of,
     table_of,
 )
-from pyklip_diffrender.detection.tables import candidate_table, measured_table
+from pyklip_diffrender.detection.tables import candidate_table, in_words, measured_table
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.files import replacing, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
@@ -111,15 +111,7 @@ class Detection:
 
     def __str__(self) -> str:
         """The candidates in words, at most 80 columns wide."""
-        lines = [
-            f"{row['separation'].value:7.3f} +- {row['separation_error'].value:.3f} arcsec  "
-            f"{row['position_angle'].value:6.2f} +- {row['position_angle_error'].value:.2f} deg  "
-            f"{row['contrast']:.2e} +- {row['contrast_error']:.1e}  {row['snr']:5.1f}"
-            for row in self.table
-        ]
-        title = "    separation             position angle     contrast               S/N"
-        no_candidates = [f"no candidate above S/N {self.threshold:g}"]
-        return "\n".join([title, *lines] if lines else no_candidates)
+        return in_words(self.table, self.threshold)
 
     @property
     def _count(self) -> str:

@@ -14,7 +14,7 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.sky import Positions, Sky, deviations_and_correlation
 
-__all__ = ["candidate_table", "magnitudes", "measured_table"]
+__all__ = ["candidate_table", "in_words", "magnitudes", "measured_table"]
 
 Column = tuple[str, Any, Any, str, str]
 """Name, values, unit, format and description."""
@@ -113,6 +113,18 @@ def measured_table(raw: QTable, calibration: Image, sky: Sky, sigmas: float) -> 
     table = _table(columns, first=("x", "y", "contrast", "snr", "upper_limit"))
     table.meta["sigmas"] = sigmas
     return table
+
+
+def in_words(table: QTable, threshold: float) -> str:
+    """A table of candidates in lines of at most 80 characters."""
+    lines = [
+        f"{row['separation'].value:7.3f} +- {row['separation_error'].value:.3f} arcsec  "
+        f"{row['position_angle'].value:6.2f} +- {row['position_angle_error'].value:.2f} deg  "
+        f"{row['contrast']:.2e} +- {row['contrast_error']:.1e}  {row['snr']:5.1f}"
+        for row in table
+    ]
+    title = "    separation             position angle     contrast               S/N"
+    return "\n".join([title, *lines] if lines else [f"no candidate above S/N {threshold:g}"])
 
 
 def magnitudes(ratio: Image, error: Image | None = None) -> tuple[Image, Image]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -28,7 +28,10 @@ _FAR = 4.0
 occulter takes less than a percent of its light."""
 
 _KERNEL = 15
-"""Side of that image, pixels."""
+"""Side of that image in the matched filter, pixels."""
+
+_REACH = 81
+"""Side of the image that is subtracted for a source: it has side lobes far from its middle."""
 
 _FINE = 4
 """Positions per pixel, along x and y, at which it is rendered for photometry."""
@@ -58,27 +61,45 @@ class WholeFrame:
         The same observation, with all of its pixels.
     roll : float
         Rotation of the sky from the first frame to this one, degrees.
+    candidates : ndarray, (k, 3)
+        Contrast, and x, y from the star in the first frame, of the sources that were found in the
+        fitted pixels. They are removed as well.
     """
 
     fit: FrameFit
     observation: Observation
     roll: float
+    candidates: Image = field(default_factory=lambda: np.zeros((0, 3)))
 
     @cached_property
     def grid(self) -> Image:
         """x, y of all pixels from the star, (ny, nx, 2), arcsec."""
-        center = self.observation.center[0]
-        return pixel_grid(
-            *self.fit.on_pixels(self.observation.shape, (float(center[0]), float(center[1])))
-        )
+        return pixel_grid(*self.fit.on_pixels(self.observation.shape, self._center))
+
+    @property
+    def _center(self) -> tuple[float, float]:
+        x, y = self.observation.center[0]
+        return float(x), float(y)
+
+    @cached_property
+    def stars(self) -> Image:
+        """Image of the star and of the candidates, without background, (ny, nx)."""
+        image = self.fit.render(self.observation.shape, self._center, background=False)
+        model, values = self.fit.on_pixels(self.observation.shape, self._center)
+        star = values.get("star_offset", torch.zeros(2, dtype=torch.float64))
+        opd = torch.from_numpy(np.ascontiguousarray(self.fit.opd))
+        for contrast, *offset in self.candidates:
+            values["star_offset"] = star + torch.from_numpy(self._turn @ offset)
+            with torch.no_grad():
+                source = model(opd, **values).double().cpu().numpy()
+            image += contrast * self.fit.flux * source
+        return image
 
     @cached_property
     def residual(self) -> Image:
-        """Data without star and background, (ny, nx); 0 where masked."""
+        """Data without star, candidates and background, (ny, nx); 0 where masked."""
         combined = self.observation.combined()
-        x, y = self.observation.center[0]
-        star = self.fit.render(self.observation.shape, (float(x), float(y)), background=False)
-        image = np.asarray(combined.data[0] - star)
+        image = np.asarray(combined.data[0] - self.stars)
         unused = ~combined.valid[0] | (separation_of(self.grid) < _CORE)
         ground = Background2D(
             np.where(combined.valid[0], image, 0.0),
@@ -105,11 +126,13 @@ class WholeFrame:
         share = (self.kernel[window] * cross).sum() / self.kernel[middle, middle]
         allowed = np.maximum(convolve(self.residual, cross), 0.0) / share
         uncertain = _OUTLIER * combined.error[0] * math.sqrt(1 + 0.25 / share**2)
-        return np.where(self.residual > allowed + uncertain, np.inf, sigma)
+        # Residuals of the star are sharper than sources, too.
+        outlier = (self.residual > allowed + uncertain) & (separation_of(self.grid) > _CORE)
+        return np.where(outlier, np.inf, sigma)
 
-    def _source(self, x: float, y: float) -> Image:
+    def _source(self, size: int, x: float = 0.0, y: float = 0.0) -> Image:
         """Source of contrast 1 far from the star, x, y pixels right of and above the middle."""
-        model, values = self.fit.on_pixels(_KERNEL)
+        model, values = self.fit.on_pixels(size)
         scale = np.array(model.detector.pixelscale)
         far = torch.tensor([_FAR, 0.0], dtype=torch.float64)
         values["star_offset"] = far
@@ -121,23 +144,22 @@ class WholeFrame:
     @cached_property
     def kernel(self) -> Image:
         """Image of a source of contrast 1 in the middle of a square of pixels."""
-        return self._source(0.0, 0.0)
+        return self._source(_KERNEL)
 
     @cached_property
     def fine_image(self) -> ImagePSF:
-        """The same for photutils, sampled more finely than the pixels."""
-        fine = np.empty((_FINE * _KERNEL, _FINE * _KERNEL))
+        """The same for photutils, larger and sampled more finely than the pixels."""
+        fine = np.empty((_FINE * _REACH, _FINE * _REACH))
         middle = (_FINE - 1) / 2
         for row in range(_FINE):
             for column in range(_FINE):
                 # A pixel right of the source's middle sees what a source to its left shows.
-                moved = self._source((middle - column) / _FINE, (middle - row) / _FINE)
+                moved = self._source(_REACH, (middle - column) / _FINE, (middle - row) / _FINE)
                 fine[row::_FINE, column::_FINE] = moved
         return ImagePSF(fine, oversampling=_FINE)
 
-    @cached_property
-    def products(self) -> tuple[Image, Image]:
-        """Template times data and template times template, over the variance, at every pixel.
+    def products(self, image: Image) -> tuple[Image, Image]:
+        """Template times image and template times template, over the variance, at every pixel.
 
         The template's mean is removed, so that a level that is constant over it does not matter.
         """
@@ -145,13 +167,13 @@ class WholeFrame:
         source = self.kernel[::-1, ::-1]
         flat = np.ones_like(source)
 
-        def around(image: Image, kernel: Image) -> Image:
-            return np.asarray(fftconvolve(image, kernel, mode="same"))
+        def around(values: Image, kernel: Image) -> Image:
+            return np.asarray(fftconvolve(values, kernel, mode="same"))
 
         total = np.maximum(around(weight, flat), 1e-300)
         mixed = around(weight, source)
-        numerator = around(self.residual * weight, source)
-        numerator -= around(self.residual * weight, flat) * mixed / total
+        numerator = around(image * weight, source)
+        numerator -= around(image * weight, flat) * mixed / total
         information = around(weight, source**2) - mixed**2 / total
         return numerator, np.maximum(information, 0.0)
 
@@ -172,28 +194,61 @@ class WholeFrame:
         angle = math.radians(self.roll)
         return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
 
-    def on_first(self, grid: Image) -> tuple[Image, Image]:
+    def on_first(self, grid: Image, image: Image) -> tuple[Image, Image]:
         """`products` at the positions of the first frame's pixels; 0 outside this frame."""
+        products = self.products(image)
         if np.array_equal(grid, self.grid):
-            return self.products
+            return products
         x, y = np.moveaxis(self.pixels_of(grid), -1, 0)
         numerator, information = (
-            map_coordinates(image, [y, x], order=3, mode="constant") for image in self.products
+            map_coordinates(each, [y, x], order=3, mode="constant") for each in products
         )
         return np.where(information > 0, numerator, 0.0), np.maximum(information, 0.0)
 
-    def photometry(self, offsets: Image, contrasts: Image) -> QTable:
-        """Fit point sources, all together, starting from positions and contrasts.
+    def light(self, offsets: Image, contrasts: Image) -> Image:
+        """Image of point sources at x, y from the star in the first frame, (ny, nx)."""
+        total = np.zeros(self.observation.shape)
+        ny, nx = total.shape
+        for (x, y), contrast in zip(self.pixels_of(offsets), contrasts, strict=True):
+            half = _REACH // 2
+            rows = slice(max(round(y) - half, 0), min(round(y) + half + 1, ny))
+            columns = slice(max(round(x) - half, 0), min(round(x) + half + 1, nx))
+            if rows.start < rows.stop and columns.start < columns.stop:
+                row, column = np.mgrid[rows, columns]
+                total[rows, columns] += self.fine_image.evaluate(column, row, contrast, x, y)
+        return total
+
+    def photometry(
+        self, image: Image, offset: Image, contrast: float
+    ) -> tuple[Image, Image, float] | None:
+        """Fit a point source to an image, starting from its position and contrast.
 
         Returns
         -------
-        QTable
-            photutils' table, in the order of the sources; the flux is the contrast.
+        values, errors : ndarray, (3,)
+            Contrast, and x, y from the star in the first frame, arcsec.
+        chi2 : float
+            Reduced chi-squared.
+        None
+            If the source is not in this frame.
         """
-        places = self.pixels_of(offsets)
-        start = QTable({"x": places[:, 0], "y": places[:, 1], "flux": contrasts})
-        fit = PSFPhotometry(self.fine_image, (_FITTED, _FITTED))
-        error = np.where(np.isfinite(self.sigma), self.sigma, 0.0)
-        masked = ~np.isfinite(self.sigma)
-        return fit(self.residual, error=np.where(masked, 1.0, error), mask=masked,
-                   init_params=start)  # fmt: skip
+        x, y = self.pixels_of(offset)
+        ny, nx = image.shape
+        if not (0 <= round(x) < nx and 0 <= round(y) < ny) or np.isinf(
+            self.sigma[round(y), round(x)]
+        ):
+            return None
+        start = QTable({"x": [x], "y": [y], "flux": [contrast]})
+        unused = np.isinf(self.sigma)
+        fitted = PSFPhotometry(self.fine_image, (_FITTED, _FITTED))(
+            image, error=np.where(unused, 1.0, self.sigma), mask=unused, init_params=start
+        )[0]
+        place = self.offsets_of(np.array([fitted["x_fit"], fitted["y_fit"]], dtype=float))
+        values = np.array([fitted["flux_fit"], *place], dtype=float)
+        scale = self.fit.model.detector.pixelscale
+        errors = np.array(
+            [fitted["flux_err"], fitted["x_err"] * scale[0], fitted["y_err"] * scale[1]],
+            dtype=float,
+        )
+        usable = np.isfinite(values).all() and (errors > 0).all()
+        return (values, errors, float(fitted["reduced_chi2"])) if usable else None

@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor, scatter_profil
 from pyklip_diffrender.detection.field import Image, far_from, ring_pixels, separation_of
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.storage import image_hdu
-from pyklip_diffrender.detection.tables import candidate_table
+from pyklip_diffrender.detection.tables import candidate_table, in_words
 from pyklip_diffrender.detection.whole_frames import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing, write_fits
@@ -33,17 +34,36 @@ __all__ = ["WideField", "wide_field"]
 _log = logging.getLogger(__name__)
 
 _EDGE = 16
-"""Pixels at the edge of the frame that are not searched: templates are cut off, and in the first rows
-light scattered at the edge of the occulters' substrate appears in frames of every star."""
+"""Pixels at the edge of the frame that are not searched: templates are cut off there, and light
+scattered by the edge of the occulters' substrate appears in the first rows of every frame."""
 
 _MOST = 50
 """Largest number of sources."""
+
+_LOBES = 1.5
+"""arcsec from a source within which a peak may be what its subtraction left."""
+
+_LEFT = 0.1
+"""Largest part of a source's S/N that it may leave."""
 
 _STEP = 0.1
 """Distance between the separations of the contrast curve, arcsec."""
 
 _COVERED = 0.5
 """Part of a ring that must be in the frame for a limit to be stated."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """A source as measured: contrast, x and y, their variances, reduced chi-squared."""
+
+    values: Image
+    variance: Image
+    chi2: float
+
+    @property
+    def snr(self) -> float:
+        return float(self.values[0] / np.sqrt(self.variance[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +78,8 @@ class WideField:
     ----------
     detection : Detection
         The search of the pixels about the star.
+    threshold : float
+        Smallest S/N of a candidate.
     contrast, error, snr : ndarray, (ny, nx)
         As those of `Detection`; NaN where nothing is known.
     grid : ndarray, (ny, nx, 2)
@@ -69,9 +91,12 @@ class WideField:
         `Detection.table`, and fit_chi2.
     contrast_curve : QTable
         See `contrast.contrast_table`.
+    light : tuple of ndarray, (ny, nx)
+        Light of the sources outside the fitted pixels in every frame, in the data's unit.
     """
 
     detection: Detection
+    threshold: float
     contrast: Image
     error: Image
     snr: Image
@@ -79,10 +104,57 @@ class WideField:
     error_factor: ErrorFactor
     table: QTable
     contrast_curve: QTable
+    light: tuple[Image, ...] = ()
 
     def __repr__(self) -> str:
         ny, nx = self.snr.shape
         return f"<WideField: {nx} x {ny} pixels, {len(self.table)} candidates>"
+
+    def __str__(self) -> str:
+        """The candidates in words, at most 80 columns wide."""
+        return in_words(self.table, self.threshold)
+
+    @property
+    def observation(self) -> Observation:
+        """The first frame, as far as it was fitted."""
+        return self.detection.observation
+
+    @property
+    def north(self) -> float:
+        """Position angle of the first frame's +y axis, degrees east of north; 0 if not known."""
+        return self.detection.north
+
+    def subtracted(
+        self, whole: Sequence[Observation], cut: Sequence[Observation]
+    ) -> tuple[Observation, ...] | None:
+        """The fitted pixels without the light of sources outside them.
+
+        Parameters
+        ----------
+        whole, cut : sequence of Observation
+            All frames, and the cutouts that were fitted.
+
+        Returns
+        -------
+        tuple of Observation or None
+            None if there is too little of that light to be seen.
+        """
+        cleaned, seen = [], 0.0
+        for light, frame, part in zip(self.light, whole, cut, strict=True):
+            column, row = np.rint(frame.center[0] - part.center[0]).astype(int)
+            ny, nx = part.shape
+            inside = light[row : row + ny, column : column + nx]
+            combined = part.combined()
+            ratio = np.where(combined.valid[0], inside / combined.error[0], 0.0)
+            seen = max(seen, float(np.sqrt((ratio**2).sum())))
+            cleaned.append(replace(part, data=part.data - inside))
+        return tuple(cleaned) if seen > self.threshold else None
+
+    def plot(self, ax: Any = None) -> NDArray[Any]:
+        """Draw the S/N map with the candidates, and the contrast curve; see `Detection.plot`."""
+        from pyklip_diffrender import plotting
+
+        return plotting.plot_detection(self, ax)
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables."""
@@ -133,18 +205,15 @@ def wide_field(
     frames = _frames(detection, observations)
     grid = frames[0].grid
     window = _window(detection, frames[0])
-    products = [frame.on_first(grid) for frame in frames]
-    numerator, information = (sum(each) for each in zip(*products, strict=True))
-    outer = np.ones(grid.shape[:2], dtype=bool)
-    outer[_EDGE:-_EDGE, _EDGE:-_EDGE] = False
-    outer = ~outer & (information > 0)
     rows, columns = window
+    outer = np.zeros(grid.shape[:2], dtype=bool)
+    outer[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
     outer[rows, columns] = False
-    safe = np.where(outer, information, np.nan)
-    snr = numerator / np.sqrt(safe)
-    sources, chi2, factor = _search(frames, snr, numerator / safe, grid, threshold, detection)
-    error = factor.at(separation_of(grid)) / np.sqrt(safe)
-    contrast = numerator / safe
+    information, measured, factor = _search(frames, outer, grid, threshold, detection)
+    sources = _candidates(measured)
+    numerator = np.sum([each.on_first(grid, each.residual)[0] for each in frames], axis=0)
+    error = factor.at(separation_of(grid)) / np.sqrt(information)
+    contrast = numerator / information
     for ours, theirs in ((contrast, detection.contrast), (error, detection.error)):
         ours[rows, columns] = theirs
     calibration = np.zeros((2, len(sources)))
@@ -154,6 +223,7 @@ def wide_field(
     # As in the table, the highest S/N first.
     order = np.argsort(-_snr(sources, factor))
     inner = detection.table.copy()
+    chi2 = np.array([each.chi2 for each in measured]) / factor.of(sources.offsets) ** 2
     inner["fit_chi2"], table["fit_chi2"] = np.nan, chi2[order]
     tables = [each for each in (inner, table) if len(each)]
     joined = vstack(tables, metadata_conflicts="silent") if tables else table
@@ -164,6 +234,7 @@ def wide_field(
     joined.meta = dict(detection.table.meta)
     return WideField(
         detection,
+        threshold,
         contrast,
         error,
         contrast / error,
@@ -171,6 +242,7 @@ def wide_field(
         factor,
         joined[np.argsort(-np.asarray(joined["snr"]))],
         _curve(detection, error, information, grid, window, factor),
+        tuple(frame.light(*_light_of(measured)) for frame in frames),
     )
 
 
@@ -186,8 +258,10 @@ def _frames(detection: Detection, observations: Sequence[Observation]) -> list[W
             f"observations: got {[each.name for each in observations]}, expected those of the fit, "
             f"{names}, before they were cut"
         )
+    known = detection.candidates
+    inside = np.column_stack([known.contrasts.numpy(), known.offsets.numpy()])
     return [
-        WholeFrame(fit, each, each.roll_from(observations[0]))
+        WholeFrame(fit, each, each.roll_from(observations[0]), inside)
         for fit, each in zip(fitted, observations, strict=True)
     ]
 
@@ -207,63 +281,90 @@ def _window(detection: Detection, first: WholeFrame) -> tuple[slice, slice]:
 
 def _search(
     frames: Sequence[WholeFrame],
-    snr: Image,
-    contrast: Image,
+    outer: NDArray[np.bool_],
     grid: Image,
     threshold: float,
     detection: Detection,
-) -> tuple[Candidates, Image, ErrorFactor]:
-    """Sources outside the fitted pixels, the chi-squared of their images, the error factor."""
+) -> tuple[Image, list[_Source], ErrorFactor]:
+    """Information of contrasts, the sources, and the error factor.
+
+    The highest peak is fitted and subtracted, until none is left: sources have side lobes.
+    """
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
-    inner = float(np.nanmin(np.where(np.isfinite(snr), separation_of(grid), np.nan)))
+    distance = separation_of(grid)
+    inner = float(distance[outer].min())
     known = detection.candidates.offsets
-    peaks: list[tuple[int, int]] = []
+    sources: list[_Source] = []
     while True:
-        places = torch.from_numpy(np.array([grid[peak] for peak in peaks]).reshape(-1, 2))
-        factor = scatter_profile(snr, grid, torch.cat([known, places]), inner, resolution)
-        factor = factor.at_least(1.0)
-        scaled = snr / factor.at(separation_of(grid))
-        allowed = np.isfinite(scaled) & far_from(grid, torch.cat([known, places]), 2 * resolution)
-        higher = local_maxima(np.nan_to_num(scaled), allowed, threshold, size=5)
-        if not higher or len(peaks) >= _MOST:
+        images = [frame.residual - frame.light(*_light_of(sources)) for frame in frames]
+        products = [f.on_first(grid, image) for f, image in zip(frames, images, strict=True)]
+        numerator, information = (np.sum(each, axis=0) for each in zip(*products, strict=True))
+        information = np.where(outer & (information > 0), information, np.nan)
+        snr = numerator / np.sqrt(information)
+        factor = scatter_profile(snr, grid, known, inner, resolution).at_least(1.0)
+        places = torch.from_numpy(_light_of(sources)[0])
+        scaled = snr / factor.at(distance)
+        allowed = np.isfinite(scaled) & far_from(grid, places, resolution)
+        for source in sources:
+            # What the subtraction of a bright source leaves is not another one.
+            near = separation_of(grid - source.values[1:]) < _LOBES
+            allowed &= ~near | (snr > _LEFT * source.snr)
+        peaks = local_maxima(np.nan_to_num(scaled), allowed, threshold, size=5)
+        if not peaks or len(sources) >= _MOST:
             break
-        peaks.append(higher[0])
-    if len(peaks) >= _MOST:
+        peak = peaks[0]
+        contrast = float(numerator[peak] / information[peak])
+        fitted = _measured(frames, images, grid[peak], contrast)
+        if fitted is None or separation_of(fitted.values[1:] - grid[peak]) > resolution:
+            # No point source: its fit fails or leads elsewhere.
+            outer = outer & far_from(grid, torch.from_numpy(grid[peak][None]), resolution)
+            continue
+        sources.append(fitted)
+    if len(sources) >= _MOST:
         _log.warning("more than %d sources in the whole field; the fainter are left out", _MOST)
-    offsets, contrasts = places.numpy(), np.array([contrast[peak] for peak in peaks])
-    return *_measured(frames, offsets, contrasts, factor), factor
+    return information, _refined(frames, sources), factor
+
+
+def _light_of(sources: Sequence[_Source]) -> tuple[Image, Image]:
+    """Positions (k, 2) and contrasts (k,)."""
+    values = np.array([each.values for each in sources]).reshape(-1, 3)
+    return values[:, 1:], values[:, 0]
+
+
+def _refined(frames: Sequence[WholeFrame], sources: list[_Source]) -> list[_Source]:
+    """Fit every source once more, with all others subtracted."""
+    for k, source in enumerate(sources):
+        others = _light_of([*sources[:k], *sources[k + 1 :]])
+        images = [frame.residual - frame.light(*others) for frame in frames]
+        fitted = _measured(frames, images, source.values[1:], source.values[0])
+        sources[k] = source if fitted is None else fitted
+    return sources
 
 
 def _measured(
-    frames: Sequence[WholeFrame], offsets: Image, contrasts: Image, factor: ErrorFactor
-) -> tuple[Candidates, Image]:
-    """Fit the sources in every frame, and average."""
-    count = len(offsets)
-    if not count:
-        return Candidates.at(offsets, contrasts), np.zeros(0)
-    total, weights, chi2 = np.zeros((count, 3)), np.zeros((count, 3)), []
-    for frame in frames:
-        fitted = frame.photometry(offsets, contrasts)
-        pixels = np.stack([fitted["x_fit"], fitted["y_fit"]], axis=-1).astype(float)
-        values = np.column_stack([fitted["flux_fit"], frame.offsets_of(pixels)])
-        scale = np.abs(np.array(frame.fit.model.detector.pixelscale))
-        errors = np.column_stack(
-            [fitted["flux_err"], fitted["x_err"] * scale[0], fitted["y_err"] * scale[1]]
-        ).astype(float)
-        usable = np.isfinite(values).all(axis=1) & (errors > 0).all(axis=1)
-        weight = np.where(usable[:, None], errors**-2.0, 0.0)
-        total += np.where(weight > 0, weight * values, 0.0)
-        weights += weight
-        chi2.append(np.where(usable, np.asarray(fitted["reduced_chi2"], dtype=float), np.nan))
-    seen: NDArray[np.bool_] = np.asarray((weights > 0).all(axis=1))
-    mean = np.where(seen[:, None], total / np.where(weights > 0, weights, 1.0), 0.0)
-    mean[~seen] = np.column_stack([contrasts, offsets])[~seen]
-    variance = np.where(weights > 0, weights, np.nan) ** -1.0
-    sources = replace(
-        Candidates.at(mean[:, 1:], mean[:, 0]),
+    frames: Sequence[WholeFrame], images: Sequence[Image], offset: Image, contrast: float
+) -> _Source | None:
+    """Fit a source in every frame and average; None if it is in none of them."""
+    fits = [f.photometry(i, offset, contrast) for f, i in zip(frames, images, strict=True)]
+    usable = [each for each in fits if each is not None]
+    if not usable:
+        return None
+    weights = np.array([errors**-2.0 for _, errors, _ in usable])
+    values = np.array([each for each, _, _ in usable])
+    return _Source(
+        (weights * values).sum(axis=0) / weights.sum(axis=0),
+        weights.sum(axis=0) ** -1.0,
+        float(np.mean([chi2 for _, _, chi2 in usable])),
+    )
+
+
+def _candidates(sources: Sequence[_Source]) -> Candidates:
+    places, contrasts = _light_of(sources)
+    variance = np.array([each.variance for each in sources]).reshape(-1, 3)
+    return replace(
+        Candidates.at(places, contrasts),
         covariance=torch.diag(torch.from_numpy(variance.T.flatten())),
     )
-    return sources, np.nanmean(chi2, axis=0) / factor.of(sources.offsets) ** 2
 
 
 def _snr(sources: Candidates, factor: ErrorFactor) -> Image:

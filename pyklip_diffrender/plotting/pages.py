@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pyklip_diffrender.detection import Detection
+    from pyklip_diffrender.detection import Detection, WideField
 
 __all__ = ["draw_search", "draw_star", "draw_wavefronts"]
 
@@ -38,7 +38,7 @@ _LIMIT = 5.0
 """Of the scale for residuals, standard deviations."""
 
 
-def draw_search(detection: Detection) -> list[Figure]:
+def draw_search(detection: Detection | WideField) -> list[Figure]:
     """The S/N map with the candidates, and the contrast curve."""
     figures, axes = _panels(2)
     plot_detection(detection, axes)

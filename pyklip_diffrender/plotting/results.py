@@ -29,7 +29,7 @@ from pyklip_diffrender.plotting.panels import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from pyklip_diffrender.detection import Detection
+    from pyklip_diffrender.detection import Detection, WideField
     from pyklip_diffrender.optics.grid import PupilGrid
     from pyklip_diffrender.optics.planes import Wavefront
     from pyklip_diffrender.optics.system import OpticalSystem
@@ -42,6 +42,9 @@ _LIGHT = "magma"
 _SIGNED = "RdBu_r"
 _LIMIT = 5.0
 """Of the scale for residuals, and of its linear part for S/N, in standard deviations."""
+
+_LABELLED = 4
+"""Largest number of candidates that are labelled: the labels of more would overlap."""
 
 _SNR_TICKS = (-100, -50, -20, -10, -5, 0, 5, 10, 20, 50, 100)
 
@@ -135,7 +138,7 @@ def plot_refinement(fit: Refinement, ax: Any = None, *, frame: int = 0) -> NDArr
     return np.array([data_axes, middle, right])
 
 
-def plot_detection(detection: Detection, ax: Any = None) -> NDArray[Any]:
+def plot_detection(detection: Detection | WideField, ax: Any = None) -> NDArray[Any]:
     """See `Detection.plot`."""
     snr_axes, right = axes_for(ax, 2)
     extent, table = extent_of(detection.grid[0, :, 0], detection.grid[:, 0, 1]), detection.table
@@ -147,7 +150,8 @@ def plot_detection(detection: Detection, ax: Any = None) -> NDArray[Any]:
     )  # fmt: skip
     label_sky(snr_axes)
     places = np.stack([table["x"].value, table["y"].value], axis=1)
-    mark(snr_axes, places, [f"S/N {snr:.1f}" for snr in table["snr"]])
+    labels = [f"S/N {snr:.1f}" for snr in table["snr"]] if len(table) <= _LABELLED else []
+    mark(snr_axes, places, labels)
     if detection.observation.position_angles is not None:
         draw_compass(snr_axes, detection.north)
 

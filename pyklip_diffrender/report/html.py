@@ -33,6 +33,9 @@ $facts
 """)
 
 _PRODUCTS = {
+    "wide_field.fits": "maps of the whole frames",
+    "wide_field_candidates.ecsv": "candidates in the whole frames",
+    "wide_field_contrast.ecsv": "contrast curve to the edge of the frames",
     "detection.fits": "maps, star-subtracted frames and candidates, for Detection.read",
     "candidates.ecsv": "the candidates with all columns",
     "contrast.ecsv": "the contrast curve",
@@ -49,6 +52,7 @@ def page(
     search: Sequence[Picture],
     stars: Sequence[Sequence[Picture]],
     wavefront: Sequence[Picture],
+    wide: Sequence[Picture] = (),
     files: Sequence[str] = (),
 ) -> str:
     """The report.
@@ -57,7 +61,8 @@ def page(
     ----------
     summary : dict
         See `summarise`.
-    search, wavefront : sequence of Picture
+    search, wavefront, wide : sequence of Picture
+        Those of whole frames, `wide`, may be missing.
     stars : sequence of sequence of Picture
         One for each frame of the target that is shown.
     files : sequence of str
@@ -74,6 +79,11 @@ def page(
     sections = [
         pieces.section(
             "Search", pieces.pictures(search, "pair"), _candidates(summary), _limits(summary)
+        ),
+        *(
+            [pieces.section("Whole frames", pieces.pictures(wide, "pair"), _wide(summary))]
+            if wide
+            else []
         ),
         pieces.section("Star subtraction", *_star(summary, stars)),
         pieces.section("Wavefront", _wavefront(summary), pieces.pictures(wavefront)),
@@ -171,6 +181,33 @@ def _candidates(summary: Mapping[str, Any]) -> str:
         + pieces.note(note)
         + _on_sky(summary["candidates"])
     )
+
+
+def _wide(summary: Mapping[str, Any]) -> str:
+    """Candidates in the whole frames."""
+    candidates = summary["wide_field"]["candidates"]
+    rows = [
+        [
+            str(k),
+            plus_minus(each["separation_arcsec"], each["separation_error_arcsec"]),
+            plus_minus(each["position_angle_deg"], each["position_angle_error_deg"]),
+            scientific(each["contrast"], each["contrast_error"]),
+            f"{each['snr']:.1f}",
+            "" if each["fit_chi2"] is None else f"{each['fit_chi2']:.1f}",
+        ]
+        for k, each in enumerate(candidates, 1)
+    ]
+    if not rows:
+        return pieces.note(f"No candidate has an S/N above {summary['threshold_snr']:g}.")
+    angle = "east of north" if summary["oriented"] else "from +y of the first frame"
+    header = ["", "Separation (arcsec)", f"Position angle (deg, {angle})", "Contrast", "S/N",
+              "Chi-squared of the image"]  # fmt: skip
+    note = (
+        "The last column is the reduced chi-squared of a fit of a point source, for candidates "
+        "outside the pixels in which the star was fitted; much above 1, the source is extended, "
+        "blended, or no source."
+    )
+    return pieces.table(header, rows) + pieces.note(note)
 
 
 _SKY = (

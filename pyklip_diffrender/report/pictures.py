@@ -6,13 +6,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pyklip_diffrender.detection import WideField
 from pyklip_diffrender.plotting import draw_search, draw_star, draw_wavefronts, to_png
 from pyklip_diffrender.plotting.panels import unit_label
 from pyklip_diffrender.reduction import Reduction
 from pyklip_diffrender.report.summary import wavefronts
 from pyklip_diffrender.report.words import number
 
-__all__ = ["MOST_FRAMES", "Picture", "search_pictures", "star_pictures", "wavefront_pictures"]
+__all__ = [
+    "MOST_FRAMES",
+    "Picture",
+    "search_pictures",
+    "star_pictures",
+    "wavefront_pictures",
+    "wide_pictures",
+]
 
 MOST_FRAMES = 4
 """Frames of which pictures are shown."""
@@ -49,7 +57,7 @@ def search_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Pi
     factors = detection.error_factor.factors
     if not detection.error_factor.is_needed:
         scaled = "Errors are those of the fit, not scaled."
-    elif len(factors) == 1:
+    elif not detection.error_factor.is_measured:
         scaled = (
             f"Errors were multiplied by {factors[0]:.2f}, the square root of the reduced "
             "chi-squared without the candidates."
@@ -83,6 +91,25 @@ def search_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Pi
             f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "
             "median of all position angles and their range. Dashed: the same if the image of the "
             f"star were known exactly.{small_sample}",
+        ),
+    )
+
+
+def wide_pictures(wide: WideField) -> list[Picture]:
+    """The S/N map of the whole frames, and the contrast curve to their edge."""
+    count = len(wide.table)
+    some = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {wide.threshold:g}"
+    return _pictures(
+        draw_search(wide),
+        (
+            f"Map of the signal-to-noise ratio of a point source in the whole frames, {some}.",
+            "S/N of a point source in the whole frames. About the star it is that of the search "
+            "above; elsewhere the star, extrapolated from its fit, and the background were "
+            "subtracted. Errors follow the scatter of the S/N at every separation.",
+        ),
+        (
+            "Curve of the contrast limit against separation in arcsec, to the edge of the frames.",
+            "Contrast limit to the edge of the frames, as far as half of a ring is in them.",
         ),
     )
 

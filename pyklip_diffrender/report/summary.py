@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pyklip_diffrender import __version__
-from pyklip_diffrender.detection import Detection
+from pyklip_diffrender.detection import Detection, WideField
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.reduction import Reduction
 from pyklip_diffrender.refinement import Refinement
@@ -75,8 +75,9 @@ def summarise(reduction: Reduction) -> dict[str, Any]:
         "wavefront_map": _wavefront_map(fit, first),
         "systematics": _systematics(reduction),
         "candidates": _candidates(detection),
+        "wide_field": None if reduction.wide is None else _wide_field(reduction.wide),
         "limits": _limits(detection),
-        "contrast_curve": _curve(detection),
+        "contrast_curve": _curve(detection.contrast_curve),
         "frames": [
             *(_frame(each, "target") for each in sequence.science),
             *(_frame(each, "reference") for each in sequence.references),
@@ -151,14 +152,29 @@ def _label(table: QTable, name: str) -> str:
 
 def _candidates(detection: Detection) -> list[dict[str, Any]]:
     """The table of candidates, with the unit in the names and the probability of a false alarm."""
-    table, rows = detection.table, []
-    for row in table:
-        values = {
-            _label(table, name): getattr(row[name], "value", row[name]) for name in table.colnames
+    table = detection.table
+    return [
+        {
+            **values,
+            "false_alarm_probability": _false_alarm(
+                detection, float(row["snr"]), row["separation"].to_value("arcsec")
+            ),
         }
-        chance = _false_alarm(detection, float(row["snr"]), row["separation"].to_value("arcsec"))
-        rows.append({**values, "false_alarm_probability": chance})
-    return rows
+        for row, values in zip(table, _rows(table), strict=True)
+    ]
+
+
+def _rows(table: QTable) -> list[dict[str, Any]]:
+    """The rows of a table, with the unit in the names."""
+    return [
+        {_label(table, name): getattr(row[name], "value", row[name]) for name in table.colnames}
+        for row in table
+    ]
+
+
+def _wide_field(wide: WideField) -> dict[str, Any]:
+    """Candidates and limits in the whole frames."""
+    return {"candidates": _rows(wide.table), "contrast_curve": _curve(wide.contrast_curve)}
 
 
 def _false_alarm(detection: Detection, snr: float, separation: float) -> float:
@@ -170,7 +186,7 @@ def _false_alarm(detection: Detection, snr: float, separation: float) -> float:
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
     elements = math.floor(2 * math.pi * separation / resolution)
     single = stats.norm.sf(snr)
-    if not detection.fits[0].status.calibrated and elements >= 3:
+    if detection.error_factor.is_measured and elements >= 3:
         single = stats.t.sf(snr / math.sqrt(1 + 1 / (elements - 1)), elements - 2)
     pixel = abs(detection.grid[0, 1, 0] - detection.grid[0, 0, 0]) * abs(
         detection.grid[1, 0, 1] - detection.grid[0, 0, 1]
@@ -179,8 +195,7 @@ def _false_alarm(detection: Detection, snr: float, separation: float) -> float:
     return float(-math.expm1(trials * math.log1p(-single)))
 
 
-def _curve(detection: Detection) -> dict[str, Any]:
-    curve = detection.contrast_curve
+def _curve(curve: QTable) -> dict[str, Any]:
     columns = {_label(curve, name): np.asarray(curve[name]) for name in curve.colnames}
     return {"sigmas": curve.meta["sigmas"], **columns}
 

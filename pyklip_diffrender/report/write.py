@@ -15,6 +15,7 @@ from pyklip_diffrender.report.pictures import (
     search_pictures,
     star_pictures,
     wavefront_pictures,
+    wide_pictures,
 )
 from pyklip_diffrender.report.summary import summarise
 
@@ -46,6 +47,7 @@ def write_report(
         search_pictures(reduction, summary),
         [star_pictures(reduction, frame) for frame in frames],
         wavefront_pictures(reduction, summary),
+        [] if reduction.wide is None else wide_pictures(reduction.wide),
         [path.name for path in (*files, html, data)],
     )
     written = {html: text, data: json.dumps(summary, indent=2, allow_nan=False) + "\n"}
