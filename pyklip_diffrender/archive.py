@@ -101,16 +101,16 @@ def list_calints(
             f"program: got {program!r}, expected the number of a JWST programme, such as 1184"
         ) from error
     with _asking(mast):
-        found = mast.observations.query_criteria(
+        observed = mast.observations.query_criteria(
             obs_collection="JWST",
             instrument_name="NIRCAM/CORON",
             # The archive has used both spellings.
             proposal_id=[str(number), f"{number:05d}"],
             calib_level=[2, 3],
         )
-    if not len(found):
+    if not len(observed):
         raise ArchiveError(f"MAST has no coronagraphic frames of NIRCam of programme {number}")
-    chosen = _chosen(found, target, filter)
+    chosen = _chosen(observed, target, filter)
     with _asking(mast):
         products = mast.observations.get_unique_product_list(chosen)
     if len(products):
@@ -236,7 +236,7 @@ def _asking(mast: _Mast) -> Iterator[None]:
         ) from error
 
 
-def _chosen(found: Table, target: str | None, filter: str | None) -> Table:
+def _chosen(observed: Table, target: str | None, filter: str | None) -> Table:
     """Observations of a star through a filter."""
     for key, choice, column, names in (
         ("target", target, "target_name", lambda value: [str(value)]),
@@ -244,12 +244,12 @@ def _chosen(found: Table, target: str | None, filter: str | None) -> Table:
     ):
         if choice is None:
             continue
-        keep = [any(_same(choice, each) for each in names(value)) for value in found[column]]
+        keep = [any(_same(choice, each) for each in names(value)) for value in observed[column]]
         if not any(keep):
-            known = sorted({each for value in found[column] for each in names(value)})
+            known = sorted({each for value in observed[column] for each in names(value)})
             raise IncompatibleSetupError(f"{key}: got {choice!r}, the programme has {known}")
-        found = found[keep]
-    return found
+        observed = observed[keep]
+    return observed
 
 
 def _same(first: str, second: str) -> bool:

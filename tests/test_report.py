@@ -25,6 +25,7 @@ from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.planning.choice import ModelError
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.report import summarise, write_report
+from pyklip_diffrender.report.html import page
 from pyklip_diffrender.report.words import (
     advice,
     plus_minus,
@@ -216,6 +217,15 @@ def test_the_summary_has_the_numbers_of_the_result(folder: Path) -> None:
     offset = plus_minus(entry["delta_ra_arcsec"], entry["delta_ra_error_arcsec"])
     assert offset in words[at:]
     assert "Flux density (Jy)" not in words
+
+
+def test_calibrated_frames_have_flux_densities_on_the_page() -> None:
+    summary = summarise(reduction())
+    summary["star"] = {"flux_density_Jy": 0.41, "flux_density_error_Jy": 0.05}
+    summary["candidates"][0] |= {"flux_density_Jy": 1.2e-4, "flux_density_error_Jy": 1e-5}
+    words = Tags(page(summary, [], [], [])).words
+    assert "0.41 ± 0.05 Jy" in words
+    assert scientific(1.2e-4, 1e-5) in words
 
 
 def test_every_picture_has_words_and_nothing_is_loaded(folder: Path) -> None:

@@ -88,17 +88,17 @@ def test_the_sky_is_where_the_frames_own_wcs_has_it(
     # As in `Templates.grid`: the detector's scales and shear about the star.
     x = pixels[0] * mask.siaf_pixelscale[0]
     y = pixels[1] * mask.siaf_pixelscale[1] + mask.siaf_shear * x
-    here = Positions(np.array([[x, y]]), COVARIANCE[None], got.position_angle)
+    place_on_sky = Positions(np.array([[x, y]]), COVARIANCE[None], got.position_angle)
     wcs = WCS(fits.Header({k: v for k, v in REAL.items() if k[:2] in ("CT", "CU", "CR", "CD")}))
     star = wcs.pixel_to_world(*got.center[0])
     place = wcs.pixel_to_world(*(got.center[0] + pixels))
     east, north = star.spherical_offsets_to(place)
     distance = star.separation(place).arcsec
     np.testing.assert_allclose(
-        here.on_sky[0], [east.arcsec, north.arcsec], rtol=0, atol=4e-3 * distance
+        place_on_sky.on_sky[0], [east.arcsec, north.arcsec], rtol=0, atol=4e-3 * distance
     )
-    assert here.separation[0] == pytest.approx(distance, rel=3e-3)
-    away = star.position_angle(place).deg - here.position_angle[0]
+    assert place_on_sky.separation[0] == pytest.approx(distance, rel=3e-3)
+    away = star.position_angle(place).deg - place_on_sky.position_angle[0]
     assert (away + 180) % 360 - 180 == pytest.approx(0, abs=0.2)
 
 
@@ -327,10 +327,10 @@ def test_the_companion_of_hip_65426_is_on_its_side_of_the_star(shared_data: Path
     """
     frames = shared_data / "hip65426_f444w_calints.fits.gz"
     opd = shared_data / "opd_2022-07-30.fits.gz"
-    found = dr.reduce(frames, opd, size=48).detection
-    row = found.table[0]
+    detection = dr.reduce(frames, opd, size=48).detection
+    row = detection.table[0]
     assert row["separation"].to_value("mas") == pytest.approx(820, abs=25)
-    header = found.observation.header
+    header = detection.observation.header
     star = SkyCoord(header["CRVAL1"], header["CRVAL2"], unit="deg")
     sun = get_sun(Time("2022-07-30"))
     nominal = star.position_angle(SkyCoord(sun.ra, sun.dec)).deg + 180

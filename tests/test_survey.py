@@ -34,6 +34,7 @@ from pyklip_diffrender.surveys import execution, folders, page, runs, work
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.driver import run_survey, survey
 from pyklip_diffrender.surveys.jobs import Injection, Job, plan_jobs
+from pyklip_diffrender.surveys.tables import COLUMNS, table_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -440,6 +441,14 @@ def test_a_survey_of_many_stars_has_one_picture(tmp_path: Path) -> None:
 
 
 # -- where it runs ---------------------------------------------------------------------------------
+
+
+def test_the_table_shows_its_contrasts_on_80_columns() -> None:
+    values = {"name": "HIP-65426_F444W", "status": "finished", "contrast": 3.6276222428e-4,
+              "snr": 70.0387387, "message": "none", "key": "0123456789abcdef"}  # fmt: skip
+    shown = table_of([dict.fromkeys(COLUMNS) | values]).pformat(max_width=80)
+    assert max(map(len, shown)) <= 80
+    assert {"3.63e-04", "70.0"} <= set(shown[-1].split())
 
 
 @pytest.mark.parametrize("missing", ["dask", "pyarrow"])

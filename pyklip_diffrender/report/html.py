@@ -131,6 +131,17 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     if used is not None:
         stars = ", ".join(used["stars"])
         pattern = used["name"] if stars in ("", used["name"]) else f"{used['name']} ({stars})"
+    star = summary["star"]
+    flux = (
+        []
+        if star is None
+        else [
+            (
+                "Flux density of the star",
+                f"{plus_minus(star['flux_density_Jy'], star['flux_density_error_Jy'])} Jy",
+            )
+        ]
+    )
     return [
         ("Reduced chi-squared without model error", number(fit["reduced_chi2"])),
         (
@@ -140,6 +151,7 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Errors multiplied by", number(fit["error_factor"])),
         ("Wavefront map", f"{map_['name']}, {_age(map_['days_before_first_frame'])}"),
         ("Pattern of the model's error learned from", pattern),
+        *flux,
     ]
 
 

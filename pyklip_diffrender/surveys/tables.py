@@ -20,6 +20,8 @@ _AT = (0.5, 1.0, 1.5, 2.0)
 COLUMNS: dict[str, type] = {
     "name": str,
     "status": str,
+    "contrast": float,
+    "snr": float,
     "target": str,
     "filter": str,
     "frames": int,
@@ -27,10 +29,8 @@ COLUMNS: dict[str, type] = {
     "reduced_chi2": float,
     "error_factor": float,
     "candidates": int,
-    "snr": float,
     "separation_arcsec": float,
     "position_angle_deg": float,
-    "contrast": float,
     "contrast_error": float,
     **{f"limit_{each:.1f}_arcsec": float for each in _AT},
     "injected_contrast": float,
@@ -48,7 +48,11 @@ COLUMNS: dict[str, type] = {
     "traceback": str,
     "key": str,
 }
-"""Columns of the results and what they hold; all but name, status and key may be masked."""
+"""Columns of the results and what they hold; all but name, status and key may be masked.
+
+Contrasts come first, because a table that is too wide to print loses its middle."""
+
+_FORMATS = {"contrast": ".2e", "snr": ".1f"}
 
 
 def row(job: Job, record: Record | None) -> dict[str, Any]:
@@ -88,6 +92,7 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
         values = [each[name] for each in rows]
         known = [kind() if value is None else kind(value) for value in values]
         table[name] = MaskedColumn(known, mask=[value is None for value in values], dtype=kind)
+        table[name].info.format = _FORMATS.get(name)
     return table
 
 
