@@ -12,7 +12,7 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import small_sample_factor
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure
-from pyklip_diffrender.detection.wide_field import WideField, wide_field
+from pyklip_diffrender.detection.wide_search import WideField, wide_field
 
 __all__ = [
     "Candidates",
