@@ -98,7 +98,7 @@ class Reduction:
         before = dict(vars(self.dataset))
 
         def subtract(*args: Any, **kwargs: Any) -> tuple[Any, ...]:
-            return self._klip_parallelized(opd, *args, **kwargs)
+            return self._in_place_of_klip(opd, *args, **kwargs)
 
         reduce = klip_dataset(
             klip_parallelized=subtract,
@@ -144,11 +144,15 @@ class Reduction:
             return ()
         return library_files(self.dataset, library)
 
+    @property
+    def _verbose(self) -> bool:
+        return bool(self.arguments["verbose"])
+
     def _tell(self, line: str) -> None:
         """Say what is being done, as pyKLIP does."""
         logger.info(line)
         # Its verbose=True prints, and whoever asks for it has no handler for our log.
-        if self.arguments["verbose"]:
+        if self._verbose:
             print(f"diffrender: {line}", flush=True)
 
     def _high_pass(
@@ -163,6 +167,10 @@ class Reduction:
         self._unfiltered = np.array(imgs)
         self._filter = apply
         return np.array([apply(frame) for frame in imgs])
+
+    def _in_place_of_klip(self, opd: OPDMap, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Do what the `klip_parallelized` of the patched module does."""
+        return self._klip_parallelized(opd, *args, **kwargs)
 
     def _klip_parallelized(
         self,

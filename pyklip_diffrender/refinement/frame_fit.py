@@ -91,6 +91,7 @@ class FrameFit:
         center: tuple[float, float] | None = None,
         *,
         background: bool = True,
+        source: tuple[float, float] | None = None,
     ) -> Image:
         """Render the star on another array of pixels of the same scale.
 
@@ -103,6 +104,8 @@ class FrameFit:
             of the array.
         background : bool
             Add the fitted background.
+        source : (x, y), optional
+            Render a source of the star's flux here instead, arcsec from the model's axis.
 
         Returns
         -------
@@ -119,6 +122,8 @@ class FrameFit:
             moved = np.array(center) - (np.array([nx, ny]) - 1) / 2 - old
             shift = torch.from_numpy(moved * np.array(model.detector.pixelscale))
             values["detector_shift"] = shift + values.get("detector_shift", torch.zeros(2))
+        if source is not None:
+            values["star_offset"] = torch.tensor(source, dtype=torch.float64)
         with torch.no_grad():
             image = model(torch.from_numpy(self.opd), **values).double().cpu().numpy()
         level = float(self.values["background"][0]) if background else 0.0
