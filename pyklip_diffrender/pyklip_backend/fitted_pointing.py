@@ -9,7 +9,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.pyklip_backend.pointings import Pointing
@@ -84,6 +86,29 @@ class FittedPointing:
                 "NaN", group.name, window.shape[1], window.shape[0],
             )  # fmt: skip
         return self.paste(np.asarray(self.frame.star), window)
+
+    def change_of_star(self, change: Tensor) -> Image:
+        """Change of the star, (ny, nx) of the fitted square, for changes of the unknowns.
+
+        Parameters
+        ----------
+        change : Tensor, (unknowns,)
+            Those of companions do not count.
+        """
+        linear = self.result.linear
+        assert linear is not None
+        star = torch.tensor([unknown.name != "companions" for unknown in linear.unknowns])
+        change = torch.where(star, change, 0.0)
+        return np.asarray(linear.frames[self.index].image(change[:, None])[0].numpy())
+
+    def last_step(self) -> Image:
+        """What the linear model's solution adds to the star, (Ny, Nx), NaN elsewhere.
+
+        0 for a fit without a linear model.
+        """
+        linear = self.result.linear
+        change = np.zeros(self.window.shape) if linear is None else self.change_of_star(linear.step)
+        return self.paste(change, self.window)
 
     def source(self, offset: Image, box: Window) -> Image:
         """A source with the light of the star, on the pixels of a box as they were fitted.

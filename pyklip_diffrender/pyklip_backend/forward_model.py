@@ -221,9 +221,8 @@ def _change_of_star(
         part.index: torch.from_numpy(factor * part.source(source.offset, part.window))[None]
         for part, source, factor in zip(parts, sources, factors, strict=True)
     }
-    change = result.linear.response(templates)
-    change[[unknown.name == "companions" for unknown in result.linear.unknowns]] = 0.0
-    return [result.linear.frames[part.index].image(change)[0].numpy() for part in parts]
+    change = result.linear.response(templates)[:, 0]
+    return [part.change_of_star(change) for part in parts]
 
 
 def _is_companion(result: Refinement, part: FittedPointing, source: _Source) -> bool:

@@ -22,6 +22,7 @@ from pyklip_diffrender.pyklip_backend.forward_model import (
 from pyklip_diffrender.pyklip_backend.placement import fill
 from pyklip_diffrender.pyklip_backend.reduction import Reduction
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["ForwardReduction"]
@@ -44,6 +45,17 @@ class ForwardReduction(Reduction):
 
     def _write_throughput(self, stage: Path, cards: fits.Header) -> None:
         """The forward model says how much is left of the planet."""
+
+    def _star(self, subtraction: Subtraction) -> NDArray[np.float64]:
+        """The star of the linear model's solution.
+
+        A fit ends where further steps gain less than the noise. The forward model is that of the
+        exact solution, from which the fit may differ by as much as a faint planet changes it.
+        """
+        star = subtraction.star.copy()
+        for part in subtraction.pointings:
+            star[part.pointing.frames] += np.nan_to_num(part.last_step())
+        return star
 
     def _in_place_of_klip(
         self,
@@ -82,6 +94,8 @@ class ForwardReduction(Reduction):
         fmout, perturbmag = None, None
         if is_planet(self.fm_class):
             planets, taken = self._planets(imgs.shape, parangs, wvs, np.array(center), kw["flipx"])
+            # The spline that turns frames depends on which pixels are masked.
+            planets[np.isnan(unturned[0])] = np.nan
             turned = _turned(planets, parangs, center, kw["flipx"])
             fmout = _repeated(turned.astype(unturned.dtype), hidden, count)
             perturbmag = np.repeat(taken[:, np.newaxis], count, axis=1)
