@@ -31,6 +31,7 @@ PACKAGES = (
     "detection",
     "reduction",
     "pyklip_backend",
+    "spaceklip",
     "demo",
     "plotting",
     "report",
@@ -55,6 +56,7 @@ OWNERS = {
     "poppy": "bridges",
     "pyarrow": "surveys",
     "pyklip": "pyklip_backend",
+    "spaceKLIP": "spaceklip",
     "stpsf": "bridges",
     "webbpsf": "bridges",
 }

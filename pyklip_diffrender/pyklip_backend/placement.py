@@ -55,7 +55,7 @@ def annuli_of(
     """
     from pyklip.klip import define_annuli_bounds
 
-    if not isinstance(annuli, int):
+    if np.ndim(annuli):
         inners, outers = np.array(annuli, dtype=float).reshape(-1, 2).T
         return Annuli(inners.min(), outers.max(), (outers - inners).min())
     edge = outer
