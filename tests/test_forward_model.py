@@ -118,7 +118,12 @@ def registered() -> Iterator[None]:
 
 
 def added(
-    model: OpticalSystem, truth: Image, folder: Path, flipx: bool = False, **settings: Any
+    model: OpticalSystem,
+    truth: Image,
+    folder: Path,
+    flipx: bool = False,
+    highpass: float | bool = False,
+    **settings: Any,
 ) -> tuple[Image, Image, Image, Any]:
     """What a planet adds to the product, its forward model, its own image turned, the dataset."""
     star, planet = shots(model, truth, flipx)
@@ -126,7 +131,9 @@ def added(
     for cube in (star, star + planet):
         made = dataset(cube, model, np.sqrt(star), **settings)
         made.flipx = flipx
-        of_planet, product = modelled(made, planet_psf(truth, made), folder, algo="diffrender")
+        of_planet, product = modelled(
+            made, planet_psf(truth, made), folder, algo="diffrender", highpass=highpass
+        )
         products.append(product)
     np.testing.assert_array_equal(np.isnan(of_planet), np.isnan(product))
     difference = (products[1] - products[0])[0]
@@ -136,12 +143,17 @@ def added(
     return difference, of_planet[0], np.nanmean(turned, axis=0), made
 
 
-def away(image: Image, other: Image) -> float:
-    """Root mean square of a difference about the planet, in units of that of an image."""
-    y, x = np.indices(image.shape)
+def near_planet() -> NDArray[np.bool_]:
+    """Pixels of the product about the planet."""
+    y, x = np.indices((SIDE, SIDE))
     direction = np.radians(PA)
     east, north = SEPARATION * np.sin(direction), SEPARATION * np.cos(direction)
-    near = np.hypot(x - CENTER[0] + east, y - CENTER[1] - north) < 7
+    return np.asarray(np.hypot(x - CENTER[0] + east, y - CENTER[1] - north) < 7)
+
+
+def away(image: Image, other: Image) -> float:
+    """Root mean square of a difference about the planet, in units of that of an image."""
+    near = near_planet()
     return float(np.sqrt(np.mean((image - other)[near] ** 2) / np.mean(image[near] ** 2)))
 
 
@@ -166,6 +178,20 @@ def test_the_forward_model_is_what_a_planet_adds_to_the_product(
     x = CENTER[0] - SEPARATION * np.sin(direction)
     peak = np.unravel_index(np.nanargmax(of_planet), of_planet.shape)
     np.testing.assert_allclose(peak, (CENTER[1] + SEPARATION * np.cos(direction), x), atol=1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("registered")
+def test_a_high_pass_filter_applies_to_the_forward_model(
+    model: OpticalSystem, tmp_path: Path
+) -> None:
+    difference, of_planet, _, _ = added(model, OLD.data, tmp_path, highpass=8.0)
+    plain, *_ = added(model, OLD.data, tmp_path)
+    # The user's PSF, which sets the flux, is not filtered here, so that only shapes compare.
+    near = near_planet()
+    alike = np.corrcoef([each[near] for each in (difference, of_planet, plain)])
+    assert 1 - alike[0, 1] < 0.001
+    assert 1 - alike[0, 2] > 0.003
 
 
 @pytest.mark.slow

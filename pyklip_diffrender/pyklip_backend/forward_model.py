@@ -9,7 +9,7 @@ of the fit loses nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["PlanetInFrame", "check_forward_model", "is_planet", "planet_in_frames"]
+
+Filter = Callable[[NDArray[Any]], NDArray[Any]]
 
 _APERTURE = 4.0
 """Radius in lambda/D of the circle in which the planet's image has the light of the user's PSF."""
@@ -91,6 +93,7 @@ def planet_in_frames(
     angles: NDArray[np.float64],
     wavelength: float,
     flipx: bool,
+    filtered: Filter | None = None,
 ) -> dict[int, PlanetInFrame]:
     """The forward model of a planet in all frames of one wavelength.
 
@@ -107,11 +110,13 @@ def planet_in_frames(
         As in ``dataset.wvs``.
     flipx : bool
         See `pyklip.klip.rotate`.
+    filtered : callable, optional
+        High-pass filter of a frame, which the user's PSF has been through.
 
     Returns
     -------
     dict of int to PlanetInFrame
-        By place in `frames`.
+        By place in `frames`; not filtered.
 
     Raises
     ------
@@ -124,7 +129,14 @@ def planet_in_frames(
     for result in dict.fromkeys(pointing.result for pointing in pointings):
         parts = [pointing for pointing in pointings if pointing.result is result]
         sources = [
-            _Source.of(fm_class, part, float(angles[part.pointing.frames[0]]), wavelength, flipx)
+            _Source.of(
+                fm_class,
+                part,
+                float(angles[part.pointing.frames[0]]),
+                wavelength,
+                flipx,
+                filtered,
+            )
             for part in parts
         ]
         factors = [
@@ -134,12 +146,11 @@ def planet_in_frames(
         means = [float(each.mean()) for each in factors]
         changes = _change_of_star(result, parts, sources, means)
         for part, source, factor, change in zip(parts, sources, factors, changes, strict=True):
-            image = part.paste(part.source(source.offset, part.box), part.box)
             star = np.nan_to_num(part.paste(change, part.window))
             taken = float(np.abs(change).max() / np.std(part.frame.star))
             center = part.pointing.observation.center[0]
             for frame, of_frame in zip(part.pointing.frames, factor, strict=True):
-                planets[int(frame)] = PlanetInFrame(of_frame * image - star, center, taken)
+                planets[int(frame)] = PlanetInFrame(of_frame * source.image - star, center, taken)
     return planets
 
 
@@ -151,7 +162,7 @@ def _light(fm_class: Any, frames: NDArray[np.intp], wavelength: float) -> NDArra
     return np.asarray(fm_class.dflux * conversion * spectrum[number], dtype=np.float64)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Source:
     """A planet in one pointing.
 
@@ -159,16 +170,25 @@ class _Source:
     ----------
     offset : ndarray, (2,)
         x, y in pixels from the star.
+    image : ndarray, (ny, nx)
+        It in the frames, as bright as the star; NaN where there is no model.
     scale : float
-        Light of the user's PSF over that of a source as bright as the star.
+        Light of the user's PSF over that of `image`.
     """
 
     offset: NDArray[np.float64]
+    image: NDArray[np.float64]
     scale: float
 
     @classmethod
     def of(
-        cls, fm_class: Any, part: FittedPointing, angle: float, wavelength: float, flipx: bool
+        cls,
+        fm_class: Any,
+        part: FittedPointing,
+        angle: float,
+        wavelength: float,
+        flipx: bool,
+        filtered: Filter | None,
     ) -> _Source:
         """Place the planet, and compare its image with the user's PSF at the same place."""
         direction = np.radians(90.0 + (-1 if flipx else 1) * fm_class.pa - angle)
@@ -181,29 +201,33 @@ class _Source:
                 f"fm_class: the planet is {fm_class.sep:.1f} pixels from the star, outside the "
                 f"{nx} x {ny} pixels that are fitted; give a larger fit_pixels"
             )
-        margin = max(fm_class.input_psfs.shape[-2:])
-        inside = np.s_[margin : margin + ny, margin : margin + nx]
-        shape = (ny + 2 * margin, nx + 2 * margin)
-        # pyKLIP cannot place a PSF that sticks out of its image.
+        group, margin = part.pointing.observation, max(fm_class.input_psfs.shape[-2:])
+        shape = (group.shape[0] + 2 * margin, group.shape[1] + 2 * margin)
+        # With a margin, because pyKLIP cannot place a PSF that sticks out of its image.
         (users,) = fm_class.generate_models(
             shape, np.arange(shape[0] * shape[1]), [angle], [wavelength], 0, 0, 0, 0, 0,
-            center + margin, angle, wavelength, flipx, [0],
+            group.center[0] + margin, angle, wavelength, flipx, [0],
         )  # fmt: skip
-        # Where the user's PSF ends there is exactly nothing.
-        users = users.reshape(shape)[inside]
-        rows, columns = np.indices(window.shape)
+        users = users.reshape(shape)[margin:-margin, margin:-margin]
+        image = part.paste(part.source(offset, part.box), part.box)
+        ours = np.nan_to_num(image)
+        if filtered is not None:
+            # As is the PSF that pyKLIP asks for.
+            ours = filtered(ours)
+        rows, columns = np.indices(group.shape)
+        x, y = group.center[0] + offset
         model = part.frame.model
         resolution = model.bandpass.mean_wavelength / model.diameter / ARCSEC
         radius = _APERTURE * resolution / np.sqrt(np.prod(model.detector.pixelscale))
+        # Where the user's PSF ends there is exactly nothing.
         near = (np.hypot(columns - x, rows - y) <= radius) & (users != 0)
-        ours = part.source(offset, window)
         scale = users[near].sum() / ours[near].sum() if near.any() else 0.0
         if not (np.isfinite(scale) and scale > 0):
             raise IncompatibleSetupError(
                 "fm_class: input_psfs has no light within 4 lambda/D of its middle; it must be "
                 "centred on pixel (nx // 2, ny // 2)"
             )
-        return cls(offset, float(scale))
+        return cls(offset, image, float(scale))
 
 
 def _change_of_star(

@@ -126,7 +126,13 @@ class ForwardReduction(Reduction):
         for record, wave in zip(self.records, np.unique(wvs), strict=True):
             frames = np.flatnonzero(wvs == wave)[record.frames.usable]
             planets = planet_in_frames(
-                self.fm_class, record.subtraction.pointings, frames, parangs[frames], wave, flipx
+                self.fm_class,
+                record.subtraction.pointings,
+                frames,
+                parangs[frames],
+                wave,
+                flipx,
+                self._filter,
             )
             for k, planet in planets.items():
                 fill(planet.left, record.frames.observation.valid[k])

@@ -9,7 +9,8 @@ drifted wavefronts; runs `pyklip.fm.klip_dataset` with an `FMPlanetPSF` whose po
 somewhat wrong; and fits the product with `FMAstrometry`. For the contrast (as a fraction of the
 truth) and the position (pixels) it prints the weighted mean of the differences from the truth, the
 mean and scatter of these differences in units of the errors that `FMAstrometry` gives, and how many
-are within one and two errors.
+are within one and two errors. "difference" fits the difference of the products with and without the
+planet, in which the noise cancels: only the error of the forward model is left.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import argparse
 import contextlib
 import io
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -71,16 +73,18 @@ class Trial:
         camera = dr.nircam_coronagraph("F444W", fov_pixels=SIDE, **NUMERICS)
         wave = self.measured.data + drifts[0]
         with torch.no_grad():
-            rolls = [
-                camera(wave)
-                + contrast * camera(wave, star_offset=self.place(roll, self.separation, self.angle))
+            stars = [camera(wave) for _ in ROLLS]
+            others = [camera(wave + drifts[1], star_offset=dither) for dither in DITHERS]
+            planets = [
+                contrast * camera(wave, star_offset=self.place(roll, self.separation, self.angle))
                 for roll in ROLLS
             ]
-            others = [camera(wave + drifts[1], star_offset=dither) for dither in DITHERS]
-        self.frames, self.others = (
-            rng.poisson(FLUX * np.array([each.numpy() for each in images]) + SKY).astype(float)
-            for images in (rolls, others)
+        # The planet comes with photons of its own, so that frames without it have the same noise.
+        self.empty, self.others, planet = (
+            rng.poisson(FLUX * np.array([each.numpy() for each in images]) + level).astype(float)
+            for images, level in ((stars, SKY), (others, SKY), (planets, 0.0))
         )
+        self.frames = self.empty + planet
         # As a user would make it, with the measured wavefront, at the guessed place.
         stamp = dr.nircam_coronagraph("F444W", fov_pixels=STAMP, **NUMERICS)
         source = self.place(0.0, *self.guess[:2])
@@ -98,8 +102,17 @@ class Trial:
 
     def fitted(self, mode: str, **settings: Any) -> NDArray[np.float64]:
         """Contrast, x and y (pixels) minus the truth, and their errors, (2, 3)."""
+        return self.measured_in(*self.images(self.frames, mode, **settings))
+
+    def difference(self, **settings: Any) -> NDArray[np.float64]:
+        """The same in the difference of the products with and without the planet."""
+        model, product = self.images(self.frames, "ADI", **settings)
+        return self.measured_in(model, product - self.images(self.empty, "ADI", **settings)[1])
+
+    def images(self, frames: Image, mode: str, **settings: Any) -> list[Image]:
+        """Forward model and product."""
         dataset = GenericData(
-            self.frames.copy(),
+            frames.copy(),
             np.tile(CENTER, (len(ROLLS), 1)),
             parangs=np.array(ROLLS),
             wvs=np.full(len(ROLLS), 4.44),
@@ -109,7 +122,7 @@ class Trial:
         dataset.OWA = SIDE / 2 - 1
         names = np.array([*dataset.filenames, *(f"other{k}" for k in range(len(DITHERS)))])
         library = rdi.PSFLibrary(
-            np.concatenate([self.frames, self.others]), CENTER, names, compute_correlation=True
+            np.concatenate([frames, self.others]), CENTER, names, compute_correlation=True
         )
         library.prepare_library(dataset)
         separation, angle, contrast = self.guess
@@ -136,11 +149,10 @@ class Trial:
                 subsections=1, numbasis=[5], movement=0, numthreads=1, mute_progression=True,
                 psf_library=library, aligned_center=CENTER,
             )  # fmt: skip
-            images = [
+            return [
                 fits.getdata(Path(folder) / f"x-{name}-KLmodes-all.fits")[0].astype(float)
                 for name in ("fmpsf", "klipped")
             ]
-            return self.measured_in(*images)
 
     def measured_in(self, model: Image, product: Image) -> NDArray[np.float64]:
         """What `FMAstrometry` finds, minus the truth, and its errors."""
@@ -168,17 +180,18 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=12)
     parser.add_argument("--contrast", type=float, default=4e-6)
     options = parser.parse_args()
-    methods: dict[str, tuple[str, dict[str, Any]]] = {
-        "diffrender": ("ADI", {"keep_detected": False}),
-        "diffrender, detected kept": ("ADI", {"keep_detected": True}),
-        "KLIP, RDI": ("RDI", {}),
+    methods: dict[str, Callable[[Trial], NDArray[np.float64]]] = {
+        "diffrender": lambda trial: trial.fitted("ADI", keep_detected=False),
+        "diffrender, detected kept": lambda trial: trial.fitted("ADI", keep_detected=True),
+        "diffrender, difference": lambda trial: trial.difference(keep_detected=False),
+        "KLIP, RDI": lambda trial: trial.fitted("RDI"),
     }
     results: dict[str, list[NDArray[np.float64]]] = {name: [] for name in methods}
     for seed in range(options.trials):
         trial = Trial(seed, options.contrast)
-        for name, (mode, settings) in methods.items():
+        for name, method in methods.items():
             np.random.seed(seed)  # emcee has no other way.  # noqa: NPY002
-            results[name].append(trial.fitted(mode, **settings))
+            results[name].append(method(trial))
             (contrast, x, y), errors = results[name][-1]
             print(
                 f"{seed} {name}: contrast {contrast / options.contrast:+.3f} +- "
@@ -197,7 +210,8 @@ def main() -> None:
                 f"{pulls[:, k].mean():+.2f} +- {len(pulls) ** -0.5:.2f}, scatter of pulls "
                 f"{pulls[:, k].std(ddof=1):.2f}, within 1 sigma {np.mean(abs(pulls[:, k]) < 1):.0%}"
                 f", within 2 {np.mean(abs(pulls[:, k]) < 2):.0%}, median error "
-                f"{np.median(errors[:, k]) / unit:.3f}"
+                f"{np.median(errors[:, k]) / unit:.3f}, unweighted mean "
+                f"{away[:, k].mean() / unit:+.3f}, scatter {away[:, k].std(ddof=1) / unit:.3f}"
             )
 
 
