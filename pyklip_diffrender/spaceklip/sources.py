@@ -38,7 +38,7 @@ def source_table(detection: Detection, product: Path) -> Table:
     count = len(found)
     unknown = np.full(count, np.nan)
     right_ascension, declination = _sky_errors(detection)
-    columns: dict[str, NDArray[Any] | list[str]] = {
+    columns: dict[str, NDArray[Any]] = {
         "ID": np.arange(1, count + 1),
         "RA": found["delta_ra"].value,
         "RA_ERR": right_ascension,
@@ -54,7 +54,7 @@ def source_table(detection: Detection, product: Path) -> Table:
         "LN(Z/Z0)": unknown,
         "TP_CORONMSK": unknown,
         "TP_COMSUBST": unknown,
-        "FITSFILE": [str(product)] * count,
+        "FITSFILE": np.full(count, str(product)),
     }
     return Table(columns)
 
