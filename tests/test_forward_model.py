@@ -158,7 +158,7 @@ def away(image: Image, other: Image) -> float:
 
 
 @pytest.mark.usefixtures("registered")
-@pytest.mark.parametrize("flipx", [False, True])
+@pytest.mark.parametrize("flipx", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_forward_model_is_what_a_planet_adds_to_the_product(
     flipx: bool, model: OpticalSystem, tmp_path: Path
 ) -> None:

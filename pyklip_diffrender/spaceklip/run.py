@@ -132,7 +132,8 @@ def run_obs(
         for key, detection in detections.items():
             _store(database, products[key], source_table(detection, products[key]))
     if failures:
-        raise ExceptionGroup(f"{len(failures)} concatenations failed", failures)
+        tried = len(failures) + len(detections)
+        raise ExceptionGroup(f"{len(failures)} of {tried} concatenations failed", failures)
     return detections
 
 
