@@ -32,6 +32,7 @@ PACKAGES = (
     "detection",
     "reduction",
     "pyklip_backend",
+    "spaceklip",
     "demo",
     "plotting",
     "report",
@@ -57,6 +58,7 @@ OWNERS = {
     "poppy": "bridges",
     "pyarrow": "surveys",
     "pyklip": "pyklip_backend",
+    "spaceKLIP": "spaceklip",
     "stpsf": "bridges",
     "webbpsf": "bridges",
 }

@@ -26,7 +26,6 @@ from backend_scene import (
     render,
 )
 from pyklip import fm, parallelized, rdi
-from pyklip.fmlib.nofm import NoFM
 from pyklip.klip import high_pass_filter
 
 # As a script does it, long before the plugin is imported.
@@ -467,7 +466,7 @@ def test_klip_on_a_dataset_that_was_reduced_here_says_so_once(
         with pytest.warns(DiffrenderWarning), pytest.raises(AttributeError):
             fm.klip_dataset(dataset, None, numbasis=[1], mode="RDI")
         register(replace=True)
-        with pytest.raises(IncompatibleSetupError, match="not supported by diffrender"):
+        with pytest.raises(IncompatibleSetupError, match="NoneType is not supported by diffrender"):
             fm.klip_dataset(dataset, None)
     finally:
         unregister()
@@ -637,33 +636,6 @@ def test_one_model_for_several_wavelengths_is_refused(imgs: np.ndarray, tmp_path
 def test_no_filter_and_no_model(imgs: np.ndarray, tmp_path: Path) -> None:
     with pytest.raises(IncompatibleSetupError, match="through which filter"), backend(opd=OPD):
         reduce(generic(imgs, ANGLES), tmp_path)
-
-
-def test_forward_modelling_is_refused_here_and_unchanged_elsewhere(
-    imgs: np.ndarray, tmp_path: Path
-) -> None:
-    def run() -> np.ndarray:
-        dataset = generic(imgs, ANGLES)
-        fm.klip_dataset(
-            dataset, NoFM(dataset.input.shape, np.array([1])), mode="ADI", annuli=1,
-            subsections=1, numbasis=[1], movement=0, numthreads=1, outputdir=str(tmp_path),
-            mute_progression=True,
-        )  # fmt: skip
-        return np.asarray(dataset.output)
-
-    expected = run()
-    assert np.isfinite(expected).any()
-    with backend(opd=OPD), pytest.raises(IncompatibleSetupError, match="not supported by diffren"):
-        run()
-    register(opd=OPD)
-    try:
-        np.testing.assert_array_equal(run(), expected)
-        with pytest.raises(IncompatibleSetupError, match="not supported by diffrender yet"):
-            fm.klip_dataset(None, None, algo="diffrender")
-        with pytest.raises(TypeError, match="algo"):
-            fm.klip_dataset(None, None, algo="klip")
-    finally:
-        unregister()
 
 
 # Observations

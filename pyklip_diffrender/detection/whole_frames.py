@@ -84,15 +84,12 @@ class WholeFrame:
     @cached_property
     def stars(self) -> Image:
         """Image of the star and of the candidates, without background, (ny, nx)."""
-        image = self.fit.render(self.observation.shape, self._center, background=False)
-        model, values = self.fit.on_pixels(self.observation.shape, self._center)
-        star = values.get("star_offset", torch.zeros(2, dtype=torch.float64))
-        opd = torch.from_numpy(np.ascontiguousarray(self.fit.opd))
+        shape, center = self.observation.shape, self._center
+        image = self.fit.render(shape, center, background=False)
+        star = self.fit.values.get("star_offset", np.zeros(2))
         for contrast, *offset in self.candidates:
-            values["star_offset"] = star + torch.from_numpy(self._turn @ offset)
-            with torch.no_grad():
-                source = model(opd, **values).double().cpu().numpy()
-            image += contrast * self.fit.flux * source
+            x, y = star + self._turn @ offset
+            image += contrast * self.fit.render(shape, center, background=False, source=(x, y))
         return image
 
     @cached_property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +36,7 @@ def annuli_of(
     centers: NDArray[Any],
     inner: float,
     outer: float | None,
-    annuli: int,
+    annuli: int | Sequence[tuple[float, float]],
     spacing: str,
 ) -> Annuli:
     """Find the annuli of frames (n, ny, nx) by pyKLIP's rules.
@@ -47,13 +48,16 @@ def annuli_of(
         Star centres x, y.
     inner, outer : float
         IWA and OWA in pixels; `outer` is None for the whole image.
-    annuli : int
-        Number of annuli.
+    annuli : int or sequence of (inner, outer)
+        Number of annuli, or their radii in pixels.
     spacing : str
         "constant", "log" or "linear".
     """
     from pyklip.klip import define_annuli_bounds
 
+    if np.ndim(annuli):
+        inners, outers = np.array(annuli, dtype=float).reshape(-1, 2).T
+        return Annuli(inners.min(), outers.max(), (outers - inners).min())
     edge = outer
     if edge is None:
         y, x = np.indices(imgs.shape[1:])

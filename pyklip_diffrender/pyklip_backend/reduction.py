@@ -41,7 +41,7 @@ from pyklip_diffrender.pyklip_backend.products import (
 )
 from pyklip_diffrender.pyklip_backend.references import References, library_files
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
-from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
+from pyklip_diffrender.pyklip_backend.subtract import Subtraction, subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.throughput import (
     on_product,
     throughput_map,
@@ -98,7 +98,7 @@ class Reduction:
         before = dict(vars(self.dataset))
 
         def subtract(*args: Any, **kwargs: Any) -> tuple[Any, ...]:
-            return self._klip_parallelized(opd, *args, **kwargs)
+            return self._in_place_of_klip(opd, *args, **kwargs)
 
         reduce = klip_dataset(
             klip_parallelized=subtract,
@@ -144,11 +144,15 @@ class Reduction:
             return ()
         return library_files(self.dataset, library)
 
+    @property
+    def _verbose(self) -> bool:
+        return bool(self.arguments["verbose"])
+
     def _tell(self, line: str) -> None:
         """Say what is being done, as pyKLIP does."""
         logger.info(line)
         # Its verbose=True prints, and whoever asks for it has no handler for our log.
-        if self.arguments["verbose"]:
+        if self._verbose:
             print(f"diffrender: {line}", flush=True)
 
     def _high_pass(
@@ -163,6 +167,10 @@ class Reduction:
         self._unfiltered = np.array(imgs)
         self._filter = apply
         return np.array([apply(frame) for frame in imgs])
+
+    def _in_place_of_klip(self, opd: OPDMap, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Do what the `klip_parallelized` of the patched module does."""
+        return self._klip_parallelized(opd, *args, **kwargs)
 
     def _klip_parallelized(
         self,
@@ -287,7 +295,7 @@ class Reduction:
             raise ShapeError(
                 f"star: got shape {subtraction.star.shape}, expected {frames.data.shape}"
             )
-        residuals = frames.data - subtraction.star
+        residuals = frames.data - self._star(subtraction)
         lost = ~np.any(np.isfinite(residuals) & observation.valid, axis=(1, 2))
         if lost.any():
             raise RefinementError(
@@ -300,6 +308,10 @@ class Reduction:
         if self._filter is not None:
             residuals = np.array([self._filter(residual) for residual in residuals])
         return residuals
+
+    def _star(self, subtraction: Subtraction) -> NDArray[np.float64]:
+        """What is subtracted from the frames, (m, ny, nx)."""
+        return subtraction.star
 
 
 def mark_filtered(dataset: Any) -> None:

@@ -18,6 +18,7 @@ from contextvars import ContextVar
 from typing import Any
 
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.pyklip_backend.forward_reduction import ForwardReduction
 from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
 from pyklip_diffrender.pyklip_backend.products import ReductionRecord
 from pyklip_diffrender.pyklip_backend.reduction import RESULTS, Reduction, mark_filtered
@@ -55,7 +56,9 @@ class _Patches:
             _klip_dataset,
             ("klip_parallelized", "klip_parallelized_lite", "high_pass_filter_imgs"),
         )
-        self.fm_klip_dataset = PatchedFunction(fm.klip_dataset, _fm_klip_dataset, ())
+        self.fm_klip_dataset = PatchedFunction(
+            fm.klip_dataset, _fm_klip_dataset, ("klip_parallelized", "high_pass_filter_imgs")
+        )
         self._all: list[PatchedFunction | PatchedMethod] = [self.klip_dataset, self.fm_klip_dataset]
         try:
             from pyklip.instruments.JWST import JWSTData
@@ -248,6 +251,12 @@ def _patches() -> _Patches:
     return patches
 
 
+def _settings_for(dataset: Any) -> DiffrenderSettings:
+    """The settings of the enclosing blocks, of the dataset and of `register`, merged."""
+    settings, _ = _block.get()
+    return settings.over(settings_of(dataset)).over(_registry.defaults)
+
+
 def dispatch(*args: Any, **kwargs: Any) -> None:
     """Handle a call of `pyklip.parallelized.klip_dataset`: with this backend or pyKLIP's code."""
     klip_dataset = _patches().klip_dataset
@@ -260,8 +269,7 @@ def dispatch(*args: Any, **kwargs: Any) -> None:
     call.apply_defaults()
     arguments = call.arguments
     if _is_ours(arguments["algo"]):
-        settings, _ = _block.get()
-        settings = settings.over(settings_of(arguments["dataset"])).over(_registry.defaults)
+        settings = _settings_for(arguments["dataset"])
         Reduction(arguments, settings).run(klip_dataset.original)
     else:
         if str(arguments["algo"]).lower() == "klip":
@@ -272,22 +280,19 @@ def dispatch(*args: Any, **kwargs: Any) -> None:
 
 
 def dispatch_fm(*args: Any, **kwargs: Any) -> Any:
-    """Handle a call of `pyklip.fm.klip_dataset`, which has no argument `algo`.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If it is for this backend, to which a model of KLIP's over-subtraction does not apply.
-    """
-    if _is_ours(kwargs.get("algo", "klip")):
-        raise IncompatibleSetupError(
-            "pyklip.fm.klip_dataset is not supported by diffrender yet: it models how KLIP "
-            "subtracts a companion from itself. For KLIP, call it outside the backend block, "
-            "without algo='diffrender' and without register(replace=True). For positions and "
-            "contrasts use pyklip_diffrender.detect on the fits, see diffrender_results"
-        )
-    _warn_of_klip(args[0] if args else kwargs.get("dataset"), "pyklip.fm.klip_dataset")
-    return _patches().fm_klip_dataset.original()(*args, **kwargs)
+    """Handle a call of `pyklip.fm.klip_dataset`, to which this package adds an argument `algo`."""
+    klip_dataset = _patches().fm_klip_dataset
+    if not _is_ours(kwargs.get("algo", "klip")):
+        _warn_of_klip(args[0] if args else kwargs.get("dataset"), "pyklip.fm.klip_dataset")
+        return klip_dataset.original()(*args, **kwargs)
+    kwargs.pop("algo", None)
+    call = klip_dataset.signature.bind(*args, **kwargs)
+    call.apply_defaults()
+    dataset = call.arguments["dataset"]
+    ForwardReduction(call.arguments, _settings_for(dataset)).run(klip_dataset.original)
+    if call.arguments["highpass"] not in (False, None):
+        mark_filtered(dataset)
+    return None
 
 
 def _klip_dataset(*args, **kwargs):  # type: ignore[no-untyped-def]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 from pyklip_diffrender.pyklip_backend.pointings import Pointing, pointings_of
 from pyklip_diffrender.pyklip_backend.references import References, pattern_for
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
@@ -21,14 +21,13 @@ from pyklip_diffrender.pyklip_backend.verdict import (
     warn_of_status,
 )
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
-from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:
     from pyklip_diffrender.optics.system import OpticalSystem
-    from pyklip_diffrender.refinement import FrameFit, Refinement
+    from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["FIT_PIXELS", "Fit", "Subtraction", "Subtractor", "subtract_by_refinement"]
 
@@ -81,6 +80,8 @@ class Subtraction:
         The pattern of the model's error that was used, in words.
     references : int
         Number of frames of reference stars that were used.
+    pointings : tuple of FittedPointing
+        The parts of the fits, one for each pointing; empty for other subtractors.
     """
 
     star: NDArray[np.float64]
@@ -89,6 +90,7 @@ class Subtraction:
     fits: tuple[Fit, ...]
     systematics: str = "none"
     references: int = 0
+    pointings: tuple[FittedPointing, ...] = ()
 
     @property
     def worst(self) -> Fit:
@@ -198,19 +200,26 @@ def subtract_by_refinement(
     if (observation.is_nircam and not adam) if keep is None else keep:
         results = _with_companions(results, tell)
     star = np.full(observation.data.shape, np.nan)
-    fits = []
+    fits, fitted = [], []
     for chosen, result in zip(together, results, strict=True):
         # It may have been refined again with companions.
         require_plausible(cut[chosen[0]].name, result, settings.max_chi2)
         warn_of_status(cut[chosen[0]].name, result)
-        for k, frame in zip(chosen, result.frames, strict=True):
-            away = frame.observation.center[0] - cut[k].center[0]
-            star[groups[k].frames] = _star_everywhere(result, frame, groups[k], windows[k], away)
+        for place, k in enumerate(chosen):
+            away = result.frames[place].observation.center[0] - cut[k].center[0]
+            fitted.append(FittedPointing(result, place, groups[k], windows[k], away))
+            star[groups[k].frames] = fitted[-1].star()
         frames = np.sort(np.concatenate([groups[k].frames for k in chosen]))
         status = result.status.name.lower()
         fits.append(Fit(tuple(map(int, frames)), status, float(result.chi2_per_pixel), result))
     return Subtraction(
-        star, results[0].method, seed, tuple(fits), pattern.label, pattern.reference_frames
+        star,
+        results[0].method,
+        seed,
+        tuple(fits),
+        pattern.label,
+        pattern.reference_frames,
+        tuple(fitted),
     )
 
 
@@ -240,55 +249,6 @@ def _with_companions(results: list[Refinement], tell: Callable[[str], None]) -> 
     results = with_companions(results, detection.candidates)
     tell(_described(results[0]))
     return results
-
-
-def _star_everywhere(
-    result: Refinement,
-    frame: FrameFit,
-    pointing: Pointing,
-    window: Window,
-    away: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """The star over all valid pixels of the frames, (ny, nx), NaN elsewhere.
-
-    The fitted wavefront is rendered on a larger detector. A model whose field of view cannot be
-    changed covers the fitted square only.
-
-    Parameters
-    ----------
-    result : Refinement
-    frame : FrameFit
-        The part of the result for this pointing.
-    pointing : Pointing
-    window : Window
-        The fitted square.
-    away : ndarray, (2,)
-        x, y in pixels by which the fitted frames were moved onto the pixels of the detector.
-    """
-    group, box = pointing.observation, extent(pointing.observation)
-    moved = bool(np.abs(away).max() > 0)
-    if box not in window and "fov_pixels" in result.model.adjustable:
-        x, y = group.center[0] + away - (box.x, box.y)
-        star = frame.render(fov_pixels=box.shape, center=(x, y), background=False)
-        if result.systematics is not None:
-            origin = frame.observation.first_pixel
-            if origin is not None:
-                origin = (origin[0] - window.x, origin[1] - window.y)
-            pixels = box.of(
-                dataclasses.replace(group, center=group.center + away, first_pixel=origin)
-            )
-            star = star * (1 + result.systematics.at(pixels)[0])
-        place, star = box, star + float(frame.values["background"][0])
-    else:
-        if box not in window:
-            logger.warning(
-                "%s: the model's field of view cannot be changed; pixels outside its %d x %d are "
-                "NaN", group.name, window.shape[1], window.shape[0],
-            )  # fmt: skip
-        place, star = window, np.asarray(frame.star)
-    if moved:
-        star = shift_frames(star[np.newaxis], -away[np.newaxis])[0]
-    return place.paste(star, group.shape)
 
 
 def model_of(observation: Observation, settings: DiffrenderSettings) -> OpticalSystem:

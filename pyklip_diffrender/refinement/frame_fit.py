@@ -91,6 +91,7 @@ class FrameFit:
         center: tuple[float, float] | None = None,
         *,
         background: bool = True,
+        source: tuple[float, float] | None = None,
     ) -> Image:
         """Render the star on another array of pixels of the same scale.
 
@@ -103,6 +104,8 @@ class FrameFit:
             of the array.
         background : bool
             Add the fitted background.
+        source : (x, y), optional
+            Render a source of the star's flux here instead, arcsec from the model's axis.
 
         Returns
         -------
@@ -110,6 +113,8 @@ class FrameFit:
             In the unit of the observation, without the pattern of the model's error.
         """
         model, values = self.on_pixels(fov_pixels, center)
+        if source is not None:
+            values["star_offset"] = torch.tensor(source, dtype=torch.float64)
         with torch.no_grad():
             image = model(torch.from_numpy(self.opd), **values).double().cpu().numpy()
         level = float(self.values["background"][0]) if background else 0.0

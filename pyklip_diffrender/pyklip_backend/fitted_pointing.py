@@ -1,0 +1,150 @@
+"""One pointing of a fit: the star, and other sources, on the pixels of its frames."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.pyklip_backend.pointings import Pointing
+from pyklip_diffrender.pyklip_backend.windows import Window, extent
+from pyklip_diffrender.scene.detector_pixels import shift_frames
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.refinement import FrameFit, Refinement
+
+__all__ = ["FittedPointing"]
+
+logger = logging.getLogger(__name__)
+
+Image = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FittedPointing:
+    """The part of a fit that belongs to one pointing.
+
+    Attributes
+    ----------
+    result : Refinement
+    index : int
+        Place of the pointing among the frames of the fit.
+    pointing : Pointing
+    window : Window
+        The fitted square.
+    away : ndarray, (2,)
+        x, y in pixels by which the fitted frames were moved onto the pixels of the detector.
+    """
+
+    result: Refinement
+    index: int
+    pointing: Pointing
+    window: Window
+    away: Image
+
+    @property
+    def frame(self) -> FrameFit:
+        """The star in the frames of the pointing."""
+        return self.result.frames[self.index]
+
+    @cached_property
+    def box(self) -> Window:
+        """What can be rendered: all valid pixels of the frames, or the fitted square only.
+
+        The fitted wavefront is rendered on a larger detector if the model's field of view can be
+        changed.
+        """
+        box = extent(self.pointing.observation)
+        adjustable = "fov_pixels" in self.result.model.adjustable
+        return box if box not in self.window and adjustable else self.window
+
+    def star(self) -> Image:
+        """The star over all pixels that can be rendered, (ny, nx), NaN elsewhere."""
+        group, window, box = self.pointing.observation, self.window, self.box
+        if box is not window:
+            star = self._rendered(box, None)
+            if self.result.systematics is not None:
+                origin = self.frame.observation.first_pixel
+                if origin is not None:
+                    origin = (origin[0] - window.x, origin[1] - window.y)
+                pixels = box.of(
+                    dataclasses.replace(group, center=group.center + self.away, first_pixel=origin)
+                )
+                star = star * (1 + self.result.systematics.at(pixels)[0])
+            return self.paste(star + float(self.frame.values["background"][0]), box)
+        if extent(group) not in window:
+            logger.warning(
+                "%s: the model's field of view cannot be changed; pixels outside its %d x %d are "
+                "NaN", group.name, window.shape[1], window.shape[0],
+            )  # fmt: skip
+        return self.paste(np.asarray(self.frame.star), window)
+
+    def change_of_star(self, change: Tensor) -> Image:
+        """Change of the star, (ny, nx) of the fitted square, for changes of the unknowns.
+
+        Parameters
+        ----------
+        change : Tensor, (unknowns,)
+            Those of companions do not count.
+        """
+        linear = self.result.linear
+        assert linear is not None
+        star = torch.tensor([unknown.name != "companions" for unknown in linear.unknowns])
+        change = torch.where(star, change, 0.0)
+        return np.asarray(linear.frames[self.index].image(change[:, None])[0].numpy())
+
+    def last_step(self) -> Image:
+        """What the linear model's solution adds to the star, (Ny, Nx), NaN elsewhere.
+
+        0 for a fit without a linear model.
+        """
+        linear = self.result.linear
+        change = np.zeros(self.window.shape) if linear is None else self.change_of_star(linear.step)
+        return self.paste(change, self.window)
+
+    def source(self, offset: Image, box: Window) -> Image:
+        """A source with the light of the star, on the pixels of a box as they were fitted.
+
+        Parameters
+        ----------
+        offset : ndarray, (2,)
+            x, y in pixels from the star's place in the header.
+        box : Window
+
+        Returns
+        -------
+        ndarray, (ny, nx)
+        """
+        return self._rendered(box, self.position(offset))
+
+    def position(self, offset: Image) -> tuple[float, float]:
+        """Position on the model's axes, arcsec, of a place in pixels from the header's star."""
+        detector = self.frame.model.detector
+        place = self.frame.observation.center[0] + offset
+        x, y = (
+            float(axis[: detector.oversample].mean()) / ARCSEC + pixels * scale
+            for axis, pixels, scale in zip(
+                detector.axes(self.frame.optical_values), place, detector.pixelscale, strict=True
+            )
+        )
+        return x, y + detector.shear * x
+
+    def _rendered(self, box: Window, source: tuple[float, float] | None) -> Image:
+        x, y = self.pointing.observation.center[0] + self.away - (box.x, box.y)
+        return self.frame.render(
+            fov_pixels=box.shape, center=(x, y), background=False, source=source
+        )
+
+    def paste(self, image: Image, box: Window) -> Image:
+        """Move an image of a box back to where the frames have it: (Ny, Nx), NaN elsewhere."""
+        if np.abs(self.away).max() > 0:
+            image = shift_frames(image[np.newaxis], -self.away[np.newaxis])[0]
+        return box.paste(image, self.pointing.observation.shape)

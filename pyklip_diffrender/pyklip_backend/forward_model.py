@@ -1,0 +1,260 @@
+"""A planet's image as the subtraction leaves it: the forward model of `pyklip.fm`.
+
+A planet adds its image p to the data. To first order in its light, the unknowns of the fit change
+by H^-1 G p (see `linear.model`), and the star by the image s of that change, so that p - s is left
+in the subtracted frames. Companions of the fit are unknowns too, but their light stays in the
+frames: what they take of the planet's light is not subtracted. A planet that itself is a companion
+of the fit loses nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
+from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.refinement import Refinement
+
+__all__ = ["PlanetInFrame", "check_forward_model", "is_planet", "planet_in_frames"]
+
+Filter = Callable[[NDArray[Any]], NDArray[Any]]
+
+_APERTURE = 4.0
+"""Radius in lambda/D of the circle in which the planet's image has the light of the user's PSF."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanetInFrame:
+    """The planet in one frame, with the star's fit.
+
+    Attributes
+    ----------
+    left : ndarray, (ny, nx)
+        Forward model on the pixels of the frame; NaN where there is no model.
+    center : ndarray, (2,)
+        x, y of the star in the frame.
+    taken : float
+        Largest change of the star because of the planet over the standard deviation of the star.
+    """
+
+    left: NDArray[np.float64]
+    center: NDArray[np.float64]
+    taken: float
+
+
+def is_planet(fm_class: Any) -> bool:
+    """Whether an object of `pyklip.fmlib` models the image of a planet."""
+    from pyklip.fmlib.fmpsf import FMPlanetPSF
+
+    return isinstance(fm_class, FMPlanetPSF)
+
+
+def check_forward_model(fm_class: Any, settings: DiffrenderSettings) -> None:
+    """Raise for an object of `pyklip.fmlib` that is not supported with these settings.
+
+    Raises
+    ------
+    IncompatibleSetupError
+    """
+    from pyklip.fmlib.nofm import NoFM
+
+    from pyklip_diffrender.refinement import Adam
+
+    if type(fm_class) is NoFM:
+        return
+    if not is_planet(fm_class):
+        raise IncompatibleSetupError(
+            f"fm_class: {type(fm_class).__name__} is not supported by diffrender, only "
+            "pyklip.fmlib.fmpsf.FMPlanetPSF and NoFM are. It models how KLIP subtracts a source "
+            "from itself. For KLIP, call pyklip.fm.klip_dataset outside the backend block, without "
+            "algo='diffrender' and without register(replace=True)"
+        )
+    if settings.subtractor is not None or isinstance(settings.fit, Adam):
+        raise IncompatibleSetupError(
+            "fm_class: the forward model of a planet needs the linear model of a fit by "
+            "GaussNewton, which a subtractor of your own and the Adam recipe do not have"
+        )
+
+
+def planet_in_frames(
+    fm_class: Any,
+    pointings: Sequence[FittedPointing],
+    frames: NDArray[np.intp],
+    angles: NDArray[np.float64],
+    wavelength: float,
+    flipx: bool,
+    filtered: Filter | None = None,
+) -> dict[int, PlanetInFrame]:
+    """The forward model of a planet in all frames of one wavelength.
+
+    Parameters
+    ----------
+    fm_class : pyklip.fmlib.fmpsf.FMPlanetPSF
+        The planet: separation in pixels, position angle, flux, and the user's PSF.
+    pointings : sequence of FittedPointing
+    frames : ndarray of int
+        Indices in the dataset of the fitted frames.
+    angles : ndarray
+        Angles in degrees by which pyKLIP turns the frames counter-clockwise.
+    wavelength : float
+        As in ``dataset.wvs``.
+    flipx : bool
+        See `pyklip.klip.rotate`.
+    filtered : callable, optional
+        High-pass filter of a frame, which the user's PSF has been through.
+
+    Returns
+    -------
+    dict of int to PlanetInFrame
+        By place in `frames`; not filtered.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If the planet is outside the frames, or the user's PSF has no light.
+    RefinementError
+        If a fit has no linear model.
+    """
+    planets = {}
+    for result in dict.fromkeys(pointing.result for pointing in pointings):
+        parts = [pointing for pointing in pointings if pointing.result is result]
+        sources = [
+            _Source.of(
+                fm_class,
+                part,
+                float(angles[part.pointing.frames[0]]),
+                wavelength,
+                flipx,
+                filtered,
+            )
+            for part in parts
+        ]
+        factors = [
+            _light(fm_class, frames[part.pointing.frames], wavelength) * source.scale
+            for part, source in zip(parts, sources, strict=True)
+        ]
+        means = [float(each.mean()) for each in factors]
+        changes = _change_of_star(result, parts, sources, means)
+        for part, source, factor, change in zip(parts, sources, factors, changes, strict=True):
+            star = np.nan_to_num(part.paste(change, part.window))
+            taken = float(np.abs(change).max() / np.std(part.frame.star))
+            center = part.pointing.observation.center[0]
+            for frame, of_frame in zip(part.pointing.frames, factor, strict=True):
+                planets[int(frame)] = PlanetInFrame(of_frame * source.image - star, center, taken)
+    return planets
+
+
+def _light(fm_class: Any, frames: NDArray[np.intp], wavelength: float) -> NDArray[np.float64]:
+    """Factor of the user's PSF in every frame, as `FMPlanetPSF` computes it."""
+    spectrum = np.ravel(fm_class.spectrallib[0])
+    number = np.abs(np.ravel(fm_class.input_psfs_wvs) - wavelength).argmin()
+    conversion = np.asarray(fm_class.flux_conversion, dtype=float)[frames]
+    return np.asarray(fm_class.dflux * conversion * spectrum[number], dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """A planet in one pointing.
+
+    Attributes
+    ----------
+    offset : ndarray, (2,)
+        x, y in pixels from the star.
+    image : ndarray, (ny, nx)
+        It in the frames, as bright as the star; NaN where there is no model.
+    scale : float
+        Light of the user's PSF over that of `image`.
+    """
+
+    offset: NDArray[np.float64]
+    image: NDArray[np.float64]
+    scale: float
+
+    @classmethod
+    def of(
+        cls,
+        fm_class: Any,
+        part: FittedPointing,
+        angle: float,
+        wavelength: float,
+        flipx: bool,
+        filtered: Filter | None,
+    ) -> _Source:
+        """Place the planet, and compare its image with the user's PSF at the same place."""
+        direction = np.radians(90.0 + (-1 if flipx else 1) * fm_class.pa - angle)
+        offset = fm_class.sep * np.array([np.cos(direction), np.sin(direction)])
+        window, center = part.window, part.frame.observation.center[0]
+        ny, nx = window.shape
+        x, y = center + offset
+        if not (-0.5 < x < nx - 0.5 and -0.5 < y < ny - 0.5):
+            raise IncompatibleSetupError(
+                f"fm_class: the planet is {fm_class.sep:.1f} pixels from the star, outside the "
+                f"{nx} x {ny} pixels that are fitted; give a larger fit_pixels"
+            )
+        group, margin = part.pointing.observation, max(fm_class.input_psfs.shape[-2:])
+        shape = (group.shape[0] + 2 * margin, group.shape[1] + 2 * margin)
+        # With a margin, because pyKLIP cannot place a PSF that sticks out of its image.
+        (users,) = fm_class.generate_models(
+            shape, np.arange(shape[0] * shape[1]), [angle], [wavelength], 0, 0, 0, 0, 0,
+            group.center[0] + margin, angle, wavelength, flipx, [0],
+        )  # fmt: skip
+        users = users.reshape(shape)[margin:-margin, margin:-margin]
+        image = part.paste(part.source(offset, part.box), part.box)
+        ours = np.nan_to_num(image)
+        if filtered is not None:
+            # As is the PSF that pyKLIP asks for.
+            ours = filtered(ours)
+        rows, columns = np.indices(group.shape)
+        x, y = group.center[0] + offset
+        model = part.frame.model
+        resolution = model.bandpass.mean_wavelength / model.diameter / ARCSEC
+        radius = _APERTURE * resolution / np.sqrt(np.prod(model.detector.pixelscale))
+        # Where the user's PSF ends there is exactly nothing.
+        near = (np.hypot(columns - x, rows - y) <= radius) & (users != 0)
+        scale = users[near].sum() / ours[near].sum() if near.any() else 0.0
+        if not (np.isfinite(scale) and scale > 0):
+            raise IncompatibleSetupError(
+                "fm_class: input_psfs has no light within 4 lambda/D of its middle; it must be "
+                "centred on pixel (nx // 2, ny // 2)"
+            )
+        return cls(offset, image, float(scale))
+
+
+def _change_of_star(
+    result: Refinement,
+    parts: Sequence[FittedPointing],
+    sources: Sequence[_Source],
+    factors: Sequence[float],
+) -> list[NDArray[np.float64]]:
+    """Light of the planet that the fit takes for star, on the fitted square of every pointing."""
+    if result.linear is None:
+        raise RefinementError("fm_class: the fit has no linear model", result)
+    if _is_companion(result, parts[0], sources[0]):
+        return [np.zeros(part.window.shape) for part in parts]
+    templates = {
+        part.index: torch.from_numpy(factor * part.source(source.offset, part.window))[None]
+        for part, source, factor in zip(parts, sources, factors, strict=True)
+    }
+    change = result.linear.response(templates)[:, 0]
+    return [part.change_of_star(change) for part in parts]
+
+
+def _is_companion(result: Refinement, part: FittedPointing, source: _Source) -> bool:
+    """Whether the planet is one of the companions of the fit, within lambda/D."""
+    if not len(result.companions):
+        return False
+    # Companions are relative to the fitted star in the first frame, as are the parts.
+    star = part.frame.optical_values.get("star_offset", torch.zeros(2))
+    offset = np.subtract(part.position(source.offset), star.cpu().numpy())
+    resolution = part.frame.model.bandpass.mean_wavelength / part.frame.model.diameter / ARCSEC
+    return bool((np.hypot(*(result.companions[:, 1:] - offset).T) < resolution).any())

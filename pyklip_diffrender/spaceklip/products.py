@@ -1,0 +1,113 @@
+"""Files of a reduction where spaceKLIP looks for them, and in its form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table
+
+from pyklip_diffrender.detection import Detection
+from pyklip_diffrender.io.files import write_fits
+from pyklip_diffrender.pyklip_backend.throughput import on_product
+
+__all__ = ["complete_header", "write_contrast", "write_database", "write_mask", "write_snr"]
+
+_COLUMNS = (
+    "TELESCOP", "TARGPROP", "TARG_RA", "TARG_DEC", "INSTRUME", "DETECTOR", "FILTER", "CWAVEL",
+    "DWAVEL", "PUPIL", "CORONMSK", "EXP_TYPE", "EFFINTTM", "SUBARRAY", "APERNAME", "PPS_APER",
+    "PIXSCALE", "PIXAR_SR", "BUNIT", "BLURFWHM",
+)  # fmt: skip
+"""Columns of the database that spaceKLIP reads from the header of a product."""
+
+
+def complete_header(product: Path, table: Table, mode: str) -> None:
+    """Add the keywords of spaceKLIP's products, and a WCS, to the header of a product.
+
+    Parameters
+    ----------
+    product : path
+        Its pixels are turned to north.
+    table : Table
+        The concatenation.
+    mode : str
+        Subtraction mode, such as "ADI+RDI".
+    """
+    science = table[np.array(table["TYPE"], dtype=str) == "SCI"]
+    frame = fits.getheader(science["FITSFILE"][0], "SCI")
+    with fits.open(product, mode="update", memmap=False) as hdus:
+        header = hdus[0].header
+        for name in _COLUMNS:
+            value = science[name][0] if name in science.colnames else np.nan
+            # FITS has no NaN in headers; spaceKLIP takes a missing keyword for one.
+            if isinstance(value, str) or np.isfinite(value):
+                header[name] = value.item() if isinstance(value, np.generic) else value
+        header["EXPSTART"] = float(np.min(science["EXPSTART"]))
+        header["NINTS"] = int(np.sum(science["NINTS"]))
+        header["MODE"], header["ANNULI"], header["SUBSECTS"] = mode, 1, 1
+        degrees = float(science["PIXSCALE"][0]) / 3600
+        header["WCSAXES"] = 2
+        for axis, (name, sign) in enumerate((("RA---TAN", -1), ("DEC--TAN", 1)), 1):
+            header[f"CTYPE{axis}"], header[f"CUNIT{axis}"] = name, "deg"
+            header[f"CRPIX{axis}"] = header["PSFCENTX" if axis == 1 else "PSFCENTY"] + 1
+            header[f"CRVAL{axis}"] = frame[f"CRVAL{axis}"]
+            for other in (1, 2):
+                header[f"CD{axis}_{other}"] = sign * degrees if other == axis else 0.0
+
+
+def write_snr(path: Path, detection: Detection, product: Path) -> None:
+    """Write the S/N map on the pixels of a product, turned to north, with its header."""
+    header = fits.getheader(product)
+    shape = (header["NAXIS2"], header["NAXIS1"])
+    turned = on_product(
+        detection.snr,
+        detection.observation.center[0],
+        shape,
+        np.array([header["PSFCENTX"], header["PSFCENTY"]]),
+        detection.north,
+    )
+    header["BUNIT"] = ("", "S/N of a point source")
+    write_fits(fits.HDUList([fits.PrimaryHDU(turned.astype(np.float32), header)]), path)
+
+
+def write_contrast(product: Path, detection: Detection) -> None:
+    """Write the 5-sigma contrast curve in the arrays of spaceKLIP's calibrated curves.
+
+    Separations (arcsec) and contrasts are (1, n), as for one number of KL modes. They include the
+    throughput of the coronagraph and of the subtraction, and the small-sample correction.
+    """
+    curve = detection.contrast_curve
+    stem = str(product).removesuffix(".fits")
+    np.save(f"{stem}_cal_seps.npy", curve["separation"].value[np.newaxis])
+    for name in ("cons", "maskcons"):
+        np.save(f"{stem}_cal_{name}.npy", np.asarray(curve["small_sample"])[np.newaxis])
+
+
+def write_database(path: Path, table: Table) -> None:
+    """Write the concatenation in the text format from which spaceKLIP reads it."""
+    text = table.copy()
+    for name in text.colnames:
+        if text[name].dtype == object:
+            text[name] = [
+                str(getattr(value, "tolist", lambda v=value: v)()) for value in text[name]
+            ]
+    text.write(path, format="ascii", overwrite=True)
+
+
+def write_mask(path: Path, table: Table) -> None:
+    """Write the transmission of the mask, turned to north, if the database has the rolls' masks.
+
+    Raises
+    ------
+    ImportError
+        If it has, and spaceKLIP, which turns them, is not installed.
+    """
+    science = table[np.array(table["TYPE"], dtype=str) == "SCI"]
+    if "NONE" in list(science["MASKFILE"]):
+        return
+    from spaceKLIP.psf import get_transmission
+
+    with fits.open(science["MASKFILE"][0]) as hdus:
+        hdus["SCI"].data = get_transmission(table)
+        hdus.writeto(path, output_verify="fix", overwrite=True)

@@ -1,0 +1,189 @@
+"""`run_obs`: every concatenation of a spaceKLIP database, subtracted and searched."""
+
+from __future__ import annotations
+
+import logging
+import os
+import warnings
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from astropy.table import Table
+
+from pyklip_diffrender.detection import Detection, detect
+from pyklip_diffrender.errors import DiffrenderWarning
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.pyklip_backend.jwst_files import reduce_jwst_files
+from pyklip_diffrender.spaceklip.products import (
+    complete_header,
+    write_contrast,
+    write_database,
+    write_mask,
+    write_snr,
+)
+from pyklip_diffrender.spaceklip.sources import source_table
+
+__all__ = ["Database", "run_obs"]
+
+logger = logging.getLogger(__name__)
+
+
+class Database(Protocol):
+    """What `run_obs` uses of a `spaceKLIP.database.Database`.
+
+    Attributes
+    ----------
+    output_dir : path
+    obs, red : dict of str to Table
+        Frames and products of every concatenation.
+    """
+
+    output_dir: str
+    obs: dict[str, Table]
+    red: dict[str, Table]
+
+    def read_jwst_s3_data(self, datapaths: list[str]) -> None:
+        """Add products to `red`."""
+
+    def update_src(self, key: str, index: int, tab: Table) -> None:
+        """Store the sources of product `index` of a concatenation."""
+
+
+def run_obs(
+    database: Database,
+    *,
+    opd: Any,
+    restrict_to: str | None = None,
+    subdir: str = "diffrender",
+    threshold: float = 5.0,
+    verbose: bool = False,
+    **settings: Any,
+) -> dict[str, Detection]:
+    """Subtract the star from every concatenation of a spaceKLIP database, and search for planets.
+
+    All rolls of a concatenation are fitted together. References (TYPE is REF) are used only where
+    the library has no flat-field pattern for the pixels, or with ``systematics="references"``; none
+    are needed. The products are added to ``database.red`` and the candidates to ``database.src``.
+
+    Parameters
+    ----------
+    database : spaceKLIP.database.Database
+        With stage-2 frames (calints) of a round NIRCam coronagraph in which the star is at
+        STARCENX, STARCENY: aligned ones, usually. Other concatenations are skipped.
+    opd : path, OPDMap, Quantity or array
+        The wavefront to start from; see `DiffrenderSettings`. Of a folder of maps, the one nearest
+        in time is taken.
+    restrict_to : str, optional
+        Only concatenations whose name contains this.
+    subdir : str
+        Folder of the products in ``database.output_dir``.
+    threshold : float
+        S/N of a candidate.
+    verbose : bool
+        Print what is being done.
+    **settings
+        Other fields of `DiffrenderSettings`, such as `systematics`.
+
+    Returns
+    -------
+    dict of str to Detection
+        By concatenation.
+
+    Raises
+    ------
+    ExceptionGroup
+        After all concatenations, if some failed: their errors, each with a note that names the
+        concatenation. The log has the tracebacks, and the others are complete.
+
+    Warns
+    -----
+    DiffrenderWarning
+        For every concatenation that is skipped.
+
+    Examples
+    --------
+    >>> from pyklip_diffrender import spaceklip
+    >>> spaceklip.run_obs(database, opd="maps")  # doctest: +SKIP
+    """
+    folder = Path(database.output_dir) / subdir
+    folder.mkdir(parents=True, exist_ok=True)
+    products: dict[str, Path] = {}
+    detections: dict[str, Detection] = {}
+    failures: list[Exception] = []
+    for key, table in database.obs.items():
+        if restrict_to is not None and restrict_to not in key:
+            continue
+        reason = why_unsupported(table)
+        if reason:
+            warnings.warn(f"{key} is skipped: {reason}", DiffrenderWarning, stacklevel=2)
+            continue
+        logger.info("concatenation %s", key)
+        try:
+            products[key], detections[key] = _reduced(
+                key, table, folder, threshold, {"opd": opd, "verbose": verbose, **settings}
+            )
+        except Exception as error:  # Reported after the other concatenations.
+            logger.exception("concatenation %s failed", key)
+            error.add_note(f"concatenation {key}")
+            failures.append(error)
+    if detections:
+        database.read_jwst_s3_data([str(products[key]) for key in detections])
+        for key, detection in detections.items():
+            _store(database, products[key], source_table(detection, products[key]))
+    if failures:
+        tried = len(failures) + len(detections)
+        raise ExceptionGroup(f"{len(failures)} of {tried} concatenations failed", failures)
+    return detections
+
+
+def why_unsupported(table: Table) -> str | None:
+    """Why a concatenation cannot be reduced; None if it can."""
+    if "SCI" not in table["TYPE"]:
+        return "it has no frames of a target (TYPE is SCI)"
+    first = table[list(table["TYPE"]).index("SCI")]
+    mask = str(first["CORONMSK"]).upper().replace("MASKA", "MASK")
+    if first["INSTRUME"] != "NIRCAM" or first["EXP_TYPE"] != "NRC_CORON" or mask not in ROUND_MASKS:
+        return (
+            f"{first['INSTRUME']} {first['EXP_TYPE']} with mask {first['CORONMSK']}; only NIRCam's "
+            f"round masks are modelled ({', '.join(ROUND_MASKS)})"
+        )
+    if first["DATAMODL"] != "STAGE2":
+        return f"its frames are {first['DATAMODL']}; only STAGE2 (calints) can be used"
+    return None
+
+
+def _reduced(
+    key: str, table: Table, folder: Path, threshold: float, settings: dict[str, Any]
+) -> tuple[Path, Detection]:
+    """Reduce one concatenation and write its files; the path of the product."""
+    kinds = np.array(table["TYPE"], dtype=str)
+    files = np.array(table["FITSFILE"], dtype=object)
+    mode = "ADI+RDI" if (kinds == "REF").any() else "ADI"
+    prefix = f"{mode}_NANNU1_NSUBS1_{key}"
+    dataset = reduce_jwst_files(
+        files[kinds == "SCI"], files[kinds == "REF"], folder=folder, prefix=prefix, **settings
+    )
+    fits = [fit.result for record in dataset.diffrender_results for fit in record.subtraction.fits]
+    detection = detect(fits, threshold=threshold)
+    product = folder / f"{prefix}-KLmodes-all.fits"
+    complete_header(product, table, mode)
+    write_snr(folder / f"{prefix}-snr.fits", detection, product)
+    write_contrast(product, detection)
+    detection.write(folder / prefix)
+    detection.fits[0].write(folder / prefix / "fit.fits")
+    source_table(detection, product).write(
+        folder / f"{prefix}-results.ecsv", format="ascii.ecsv", overwrite=True
+    )
+    write_database(folder / f"{key}.dat", table)
+    write_mask(folder / f"{key}_psfmask.fits", table)
+    return product, detection
+
+
+def _store(database: Database, product: Path, sources: Table) -> None:
+    """Add sources to the database, at the place of the product that they are in."""
+    for key, table in database.red.items():
+        paths = [os.fspath(path) for path in table["FITSFILE"]]
+        if str(product) in paths:
+            # The last one: the database may list a product that was made before, too.
+            database.update_src(key, len(paths) - 1 - paths[::-1].index(str(product)), sources)

@@ -1,0 +1,294 @@
+"""``pyklip.fm.klip_dataset`` with ``algo="diffrender"``: the forward model of a planet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from astropy.io import fits
+from backend_scene import OPD, frames, generic, render
+from numpy.typing import NDArray
+from pyklip import fm
+from pyklip.fmlib.fmpsf import FMPlanetPSF
+from pyklip.fmlib.nofm import NoFM
+from pyklip.klip import rotate
+from pyklip.parallelized import klip_dataset
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, register, unregister
+from pyklip_diffrender.refinement import Adam, GaussNewton
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.wavefront.bases import default_basis
+from pyklip_diffrender.wavefront.opd import random_drift, random_opd
+
+Image = NDArray[np.float64]
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning"),
+    # Of pyKLIP's spline through the user's PSF.
+    pytest.mark.filterwarnings("ignore:.*rank deficient:UserWarning"),
+]
+
+PIXEL, SIDE, STAMP = 0.062424185, 40, 17
+ANGLES = (0.0, 70.0)
+MODES = np.array([1, 3])
+CENTER = np.array([19.8, 19.4])
+FLUX, SKY = 1e10, 100.0
+SEPARATION, PA, CONTRAST = 11.3, 25.0, 1e-6
+NUMERICS: dict[str, Any] = {"npix": 128, "occulter_sampling": 2.0, "monochromatic": 4.44e-6}
+OLD = random_opd(1, npix=128)
+NEW = OLD.data + random_drift(2, 40.0, npix=128).data
+LINEAR = GaussNewton(free=("flux", "background"), wavefront=False)
+
+
+@pytest.fixture(scope="module")
+def model() -> OpticalSystem:
+    return nircam_coronagraph("F444W", fov_pixels=SIDE, **NUMERICS)
+
+
+def place(angle: float, flipx: bool = False) -> Image:
+    """x, y in arcsec of the planet in a frame that pyKLIP turns by an angle."""
+    direction = np.radians(90 + (-PA if flipx else PA) - angle)
+    return PIXEL * SEPARATION * np.array([np.cos(direction), np.sin(direction)])
+
+
+def image(model: OpticalSystem, opd: Image, source: Any, shift: Any) -> Image:
+    with torch.no_grad():
+        rendered = model(
+            opd, star_offset=torch.as_tensor(source), detector_shift=torch.as_tensor(shift)
+        )
+    return FLUX * rendered.double().numpy()
+
+
+def shots(model: OpticalSystem, opd: Image, flipx: bool = False) -> tuple[Image, Image]:
+    """The star and its planet in every roll, without noise."""
+    shift = PIXEL * (CENTER - (SIDE - 1) / 2)
+    star = [image(model, opd, np.zeros(2), shift) + SKY for _ in ANGLES]
+    planet = [CONTRAST * image(model, opd, place(angle, flipx), shift) for angle in ANGLES]
+    return np.array(star), np.array(planet)
+
+
+def dataset(cube: Image, model: OpticalSystem, errors: Image, **settings: Any) -> Any:
+    made = generic(cube, ANGLES, center=CENTER)
+    made.diffrender = DiffrenderSettings(
+        **{"opd": OLD, "model": model, "error": errors, "plan": "off", "fit": LINEAR, **settings}
+    )
+    return made
+
+
+def planet_psf(opd: Image, made: Any) -> FMPlanetPSF:
+    """The planet as a user gives it: one PSF for each roll, half as bright, twice its flux."""
+    camera = nircam_coronagraph("F444W", fov_pixels=STAMP, **NUMERICS)
+    places = [place(angle, made.flipx) for angle in ANGLES]
+    stamps = [[0.5 * image(camera, opd, each, -each)] for each in places]
+    return FMPlanetPSF(
+        made.input.shape, MODES, SEPARATION, PA, CONTRAST, np.array(stamps), np.unique(made.wvs),
+        flux_conversion=np.full(len(made.input), 2.0), spectrallib=[np.ones(1)],
+        spectrallib_units="contrast", input_psfs_pas=np.array(ANGLES),
+    )  # fmt: skip
+
+
+def modelled(made: Any, fm_class: Any, folder: Path, **options: Any) -> tuple[Any, Any]:
+    """Forward model and product."""
+    folder.mkdir(exist_ok=True)
+    fm.klip_dataset(
+        made, fm_class, **{
+            "mode": "ADI", "annuli": 1, "subsections": 1, "numbasis": MODES, "movement": 0,
+            "numthreads": 1, "outputdir": str(folder), "fileprefix": "x",
+            "mute_progression": True, **options,
+        },
+    )  # fmt: skip
+    paths = [folder / f"x-{kind}-KLmodes-all.fits" for kind in ("fmpsf", "klipped")]
+    read = [fits.getdata(p).astype(float) if p.exists() else None for p in paths]
+    return read[0], read[1]
+
+
+@pytest.fixture
+def registered() -> Iterator[None]:
+    register(opd=OPD)
+    yield
+    unregister()
+
+
+def added(
+    model: OpticalSystem,
+    truth: Image,
+    folder: Path,
+    flipx: bool = False,
+    highpass: float | bool = False,
+    **settings: Any,
+) -> tuple[Image, Image, Image, Any]:
+    """What a planet adds to the product, its forward model, its own image turned, the dataset."""
+    star, planet = shots(model, truth, flipx)
+    products = []
+    for cube in (star, star + planet):
+        made = dataset(cube, model, np.sqrt(star), **settings)
+        made.flipx = flipx
+        of_planet, product = modelled(
+            made, planet_psf(truth, made), folder, algo="diffrender", highpass=highpass
+        )
+        products.append(product)
+    np.testing.assert_array_equal(np.isnan(of_planet), np.isnan(product))
+    difference = (products[1] - products[0])[0]
+    # The pedestal that is subtracted from the product is not part of the model.
+    difference -= np.nanmedian(difference - of_planet[0])
+    turned = [rotate(*each, CENTER, flipx=flipx) for each in zip(planet, ANGLES, strict=True)]
+    return difference, of_planet[0], np.nanmean(turned, axis=0), made
+
+
+def near_planet() -> NDArray[np.bool_]:
+    """Pixels of the product about the planet."""
+    y, x = np.indices((SIDE, SIDE))
+    direction = np.radians(PA)
+    east, north = SEPARATION * np.sin(direction), SEPARATION * np.cos(direction)
+    return np.asarray(np.hypot(x - CENTER[0] + east, y - CENTER[1] - north) < 7)
+
+
+def away(image: Image, other: Image) -> float:
+    """Root mean square of a difference about the planet, in units of that of an image."""
+    near = near_planet()
+    return float(np.sqrt(np.mean((image - other)[near] ** 2) / np.mean(image[near] ** 2)))
+
+
+@pytest.mark.usefixtures("registered")
+@pytest.mark.parametrize("flipx", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_the_forward_model_is_what_a_planet_adds_to_the_product(
+    flipx: bool, model: OpticalSystem, tmp_path: Path
+) -> None:
+    """The fit of flux and background is linear, so that the forward model is exact."""
+    difference, of_planet, planet, made = added(model, OLD.data, tmp_path, flipx)
+    assert away(difference, of_planet) < 0.01
+    assert away(difference, planet) > 0.1
+    assert np.shape(made.fmout) == np.shape(made.output) == (2, 2, SIDE, SIDE)
+    assert np.shape(made.perturbmag) == (2, 2)
+
+    of_all, header = fits.getdata(tmp_path / "x-fmpsf-KLmodes-all.fits", header=True)
+    np.testing.assert_array_equal(of_all[0], of_all[1])
+    assert (header["FM_SEP"], header["FM_PA"]) == (SEPARATION, PA)
+    assert (header["PSFCENTX"], header["PSFCENTY"]) == tuple(CENTER)
+    assert (header["KLMODE0"], header["KLMODE1"], header["DRALGO"]) == (1, 3, "diffrender")
+    direction = np.radians(PA)
+    x = CENTER[0] - SEPARATION * np.sin(direction)
+    peak = np.unravel_index(np.nanargmax(of_planet), of_planet.shape)
+    np.testing.assert_allclose(peak, (CENTER[1] + SEPARATION * np.cos(direction), x), atol=1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("registered")
+def test_a_high_pass_filter_applies_to_the_forward_model(
+    model: OpticalSystem, tmp_path: Path
+) -> None:
+    difference, of_planet, _, _ = added(model, OLD.data, tmp_path, highpass=8.0)
+    plain, *_ = added(model, OLD.data, tmp_path)
+    # The user's PSF, which sets the flux, is not filtered here, so that only shapes compare.
+    near = near_planet()
+    alike = np.corrcoef([each[near] for each in (difference, of_planet, plain)])
+    assert 1 - alike[0, 1] < 0.001
+    assert 1 - alike[0, 2] > 0.003
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("registered")
+def test_a_planet_of_the_fit_loses_no_light(model: OpticalSystem, tmp_path: Path) -> None:
+    star, planet = shots(model, OLD.data)
+    known = replace(LINEAR, companions=(Planet.from_offset(CONTRAST, *place(0.0)),))
+    made = dataset(star + planet, model, np.sqrt(star), fit=known)
+    of_planet, product = modelled(made, planet_psf(OLD.data, made), tmp_path, algo="diffrender")
+    turned = [rotate(*each, CENTER) for each in zip(planet, ANGLES, strict=True)]
+    assert away(of_planet[0], np.nanmean(turned, axis=0)) < 0.01
+    assert away(of_planet[0], product[0] - np.nanmedian(product[0] - of_planet[0])) < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("registered")
+def test_the_wavefront_takes_what_the_forward_model_says(
+    model: OpticalSystem, tmp_path: Path
+) -> None:
+    fit = GaussNewton(basis=default_basis(10.0), response_npix=128)
+    difference, of_planet, planet, made = added(model, NEW, tmp_path, fit=fit)
+    assert made.diffrender_results[0].subtraction.fits[0].result.status.name == "CONVERGED"
+    assert away(difference, of_planet) < 0.1
+    assert away(difference, planet) > 0.3
+
+
+@pytest.mark.usefixtures("registered")
+def test_without_a_forward_model_the_product_is_that_of_klip_dataset(
+    model: OpticalSystem, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(3)
+    cube = frames((0.0, 20.0, 45.0), rng)
+    made = generic(cube, (0.0, 20.0, 45.0))
+    made.diffrender = DiffrenderSettings(subtractor=render)
+    options = {
+        "mode": "ADI", "annuli": 2, "subsections": 1, "numbasis": MODES, "movement": 0,
+        "numthreads": 1, "outputdir": str(tmp_path), "fileprefix": "x", "algo": "diffrender",
+        "aligned_center": [22.0, 24.0], "time_collapse": "weighted-mean",
+    }  # fmt: skip
+    _, product = modelled(made, NoFM(cube.shape, MODES), tmp_path, **options)
+    assert not (tmp_path / "x-fmpsf-KLmodes-all.fits").exists()
+    cards = fits.getheader(tmp_path / "x-klipped-KLmodes-all.fits")
+    klip_dataset(made, verbose=False, **options)
+    expected, header = fits.getdata(tmp_path / "x-KLmodes-all.fits", header=True)
+    np.testing.assert_allclose(product, expected, atol=1e-4)
+    for key in ("PSFCENTX", "PSFCENTY", "KLMODE1", "CTYPE3", "DRMETH", "DRSHA256"):
+        assert cards[key] == header[key]
+    inside = modelled(made, NoFM(cube.shape, MODES), tmp_path, **{**options, "annuli": [(5, 9)]})[1]
+    y, x = np.nonzero(np.isfinite(inside[0]))
+    radius = np.hypot(x - 22, y - 24)
+    assert (radius.min(), radius.max()) == pytest.approx((5, 9), abs=0.5)
+
+
+@pytest.mark.usefixtures("registered")
+def test_what_cannot_be_modelled_says_what_can(model: OpticalSystem, tmp_path: Path) -> None:
+    star, _ = shots(model, OLD.data)
+
+    def run(fm_class: Any = None, **settings: Any) -> None:
+        made = dataset(star, model, np.sqrt(star), **settings)
+        fm_class = planet_psf(OLD.data, made) if fm_class is None else fm_class
+        modelled(made, fm_class, tmp_path, algo="diffrender")
+
+    class Other(NoFM):
+        """Another forward model."""
+
+    refused = pytest.raises(IncompatibleSetupError, match=r"Other is not .*FMPlanetPSF and NoFM")
+    with refused:
+        run(Other(star.shape, MODES))
+    for settings in ({"fit": Adam()}, {"subtractor": render}):
+        with pytest.raises(IncompatibleSetupError, match="needs the linear model"):
+            run(**settings)
+    planet = planet_psf(OLD.data, generic(star, ANGLES))
+    planet.sep = 40.0
+    with pytest.raises(IncompatibleSetupError, match=r"40\.0 pixels from the star, outside the 40"):
+        run(planet)
+    assert not list(tmp_path.iterdir())
+
+
+def test_klip_forward_modelling_is_unchanged(tmp_path: Path) -> None:
+    angles = (0.0, 20.0, 45.0)
+    cube = frames(angles, np.random.default_rng(3))
+
+    def run(**options: Any) -> Image:
+        made = generic(cube, angles)
+        modelled(made, NoFM(cube.shape, MODES[:1]), tmp_path, numbasis=MODES[:1], **options)
+        return np.asarray(made.output)
+
+    expected = run()
+    assert np.isfinite(expected).any()
+    register(opd=OPD, subtractor=render)
+    try:
+        np.testing.assert_array_equal(run(), expected)
+        with backend(force=False):
+            np.testing.assert_array_equal(run(), expected)
+        with backend():
+            assert not np.array_equal(run(), expected, equal_nan=True)
+        with pytest.raises(TypeError, match="algo"):
+            run(algo="klip")
+    finally:
+        unregister()

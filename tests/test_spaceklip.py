@@ -1,0 +1,255 @@
+"""`spaceklip.run_obs` on a stand-in for a spaceKLIP database, and on a real one where installed."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from astropy.io import fits
+from astropy.table import QTable, Table
+from pyklip.instruments import JWST
+
+from pyklip_diffrender import spaceklip
+from pyklip_diffrender.detection import Candidates, Detection
+from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.refinement import GaussNewton
+from pyklip_diffrender.spaceklip import run
+from pyklip_diffrender.spaceklip.products import complete_header, write_contrast, write_database
+from pyklip_diffrender.spaceklip.sources import source_table
+from pyklip_diffrender.wavefront.opd import random_opd
+
+pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
+
+SIDE, PIXEL = 41, 0.062424185
+KEY = "JWST_NIRCAM_NRCALONG_F444W_MASKRND_MASK335R_SUB320A335R"
+FLUX, CONTRAST = 1e10, 2e-5
+SKY_ANGLES = (63.0, 73.0)
+OPD = random_opd(1, npix=128)
+
+
+class StandIn:
+    """The part of `spaceKLIP.database.Database` that is used."""
+
+    def __init__(self, folder: Path, obs: dict[str, Table]) -> None:
+        self.output_dir, self.obs = str(folder), obs
+        self.red: dict[str, Table] = {}
+        self.src: dict[str, dict[int, Table]] = {}
+
+    def read_jwst_s3_data(self, datapaths: list[str]) -> None:
+        for path in datapaths:
+            header = fits.getheader(path)
+            keys = "TELESCOP INSTRUME DETECTOR FILTER PUPIL CORONMSK SUBARRAY"
+            key = "_".join(header[k] for k in keys.split())
+            modes = {name: [header[name]] for name in ("MODE", "ANNULI", "SUBSECTS", "KLMODE0")}
+            self.red[key] = Table({"FITSFILE": [path], **modes})
+
+    def update_src(self, key: str, index: int, tab: Table) -> None:
+        self.src.setdefault(key, {})[index] = tab
+
+
+def frame(path: Path, data: Any, roll: float) -> str:
+    """Write a stage-2 file with the star where spaceKLIP puts it."""
+    center = (SIDE + 1) / 2
+    primary = {
+        "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON", "FILTER": "F444W",
+        "PUPIL": "MASKRND", "CORONMSK": "MASKA335R", "DATE-BEG": "2022-07-30T01:02:03",
+        "TARGPROP": "STAR", "XOFFSET": 0.0, "YOFFSET": 0.0,
+    }  # fmt: skip
+    science = {
+        "BUNIT": "MJy/sr", "PIXAR_A2": PIXEL**2, "STARCENX": center, "STARCENY": center,
+        "CRPIX1": center, "CRPIX2": center, "CRVAL1": 201.0, "CRVAL2": -51.0, "ROLL_REF": roll,
+        "V3I_YANG": 0.0, "VPARITY": -1,
+    }  # fmt: skip
+    hdus = [
+        fits.PrimaryHDU(header=fits.Header(primary)),
+        fits.ImageHDU(data.astype(np.float32)[None], fits.Header(science), name="SCI"),
+        fits.ImageHDU(np.sqrt(data).astype(np.float32)[None], name="ERR"),
+        fits.ImageHDU(np.zeros((1, *data.shape), np.uint32), name="DQ"),
+    ]
+    fits.HDUList(hdus).writeto(path)
+    return str(path)
+
+
+def concatenation(files: list[str], **columns: Any) -> Table:
+    """The table of a concatenation."""
+    common = {
+        "TYPE": "SCI", "EXP_TYPE": "NRC_CORON", "DATAMODL": "STAGE2", "TELESCOP": "JWST",
+        "TARGPROP": "STAR", "TARG_RA": 201.0, "TARG_DEC": -51.0, "INSTRUME": "NIRCAM",
+        "DETECTOR": "NRCALONG", "FILTER": "F444W", "CWAVEL": 4.44, "DWAVEL": 1.02,
+        "PUPIL": "MASKRND", "CORONMSK": "MASK335R", "EXPSTART": 59790.0, "NINTS": 1,
+        "EFFINTTM": 300.0, "SUBARRAY": "SUB320A335R", "APERNAME": "NRCA5_MASK335R",
+        "PPS_APER": "NRCA5_MASK335R", "PIXSCALE": PIXEL, "PIXAR_SR": 9.2e-14, "BUNIT": "MJy/sr",
+        "BLURFWHM": np.nan, "MASKFILE": "NONE", **columns,
+    }  # fmt: skip
+    table = Table({name: [value] * len(files) for name, value in common.items()})
+    table["FITSFILE"] = np.array(files, dtype=object)
+    table["ALIGN_SHIFT"] = np.empty(len(files), dtype=object)
+    for k in range(len(files)):
+        table["ALIGN_SHIFT"][k] = np.zeros((1, 2))
+    return table
+
+
+def fake_detection(offset: tuple[float, float], north: float) -> Any:
+    """A `Detection` with one candidate and one at twice its S/N."""
+    candidates = replace(
+        Candidates.at([offset, (0.5, 0.6)], [1e-5, 2e-5]),
+        covariance=torch.diag(torch.tensor([1e-6, 1e-6, 1e-2, 2e-2, 3e-2, 4e-2])**2).double(),
+    )  # fmt: skip
+    curve = Table({"separation": [0.3, 0.5], "small_sample": [1e-4, 1e-5], "contrast": [0.0, 0.0]})
+    curve["separation"].unit = "arcsec"
+    made = SimpleNamespace(
+        candidates=candidates, scatter=2.0, north=north, contrast_curve=QTable(curve),
+        _calibration_errors=np.zeros(2), _provenance={},
+    )  # fmt: skip
+    made.table = Detection.table.func(made)  # type: ignore[attr-defined]
+    return made
+
+
+def test_candidates_become_rows_of_spaceklips_table(tmp_path: Path) -> None:
+    made = fake_detection((-0.3, 0.4), 90.0)
+    table = source_table(made, tmp_path / "x.fits")
+    assert list(table["ID"]) == [1, 2]
+    # +y points east, and +x north.
+    np.testing.assert_allclose(table["RA"][1], 0.4, atol=1e-9)
+    np.testing.assert_allclose(table["DEC"][1], -0.3, atol=1e-9)
+    np.testing.assert_allclose(table["RA_ERR"], 2 * np.array([4e-2, 3e-2]), rtol=1e-6)
+    np.testing.assert_allclose(table["DEC_ERR"], 2 * np.array([2e-2, 1e-2]), rtol=1e-6)
+    np.testing.assert_allclose(table["CON"], [2e-5, 1e-5])
+    np.testing.assert_allclose(table["SNR"], [10.0, 5.0])
+    assert np.isnan(table["FLUX_JY"]).all()
+    assert set(table["FITSFILE"]) == {str(tmp_path / "x.fits")}
+
+
+def test_products_have_spaceklips_keywords_and_curves(tmp_path: Path) -> None:
+    table = concatenation([frame(tmp_path / "a_calints.fits", np.ones((SIDE, SIDE)), 63.0)] * 2)
+    product = tmp_path / "x-KLmodes-all.fits"
+    fits.PrimaryHDU(
+        np.zeros((1, SIDE, SIDE)), fits.Header({"PSFCENTX": 20.0, "PSFCENTY": 19.5, "KLMODE0": 1})
+    ).writeto(product)
+    complete_header(product, table, "ADI")
+    header = fits.getheader(product)
+    assert (header["NINTS"], header["MODE"], header["ANNULI"]) == (2, "ADI", 1)
+    assert (header["CRPIX1"], header["CRPIX2"], header["CRVAL1"]) == (21.0, 20.5, 201.0)
+    assert (header["CD1_1"], header["CD2_2"]) == pytest.approx((-PIXEL / 3600, PIXEL / 3600))
+    assert "BLURFWHM" not in header
+    write_contrast(product, fake_detection((0.1, 0.1), 0.0))
+    for name, values in (("seps", [0.3, 0.5]), ("cons", [1e-4, 1e-5]), ("maskcons", [1e-4, 1e-5])):
+        saved = np.load(tmp_path / f"x-KLmodes-all_cal_{name}.npy")
+        np.testing.assert_array_equal(saved, [values])
+    write_database(tmp_path / "x.dat", table)
+    again = Table.read(tmp_path / "x.dat", format="ascii")
+    assert list(again["FITSFILE"]) == list(table["FITSFILE"])
+    assert again["ALIGN_SHIFT"][0] == "[[0.0, 0.0]]"
+
+
+def test_a_failure_is_reported_after_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any
+) -> None:
+    good = concatenation(["a_calints.fits"])
+    obs = {
+        "bad": concatenation(["b_calints.fits"]),
+        KEY: good,
+        "miri": concatenation(["c"], INSTRUME="MIRI", EXP_TYPE="MIR_4QPM"),
+        "raw": concatenation(["d"], DATAMODL="STAGE1"),
+        "references": concatenation(["e"], TYPE="REF"),
+        "bar": concatenation(["f"], CORONMSK="MASKALWB"),
+    }
+    database = StandIn(tmp_path, obs)
+
+    def reduced(key: str, table: Table, folder: Path, threshold: float, settings: Any) -> Any:
+        if key == "bad":
+            raise IncompatibleSetupError("no such filter")
+        header = {name: good[name][0] for name in good.colnames if len(name) <= 8
+                  and name not in ("ALIGN_SHIFT", "BLURFWHM")}  # fmt: skip
+        header |= {"MODE": "ADI", "ANNULI": 1, "SUBSECTS": 1, "KLMODE0": 1}
+        product = folder / "x-KLmodes-all.fits"
+        fits.PrimaryHDU(header=fits.Header(header)).writeto(product)
+        return product, fake_detection((-0.3, 0.4), 0.0)
+
+    monkeypatch.setattr(run, "_reduced", reduced)
+    with (
+        pytest.warns(DiffrenderWarning) as skipped,
+        pytest.raises(ExceptionGroup, match="1 of 2 concatenations failed") as caught,
+    ):
+        spaceklip.run_obs(database, opd=OPD)
+    (error,) = caught.value.exceptions
+    assert isinstance(error, IncompatibleSetupError)
+    assert error.__notes__ == ["concatenation bad"]
+    assert "Traceback" in caplog.text
+    assert "no such filter" in caplog.text
+    reasons = [str(each.message) for each in skipped]
+    for reason, words in zip(
+        reasons, ("MIR_4QPM", "STAGE1", "no frames of a target", "MASKALWB"), strict=True
+    ):
+        assert "is skipped" in reason
+        assert words in reason
+    assert list(database.red) == [KEY]
+    assert list(database.src[KEY][0]["CON"]) == [2e-5, 1e-5]
+    with pytest.raises(ExceptionGroup):
+        spaceklip.run_obs(database, opd=OPD, restrict_to="bad")
+
+
+@pytest.fixture
+def real_database(tmp_path: Path) -> Any:
+    reason = "spaceKLIP is not on the package index; install it from its repository"
+    database = pytest.importorskip("spaceKLIP.database", reason=reason, exc_type=ImportError)
+    made = database.Database(str(tmp_path))
+    made.verbose = False
+    return made
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["stand-in", "real"])
+def test_a_concatenation_from_frames_to_sources(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest,
+    caplog: Any,
+) -> None:  # fmt: skip
+    def offline(**kw: Any) -> None:
+        raise OSError("offline")
+
+    monkeypatch.setattr(JWST.SvoFps, "get_filter_list", offline)
+    caplog.set_level(logging.INFO)
+    model = nircam_coronagraph(
+        "F444W", fov_pixels=SIDE, npix=128, occulter_sampling=2.0, monochromatic=4.44e-6
+    )
+    rng = np.random.default_rng(1)
+    files, sky = [], np.radians(120.0)
+    for k, roll in enumerate(SKY_ANGLES):
+        turned = sky - np.radians(roll)
+        planet = 0.8 * np.array([-np.sin(turned), np.cos(turned)])
+        with torch.no_grad():
+            image = model(OPD.data) + CONTRAST * model(OPD.data, star_offset=planet)
+        photons = rng.poisson(FLUX * image.numpy() + 100.0).astype(float)
+        files.append(frame(tmp_path / f"jw0{k}_calints.fits", photons, roll))
+    database = StandIn(tmp_path, {}) if kind == "stand-in" else request.getfixturevalue(
+        "real_database"
+    )  # fmt: skip
+    database.obs[KEY] = concatenation(files)
+    detections = spaceklip.run_obs(
+        database, opd=OPD, model=model, systematics="off", plan="off",
+        fit=GaussNewton(free=("flux", "background"), wavefront=False),
+    )  # fmt: skip
+    assert list(detections) == list(database.red) == [KEY]
+    (sources,) = database.src[KEY] if kind == "real" else database.src[KEY].values()
+    assert len(sources) == 1
+    for name, truth in (("RA", 0.8 * np.sin(sky)), ("DEC", 0.8 * np.cos(sky)), ("CON", CONTRAST)):
+        assert abs(sources[name][0] - truth) < 4 * sources[f"{name}_ERR"][0]
+    product = Path(database.red[KEY]["FITSFILE"][0])
+    assert product.parent == tmp_path / "diffrender"
+    snr, header = fits.getdata(Path(str(product).replace("KLmodes-all", "snr")), header=True)
+    peak = np.unravel_index(np.nanargmax(snr), snr.shape)
+    y = header["PSFCENTY"] + 0.8 * np.cos(sky) / PIXEL
+    x = header["PSFCENTX"] - 0.8 * np.sin(sky) / PIXEL
+    np.testing.assert_allclose(peak, (y, x), atol=1.0)
+    image = fits.getdata(product)[0]
+    brightest = np.unravel_index(np.nanargmax(image), image.shape)
+    np.testing.assert_allclose(brightest, (y, x), atol=1.0)
+    assert (product.parent / f"{KEY}.dat").exists()
+    assert Detection.read(product.parent / f"ADI_NANNU1_NSUBS1_{KEY}").table["snr"][0] > 5
