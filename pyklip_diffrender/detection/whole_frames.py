@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from astropy.stats import SigmaClip
 from astropy.table import QTable
 from numpy.typing import NDArray
-from photutils.background import Background2D, MedianBackground
-from photutils.psf import ImagePSF, PSFPhotometry
 from scipy.ndimage import convolve, map_coordinates
 from scipy.signal import fftconvolve
 
@@ -20,6 +19,9 @@ from pyklip_diffrender.detection.field import Image, separation_of
 from pyklip_diffrender.detection.templates import pixel_grid
 from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.scene.observation import Observation
+
+if TYPE_CHECKING:
+    from photutils.psf import ImagePSF
 
 __all__ = ["WholeFrame"]
 
@@ -95,6 +97,9 @@ class WholeFrame:
     @cached_property
     def residual(self) -> Image:
         """Data without star, candidates and background, (ny, nx); 0 where masked."""
+        # Imported where it is used, because it imports matplotlib.
+        from photutils.background import Background2D, MedianBackground
+
         combined = self.observation.combined()
         image = np.asarray(combined.data[0] - self.stars)
         unused = ~combined.valid[0] | (separation_of(self.grid) < _CORE)
@@ -146,6 +151,8 @@ class WholeFrame:
     @cached_property
     def fine_image(self) -> ImagePSF:
         """The same for photutils, larger and sampled more finely than the pixels."""
+        from photutils.psf import ImagePSF
+
         fine = np.empty((_FINE * _REACH, _FINE * _REACH))
         middle = (_FINE - 1) / 2
         for row in range(_FINE):
@@ -229,6 +236,8 @@ class WholeFrame:
         None
             If the source is not in this frame.
         """
+        from photutils.psf import PSFPhotometry
+
         x, y = self.pixels_of(offset)
         ny, nx = image.shape
         if not (0 <= round(x) < nx and 0 <= round(y) < ny) or np.isinf(
