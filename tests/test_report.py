@@ -21,6 +21,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.planning.choice import ModelError
 from pyklip_diffrender.refinement import Status
@@ -179,8 +180,7 @@ def test_probabilities_of_false_alarms() -> None:
     elements = (2.0 / (4.5e-6 / 6.6) * np.pi / 180 / 3600) ** 2
     assert row["false_alarm_probability"] == pytest.approx(2.87e-7 * elements, rel=0.15)
     # Student's t has wider tails: noise whose level was read off few places is known less well.
-    fit = replace(found.fits[0], status=Status.MODEL_MISMATCH)
-    weak.__dict__["fits"] = (fit,)
+    weak.__dict__["error_factor"] = ErrorFactor(np.array([0.5, 1.0]), np.array([1.2, 1.0]))
     (wide,) = summarise(replace(reduction(), detection=weak))["candidates"]
     assert wide["false_alarm_probability"] > 10 * row["false_alarm_probability"]
 

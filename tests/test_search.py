@@ -65,7 +65,7 @@ def test_a_dismissed_peak_is_not_taken_again(monkeypatch: pytest.MonkeyPatch) ->
     candidates, factor = search._search(
         maps, [fit], 5.0, 0.2, 1.0, Candidates.at(np.zeros((0, 2)), [])
     )
-    assert factor == 1.0
+    assert factor.typical == 1.0
     assert sorted(candidates.contrasts.tolist()) == [6.0, 8.0]
     # Three peaks are fitted and one is dismissed; each needs one fit.
     assert len(fitted) <= 6

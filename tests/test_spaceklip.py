@@ -17,6 +17,9 @@ from pyklip.instruments import JWST
 
 from pyklip_diffrender import spaceklip
 from pyklip_diffrender.detection import Candidates, Detection
+from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.sky import Sky
+from pyklip_diffrender.detection.tables import candidate_table
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.refinement import GaussNewton
@@ -104,12 +107,10 @@ def fake_detection(offset: tuple[float, float], north: float) -> Any:
     )  # fmt: skip
     curve = Table({"separation": [0.3, 0.5], "small_sample": [1e-4, 1e-5], "contrast": [0.0, 0.0]})
     curve["separation"].unit = "arcsec"
-    made = SimpleNamespace(
-        candidates=candidates, scatter=2.0, north=north, contrast_curve=QTable(curve),
-        _calibration_errors=np.zeros(2), _provenance={},
-    )  # fmt: skip
-    made.table = Detection.table.func(made)  # type: ignore[attr-defined]
-    return made
+    table = candidate_table(
+        candidates, ErrorFactor.constant(2.0), np.zeros((2, 2)), Sky(north, star=(0.5, 0.01))
+    )
+    return SimpleNamespace(table=table, contrast_curve=QTable(curve))
 
 
 def test_candidates_become_rows_of_spaceklips_table(tmp_path: Path) -> None:
@@ -123,7 +124,8 @@ def test_candidates_become_rows_of_spaceklips_table(tmp_path: Path) -> None:
     np.testing.assert_allclose(table["DEC_ERR"], 2 * np.array([2e-2, 1e-2]), rtol=1e-6)
     np.testing.assert_allclose(table["CON"], [2e-5, 1e-5])
     np.testing.assert_allclose(table["SNR"], [10.0, 5.0])
-    assert np.isnan(table["FLUX_JY"]).all()
+    np.testing.assert_allclose(table["FLUX_JY"], [1e-5, 5e-6])
+    assert np.isnan(table["APPMAG"]).all()
     assert set(table["FITSFILE"]) == {str(tmp_path / "x.fits")}
 
 
