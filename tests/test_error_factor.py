@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from pyklip_diffrender.detection import search
 from pyklip_diffrender.detection.error_factor import ErrorFactor, scatter_profile
+from pyklip_diffrender.detection.maps import Maps
 
 PIXEL = 0.06
 RESOLUTION = 0.15
@@ -82,3 +87,27 @@ def test_factors_are_interpolated_and_never_below_their_floor() -> None:
 def test_a_map_without_valid_pixels_needs_no_factor() -> None:
     factor = scatter_profile(np.full((80, 80), np.nan), field(), torch.zeros(0, 2), 0.2, RESOLUTION)
     assert not factor.is_needed
+
+
+def test_a_source_near_the_star_is_judged_without_its_own_light(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    grid, ones = field(), np.ones((80, 80))
+    distance = np.hypot(grid[..., 0] - 0.4, grid[..., 1])
+    quiet = snr_map(1, ones)
+    snr = quiet + 6.5 * np.exp(-((distance / 0.1) ** 2))
+    peak = np.unravel_index(np.argmax(np.where(distance < 0.2, snr, 0)), snr.shape)
+
+    def factor(_s: Image, _m: object, _f: object, known: torch.Tensor, inner: float) -> ErrorFactor:
+        return scatter_profile(snr, grid, known, inner, RESOLUTION).at_least(1.0)
+
+    monkeypatch.setattr(search, "_error_factor", factor)
+    none = torch.zeros(0, 2, dtype=torch.float64)
+    raised = factor(snr, None, None, none, 0.2)
+    threshold = 0.97 * snr[peak]
+    assert search._next_peak(snr, grid, none, raised, threshold, 0.2) is None
+    maps = cast(Maps, SimpleNamespace(grid=grid))
+    hidden = search._hidden_peak(snr, snr, maps, [], none, raised, threshold, 0.2)
+    assert hidden == peak
+    quiet_factor = factor(quiet, None, None, none, 0.2)
+    assert search._hidden_peak(quiet, quiet, maps, [], none, quiet_factor, 5.0, 0.2) is None

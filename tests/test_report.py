@@ -395,3 +395,24 @@ def test_the_page_fits_the_screen(folder: Path, tmp_path: Path, width: int, dark
     assert seen["seen"]
     assert seen["dark"] == dark
     assert seen["ground"] == ("rgb(20, 23, 26)" if dark else "rgb(255, 255, 255)")
+
+
+@pytest.mark.slow
+def test_the_search_of_whole_frames_has_a_section_of_its_own(tmp_path: Path) -> None:
+    inner = reduction().detection
+    table = inner.table.copy()
+    table["fit_chi2"] = 1.3
+    wide = dr.WideField(
+        inner, 5.0, inner.contrast, inner.error, inner.snr, inner.grid, inner.error_factor, table,
+        inner.contrast_curve,
+    )  # fmt: skip
+    written = replace(reduction(), wide=wide).write(tmp_path)
+    assert tmp_path / "wide_field.fits" in written
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<h2>Whole frames</h2>" in text
+    assert "Chi-squared of the image" in text
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    (row,) = summary["wide_field"]["candidates"]
+    assert row["fit_chi2"] == 1.3
+    assert len(summary["wide_field"]["contrast_curve"]["contrast"]) == len(inner.contrast_curve)
+    assert summarise(reduction())["wide_field"] is None

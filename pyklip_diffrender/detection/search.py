@@ -41,6 +41,9 @@ _log = logging.getLogger(__name__)
 
 _MAX_CANDIDATES = 20
 
+_WORTH_A_LOOK = 0.6
+"""Part of the threshold from which a peak is judged by the scatter without it."""
+
 _SOURCE = 5.0
 """S/N above which `measure` removes a source before it computes the default `scatter`."""
 
@@ -317,14 +320,10 @@ def _search(
         else:
             factor = _error_factor(snr, maps, fits, candidates.offsets, inner)
         allowed = np.where(far_from(grid, dismissed, 2 * pixel), snr, 0.0)
-        peak = strongest_peak(
-            allowed / factor.at(separation_of(grid)),
-            grid,
-            candidates.offsets,
-            threshold=threshold,
-            inner=inner,
-            distance=pixel,
-        )
+        peak = _next_peak(allowed, grid, candidates.offsets, factor, threshold, inner)
+        if peak is None and factor.is_measured:
+            peak = _hidden_peak(snr, allowed, maps, fits, candidates.offsets, factor, threshold,
+                                inner)  # fmt: skip
         if peak is None or max(len(candidates), len(dismissed)) >= _MAX_CANDIDATES:
             # The factor may have grown since a candidate was accepted.
             if not len(candidates) or _snr(candidates, factor).min() >= threshold:
@@ -337,6 +336,51 @@ def _search(
         candidates = candidates.with_one_more(grid[peak], contrast)
         candidates = refine_candidates(groups, candidates, reach=pixel / 2)
         _log.info("candidates at %s arcsec", candidates.offsets.tolist())
+
+
+def _next_peak(
+    snr: Image,
+    grid: Image,
+    sources: torch.Tensor,
+    factor: ErrorFactor,
+    threshold: float,
+    inner: float,
+) -> tuple[int, int] | None:
+    """The highest peak above the threshold that belongs to no source."""
+    return strongest_peak(
+        snr / factor.at(separation_of(grid)),
+        grid,
+        sources,
+        threshold=threshold,
+        inner=inner,
+        distance=pixel_width(grid),
+    )
+
+
+def _hidden_peak(
+    snr: Image,
+    allowed: Image,
+    maps: Maps,
+    fits: Sequence[Refinement],
+    sources: torch.Tensor,
+    factor: ErrorFactor,
+    threshold: float,
+    inner: float,
+) -> tuple[int, int] | None:
+    """A peak that is above the threshold where it does not itself raise the scatter.
+
+    Near the star a ring has few positions, so that a source is a large part of their scatter.
+    """
+    for _ in range(_MAX_CANDIDATES):
+        peak = _next_peak(allowed, maps.grid, sources, factor, _WORTH_A_LOOK * threshold, inner)
+        if peak is None:
+            return None
+        place = torch.from_numpy(maps.grid[peak][None])
+        without = _error_factor(snr, maps, fits, torch.cat([sources, place]), inner)
+        if snr[peak] >= threshold * without.of(place)[0]:
+            return peak
+        allowed = np.where(far_from(maps.grid, place, 2 * pixel_width(maps.grid)), allowed, 0.0)
+    return None
 
 
 def _error_factor(

@@ -219,7 +219,7 @@ def _wide(summary: Mapping[str, Any]) -> str:
         "outside the pixels in which the star was fitted; much above 1, the source is extended, "
         "blended, or no source."
     )
-    return pieces.table(header, rows) + pieces.note(note)
+    return "<h3>Candidates</h3>" + pieces.table(header, rows) + pieces.note(note)
 
 
 _SKY = (
