@@ -1,6 +1,7 @@
 """Configuration of the documentation. It builds without a network."""
 
 import csv
+import hashlib
 import os
 from pathlib import Path
 
@@ -19,7 +20,7 @@ copyright = "2025, pyklip_diffrender developers"
 release = version = pyklip_diffrender.__version__
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
@@ -29,6 +30,8 @@ extensions = [
 ]
 exclude_patterns = ["_build", "results"]
 templates_path = ["_templates"]
+html_static_path = ["_static"]
+html_css_files = ["narrow.css"]
 html_theme = "furo"
 html_title = f"pyklip_diffrender {release}"
 
@@ -42,6 +45,22 @@ numpydoc_xref_param_type = True
 numpydoc_xref_aliases = {name: f"pyklip_diffrender.errors.{name}" for name in errors.__all__}
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
+
+# Tutorials are run by the build, and an error in one of them ends it. Outputs are kept for the next
+# build, unless the package has changed in between.
+_package = Path(pyklip_diffrender.__file__).parent
+_code = b"".join(path.read_bytes() for path in sorted(_package.rglob("*.py")))
+_cache = Path(__file__).parent / "_build" / "tutorials" / hashlib.sha256(_code).hexdigest()[:16]
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(_cache)
+nb_execution_timeout = 600
+nb_execution_raise_on_error = True
+nb_execution_show_tb = True
+# A cell prints in several pieces, and they are one output.
+nb_merge_streams = True
+# This one needs frames of the telescope. Without them the page has the outputs that its file has.
+if not os.environ.get("DIFFRENDER_DOCS_DATA"):
+    nb_execution_excludepatterns = ["tutorials/hip65426.ipynb"]
 
 # Links to other projects need their inventories, so they are made only where that is asked for:
 # an inventory that cannot be fetched is a warning, and warnings are errors in the build.
