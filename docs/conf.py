@@ -31,7 +31,7 @@ extensions = [
 exclude_patterns = ["_build", "results"]
 templates_path = ["_templates"]
 html_static_path = ["_static"]
-html_css_files = ["narrow.css"]
+html_css_files = ["phone.css"]
 html_theme = "furo"
 html_title = f"pyklip_diffrender {release}"
 
@@ -43,6 +43,17 @@ autodoc_typehints = "none"
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = True
 numpydoc_xref_aliases = {name: f"pyklip_diffrender.errors.{name}" for name in errors.__all__}
+numpydoc_xref_aliases["OPDMap"] = "pyklip_diffrender.wavefront.opd.OPDMap"
+
+# References have to exist, but for words that stand in single backticks or in the type of a
+# parameter, other projects, attributes of dataclasses, and helpers that have no page.
+nitpicky = True
+nitpick_ignore_regex = [
+    ("py:obj", r"[^.]*"),
+    ("py:obj", r"(poppy|pyklip|stpsf|torch|webbpsf)\..*"),
+    ("py:obj", r"(GaussNewton|RoundMask|calibration|contrast|planning|spectrum)\..*"),
+    ("py:obj", r"pyklip_diffrender\.(linear|pyklip_backend\.subtract|scene\.noise)\..*"),
+]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 

@@ -237,9 +237,10 @@ class Detection:
         """Star-subtracted frames of all fits, with the candidates as part of the model.
 
         A fit without a companion in its model attributes some of its light to the star, so that
-        `Refinement.residual` has lost that light. Here the candidates lose no light, only sources
-        below the threshold do. Images (ny, nx) are in the order of `fits`, in the data's unit, and
-        NaN where the data are masked; frames of one observation are averaged.
+        `pyklip_diffrender.refinement.FrameFit.residual` has lost that light. Here the candidates
+        lose no light, only sources below the threshold do. Images (ny, nx) are in the order of
+        `fits`, in the data's unit, and NaN where the data are masked; frames of one observation are
+        averaged.
         """
         return subtracted_frames(self.fits, self.groups, self.candidates)
 

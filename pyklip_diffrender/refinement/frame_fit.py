@@ -71,7 +71,7 @@ class FrameFit:
         """Data minus star, (frames, ny, nx); NaN where the data are masked.
 
         The fit attributes some of the light of other sources to the star, so that it is missing
-        here; `Detection.subtracted` retains it.
+        here; `pyklip_diffrender.Detection.subtracted` retains it.
         """
         data = self.observation.data - self.star
         return np.where(self.observation.valid, data, np.nan)
