@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 import latex2mathml.converter
-from docutils.nodes import SkipNode
+from docutils.nodes import SkipNode, entry
 from numpydoc.xref import DEFAULT_LINKS
 
 import pyklip_diffrender
@@ -31,7 +31,7 @@ extensions = [
 exclude_patterns = ["_build", "results"]
 templates_path = ["_templates"]
 html_static_path = ["_static"]
-html_css_files = ["phone.css"]
+html_css_files = ["tables_and_figures.css"]
 html_theme = "furo"
 html_title = f"pyklip_diffrender {release}"
 
@@ -122,8 +122,16 @@ def _write_tables(app):
         (folder / f"{name}.txt").write_text(text + "\n", encoding="utf-8")
 
 
+def _mark_short_cells(app, doctree):
+    """Tell the style sheet which cells of tables are too short to be broken."""
+    for cell in doctree.findall(entry):
+        if len(cell.astext()) < 10:
+            cell["classes"].append("short")
+
+
 def setup(app):
     app.add_html_math_renderer(
         "mathml", inline_renderers=(_inline_math, None), block_renderers=(_display_math, None)
     )
     app.connect("builder-inited", _write_tables)
+    app.connect("doctree-read", _mark_short_cells)
