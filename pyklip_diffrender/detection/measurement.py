@@ -74,7 +74,7 @@ def measured_shape(
     relinearise: float,
 ) -> tuple[float, float]:
     """Amplitude of an extended source and its error; see `Detection.measure_shape`."""
-    shape = torch.as_tensor(image)
+    shape = torch.from_numpy(np.ascontiguousarray(image))
     amplitude, error = _amplitude(groups[0][0], shape)
     total, bright = amplitude, amplitude > relinearise * error
     single_frame = len(fits) == 1 and len(fits[0].frames) == 1
