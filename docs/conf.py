@@ -50,7 +50,7 @@ numpydoc_xref_aliases["OPDMap"] = "pyklip_diffrender.wavefront.opd.OPDMap"
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:obj", r"[^.]*"),
-    ("py:obj", r"(poppy|pyklip|stpsf|torch|webbpsf)\..*"),
+    ("py:obj", r"(poppy|pyklip|spaceKLIP|stpsf|torch|webbpsf)\..*"),
     ("py:obj", r"(GaussNewton|RoundMask|calibration|contrast|planning|spectrum)\..*"),
     ("py:obj", r"pyklip_diffrender\.(linear|pyklip_backend\.subtract|scene\.noise)\..*"),
 ]
