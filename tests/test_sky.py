@@ -317,7 +317,7 @@ def test_an_orbit_needs_angle_and_date(sky: Sky, format: str, message: str, tmp_
 # -- real frames -------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.study  # Three minutes.
 def test_the_companion_of_hip_65426_is_on_its_side_of_the_star(shared_data: Path) -> None:
     """The header's roll is a placeholder, but the telescope keeps its shade towards the sun.
 
