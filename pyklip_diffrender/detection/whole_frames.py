@@ -252,9 +252,9 @@ class WholeFrame:
         place = self.offsets_of(np.array([fitted["x_fit"], fitted["y_fit"]], dtype=float))
         values = np.array([fitted["flux_fit"], *place], dtype=float)
         scale = self.fit.model.detector.pixelscale
-        errors = np.array(
-            [fitted["flux_err"], fitted["x_err"] * scale[0], fitted["y_err"] * scale[1]],
-            dtype=float,
-        )
+        variances = np.array([fitted["x_err"], fitted["y_err"]], dtype=float) ** 2
+        # Along the axes of the first frame, from which this one may be rolled.
+        turned = self._turn.T**2 @ (variances * np.square(scale))
+        errors = np.array([fitted["flux_err"], *np.sqrt(turned)], dtype=float)
         usable = np.isfinite(values).all() and (errors > 0).all()
         return (values, errors, float(fitted["reduced_chi2"])) if usable else None

@@ -218,7 +218,7 @@ def wide_field(
         ours[rows, columns] = theirs
     calibration = np.zeros((2, len(sources)))
     star = detection.fits[0].frames[0]
-    calibration[0] = float(star.errors["flux"][0]) / star.flux
+    calibration[0] = detection.scatter * float(star.errors["flux"][0]) / star.flux
     table = candidate_table(sources, factor, calibration, detection.sky)
     # As in the table, the highest S/N first.
     order = np.argsort(-_snr(sources, factor))
