@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import Detection, small_sample_factor
+from pyklip_diffrender.detection import Detection, search, small_sample_factor
 from pyklip_diffrender.detection.calibration import calibration_errors
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.relinearise import with_companions
 from pyklip_diffrender.errors import (
     CorruptFileError,
@@ -951,3 +952,31 @@ def test_a_contrast_curve_outside_the_field_is_refused(one: Detection) -> None:
     # What is partly inside has rows for that part.
     curve = dr.contrast_curve(fit, [500.0, 5000.0] * u.mas)
     assert curve["separation"].to_value("arcsec").tolist() == [0.5]
+
+
+def test_all_errors_have_the_factor_of_their_separation(
+    one: Detection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = dr.detect(one.fits, scatter=1.0)
+    factor = ErrorFactor(np.array([0.2, 0.9]), np.array([1.6, 1.0]))
+    monkeypatch.setattr(search, "_error_factor", lambda *_: factor)
+    found = dr.detect(one.fits)
+    factors = factor.at(np.hypot(found.grid[..., 0], found.grid[..., 1]))
+    assert np.ptp(factors) > 0.3
+    np.testing.assert_allclose(found.error, factors * plain.error)
+    np.testing.assert_allclose(found.snr, plain.snr / factors)
+    np.testing.assert_allclose(found.residual_snr, plain.residual_snr / factors)
+    at_source = factor.at(plain.table["separation"].value)
+    np.testing.assert_allclose(found.table["snr"], plain.table["snr"] / at_source)
+    np.testing.assert_allclose(
+        found.table["separation_error"].value, at_source * plain.table["separation_error"].value
+    )
+    curve = found.contrast_curve
+    np.testing.assert_allclose(curve["error_factor"], factor.at(curve["separation"].value))
+    # A ring is as wide as a pixel.
+    np.testing.assert_allclose(
+        curve["contrast"], plain.contrast_curve["contrast"] * curve["error_factor"], rtol=0.05
+    )
+    offsets = [[0.3, 0.1], [0.0, -0.8]]
+    ratio = found.measure(offsets)["snr"] / plain.measure(offsets)["snr"]
+    np.testing.assert_allclose(ratio, 1 / factor.at(np.hypot(*np.transpose(offsets))))

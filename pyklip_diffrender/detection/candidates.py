@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image, far_from, separation_of
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.detection.templates import Templates
@@ -45,6 +46,11 @@ class Candidates:
     contrasts: Tensor
     covariance: Tensor
     converged: bool = True
+
+    def snr(self, factor: ErrorFactor) -> Image:
+        """S/N of the candidates, (k,), with their errors multiplied by the factor."""
+        errors = self.errors[:, 0].numpy() * factor.of(self.offsets)
+        return np.asarray(self.contrasts.numpy() / errors)
 
     def __len__(self) -> int:
         return len(self.contrasts)

@@ -111,7 +111,7 @@ def detect(
     candidates, factor = _search(maps, fits, threshold, inner, scatter, Candidates.of_fit(fits[0]))
     if not all(fit.status.calibrated for fit in fits):
         relinearise = min(relinearise, threshold)
-    bright = _snr(candidates, factor) > relinearise
+    bright = candidates.snr(factor) > relinearise
     if bright.any() and lacks_candidates(fits, candidates):
         fits = with_companions(fits, candidates, progress)
         maps = Maps(groups_of(fits), progress)
@@ -309,7 +309,7 @@ def _search(
     candidates = refine_candidates(groups, start, reach=pixel / 2)
     # A fit may have taken a residual for a companion while its wavefront was still wrong.
     unscaled = ErrorFactor.constant(1.0)
-    while len(candidates) and _snr(candidates, unscaled).min() < threshold:
+    while len(candidates) and candidates.snr(unscaled).min() < threshold:
         candidates = _without_weakest(groups, candidates, unscaled, pixel)
     # A peak that is no candidate once its position is fitted would be the highest one for ever.
     dismissed = torch.zeros(0, 2, dtype=torch.float64)
@@ -326,9 +326,9 @@ def _search(
                                 inner)  # fmt: skip
         if peak is None or max(len(candidates), len(dismissed)) >= _MAX_CANDIDATES:
             # The factor may have grown since a candidate was accepted.
-            if not len(candidates) or _snr(candidates, factor).min() >= threshold:
+            if not len(candidates) or candidates.snr(factor).min() >= threshold:
                 return candidates, factor
-            weakest = int(_snr(candidates, factor).argmin())
+            weakest = int(candidates.snr(factor).argmin())
             dismissed = torch.cat([dismissed, candidates.offsets[weakest, None]])
             candidates = _without_weakest(groups, candidates, factor, pixel)
             continue
@@ -395,17 +395,11 @@ def _error_factor(
     return measured.at_least(least)
 
 
-def _snr(candidates: Candidates, factor: ErrorFactor) -> Image:
-    """S/N of the candidates."""
-    errors = candidates.errors[:, 0].numpy() * factor.of(candidates.offsets)
-    return np.asarray(candidates.contrasts.numpy() / errors)
-
-
 def _without_weakest(
     groups: Sequence[Group], candidates: Candidates, factor: ErrorFactor, pixel: float
 ) -> Candidates:
     """The other candidates, fitted again."""
-    weakest = int(_snr(candidates, factor).argmin())
+    weakest = int(candidates.snr(factor).argmin())
     return refine_candidates(groups, candidates.without(weakest), reach=pixel / 2)
 
 

@@ -14,7 +14,6 @@ import torch
 from astropy.io import fits
 from astropy.table import QTable, vstack
 from numpy.typing import NDArray
-from torch import Tensor
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
@@ -221,7 +220,7 @@ def wide_field(
     calibration[0] = detection.scatter * float(star.errors["flux"][0]) / star.flux
     table = candidate_table(sources, factor, calibration, detection.sky)
     # As in the table, the highest S/N first.
-    order = np.argsort(-_snr(sources, factor))
+    order = np.argsort(-sources.snr(factor))
     inner = detection.table.copy()
     chi2 = np.array([each.chi2 for each in measured]) / factor.of(sources.offsets) ** 2
     inner["fit_chi2"], table["fit_chi2"] = np.nan, chi2[order]
@@ -365,11 +364,6 @@ def _candidates(sources: Sequence[_Source]) -> Candidates:
         Candidates.at(places, contrasts),
         covariance=torch.diag(torch.from_numpy(variance.T.flatten())),
     )
-
-
-def _snr(sources: Candidates, factor: ErrorFactor) -> Image:
-    errors: Tensor = sources.errors[:, 0]
-    return np.asarray(sources.contrasts.numpy() / (errors.numpy() * factor.of(sources.offsets)))
 
 
 def _curve(
