@@ -20,7 +20,7 @@ from pyklip.parallelized import klip_dataset
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.io.files import replacing
-from pyklip_diffrender.plotting import draw_subtraction, save
+from pyklip_diffrender.plotting import save
 from pyklip_diffrender.refinement import Refinement
 
 COMPANION_RADIUS = 0.35  # arcsec; what is left out of the figure of merit
@@ -118,7 +118,7 @@ def main() -> None:
     table.pprint_all()
     with replacing(options.output / "candidates.ecsv") as path:
         table.write(path, format="ascii.ecsv", overwrite=True)
-    save(draw_subtraction(fit), options.output / "hip65426.png")
+    save(fit.plot()[0].figure, options.output / "hip65426.png")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Figures. The only package that imports matplotlib, and only when a figure is drawn."""
 
-from pyklip_diffrender.plotting.figures import draw_demo, draw_detection, draw_subtraction
+from pyklip_diffrender.plotting.figures import draw_demo, draw_detection
 from pyklip_diffrender.plotting.pages import draw_search, draw_star, draw_wavefronts
 from pyklip_diffrender.plotting.panels import draw_image, save, to_png
 from pyklip_diffrender.plotting.results import (
@@ -18,7 +18,6 @@ __all__ = [
     "draw_limits",
     "draw_search",
     "draw_star",
-    "draw_subtraction",
     "draw_wavefronts",
     "plot_detection",
     "plot_observation",

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pyklip_diffrender.instrument.jwst import maskrnd_openings
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
@@ -17,9 +16,8 @@ if TYPE_CHECKING:
 
     from pyklip_diffrender.demo import DemoResult
     from pyklip_diffrender.detection import Detection
-    from pyklip_diffrender.refinement import Refinement
 
-__all__ = ["draw_demo", "draw_detection", "draw_subtraction"]
+__all__ = ["draw_demo", "draw_detection"]
 
 
 def draw_demo(result: DemoResult) -> Figure:
@@ -99,43 +97,6 @@ def _draw_candidates(ax: Axes, figure: Figure, result: DemoResult) -> None:
     )  # fmt: skip
     ax.plot(*planet.offset, "o", mfc="none", mec=INK, ms=13, mew=1.2)
     figure.colorbar(artist, ax=ax, label="S/N of a point source", shrink=0.85)
-
-
-def draw_subtraction(fit: Refinement) -> Figure:
-    """Draw a fit to real frames: data, star, residual, and residual in units of the noise."""
-    from matplotlib.colors import SymLogNorm
-    from matplotlib.figure import Figure
-
-    frame = fit.frames[0]
-    combined = frame.observation.combined()
-    data, noise = combined.data[0], combined.error[0]
-    residual = np.where(combined.valid[0], data - frame.star, np.nan)
-    scale = fit.model.detector.pixelscale[0]
-    unit = str(frame.observation.unit)
-    limit = float(np.nanpercentile(data, 99.8))
-    norm = SymLogNorm(limit / 30, vmin=-limit / 30, vmax=limit)
-    span = float(np.nanpercentile(np.abs(residual), 99.5))
-    ratio = np.where(combined.valid[0], residual / noise, np.nan)
-
-    figure = Figure(figsize=(15.5, 4.4), layout="constrained")
-    axes = figure.subplots(1, 4)
-    panels: tuple[tuple[NDArray[np.float64], dict[str, Any], str, str], ...] = (
-        (data, {"norm": norm, "cmap": "magma"}, "Data, mean of the integrations", unit),
-        (frame.star, {"norm": norm, "cmap": "magma"}, "Rendered star", unit),
-        (residual, {"limits": (-span, span), "cmap": "RdBu_r"}, "Data - star", unit),
-        (ratio, {"limits": (-8, 8), "cmap": "RdBu_r"}, "(Data - star) / noise", "sigma"),
-    )
-    star = np.zeros(2)
-    for name in ("detector_shift", "star_offset"):
-        star = star + frame.values.get(name, np.zeros(2))
-    for ax, (image, style, title, label) in zip(axes, panels, strict=True):
-        settings: dict[str, Any] = {"limits": (0.0, 1.0), **style}
-        artist = draw_image(ax, image, scale, title=title, **settings)
-        figure.colorbar(artist, ax=ax, label=label, shrink=0.8)
-        ax.set_xlabel("arcsec from the middle of the array", fontsize=8)
-        for _, x, y in fit.companions:
-            ax.plot(star[0] + x, star[1] + y, "o", mfc="none", mec="#2f9e44", ms=16, mew=1.4)
-    return figure
 
 
 def draw_detection(detection: Detection) -> Figure:
