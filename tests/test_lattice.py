@@ -147,6 +147,24 @@ def test_another_kind_of_plane_takes_the_models_own_route(opd: torch.Tensor) -> 
     )
 
 
+def test_the_mask_is_ignored_where_it_changes_images_by_a_percent_at_most(
+    opd: torch.Tensor,
+) -> None:
+    model = system(fov_pixels=(81, 80))
+    sources = PointSources(model, opd)
+    assert 1.0 < sources.reach < 2.4
+    every = torch.arange(80)
+    for rows, columns in ((every, torch.full_like(every, 40)), (every, every.flip(0))):
+        positions = sources.positions(rows, columns)
+        truth = model(opd, positions)
+        difference = (sources.images(rows, columns) - truth).flatten(1).norm(dim=1)
+        relative = difference / truth.flatten(1).norm(dim=1)
+        outside = positions.norm(dim=1) > sources.reach
+        assert 10 < int(outside.sum()) < 70
+        assert 1e-4 < float(relative[outside].max()) < 0.02
+        assert float(relative[~outside].max()) < 1e-4
+
+
 def test_bad_pixels_and_maps_are_refused(opd: torch.Tensor) -> None:
     sources = PointSources(system(), opd)
     with pytest.raises(ShapeError, match="rows: expected indices from 0 to 29"):

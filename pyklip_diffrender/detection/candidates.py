@@ -24,8 +24,9 @@ __all__ = ["Candidates", "refine_candidates", "strongest_peak"]
 _log = logging.getLogger(__name__)
 
 _ITERATIONS = 12
-_SETTLED = 0.02
-"""The fit ends when all steps are shorter than this many standard deviations."""
+_SETTLED = 0.05
+"""A position whose step is shorter than this many standard deviations stays where it is, so that
+its images are used again; the fit ends when all steps are shorter."""
 
 
 @dataclass(frozen=True)
@@ -141,13 +142,14 @@ def refine_candidates(groups: Sequence[Group], candidates: Candidates, reach: fl
         covariance = torch.linalg.inv(system) / scale[:, None] / scale
         step = covariance @ vector
         contrasts = contrasts + step[:count]
-        moves = step[count:].reshape(2, count).T
-        longest = moves.norm(dim=1, keepdim=True).clamp(min=1e-300)
-        offsets = offsets + moves * (reach / longest).clamp(max=1.0)
-        deviation = covariance.diagonal().sqrt()
-        if bool((step.abs() < _SETTLED * deviation).all()):
+        is_settled = (step.abs() < _SETTLED * covariance.diagonal().sqrt()).reshape(3, count)
+        if bool(is_settled.all()):
             converged = True
             break
+        moves = step[count:].reshape(2, count).T
+        longest = moves.norm(dim=1, keepdim=True).clamp(min=1e-300)
+        moves = moves * (reach / longest).clamp(max=1.0)
+        offsets = offsets + torch.where(is_settled[1:].all(dim=0)[:, None], 0.0, moves)
     if not converged:
         _log.info("positions did not settle, number of candidates: %d", count)
     return Candidates(offsets, contrasts, covariance, converged)

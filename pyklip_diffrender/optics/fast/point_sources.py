@@ -41,8 +41,11 @@ _NEAR = 0.15
 the light is suppressed a thousandfold, and the error of single precision is 4e-6 of the image."""
 
 _ALIKE = 0.01
-"""Largest relative rms difference from the images of the model at which the outer parts of a mask
-are ignored. An error of a percent of a planet's template costs 5e-5 of its S/N."""
+"""Largest relative rms difference from the images of the model at which the outer parts of a mask,
+or all of it, are ignored. An error of a percent of a planet's template costs 5e-5 of its S/N."""
+
+_STEP = 4
+"""Number of pixels by which the reach of the mask is searched."""
 
 
 class PointSources:
@@ -67,6 +70,9 @@ class PointSources:
         calling the model. The model is called if the planes are not one mask between pupil planes.
         A mask of several parts is reduced to the first one if that changes the images of a few
         test sources by a percent at most.
+    reach : float
+        Distance from the axis, arcsec, beyond which the mask changes images by a percent at most.
+        There, it is ignored: images are then the same but for a shift, and cost next to nothing.
     """
 
     def __init__(
@@ -90,6 +96,7 @@ class PointSources:
             self.route = "lattice" if self._waves else "model"
             if any(isinstance(p, SampledOcculter) for p in model.planes) and not self._agrees():
                 self._waves, self.route = [], "model"
+            self.reach = self._reach()
         _log.debug("images of point sources: method %r", self.route)
 
     def _prepared(self, sampling: float) -> list[_Wave]:
@@ -114,6 +121,27 @@ class PointSources:
         exact = self.model(self._opd, self.positions(rows, columns), **self._values).double()
         away = (self.images(rows, columns).double() - exact).flatten(1).norm(dim=1)
         return bool((away <= _ALIKE * exact.flatten(1).norm(dim=1)).all())
+
+    def _reach(self) -> float:
+        """Search the reach of the mask, from the outside, to the right and towards a corner."""
+        if self.route == "model" or not self._radius:
+            return math.inf
+        ny, nx = self.model.detector.shape
+        reach = 0.0
+        for slope in (0.0, ny / nx):
+            columns = torch.arange(nx // 2, nx)
+            rows = ((ny - 1) / 2 + slope * (columns - (nx - 1) / 2)).round().to(torch.int64)
+            distances = self.positions(rows, columns).norm(dim=-1)
+            for last in range(len(rows), 0, -_STEP):
+                part = slice(max(0, last - _STEP), last)
+                exact, plain = (
+                    self._batch_of_images(rows[part], columns[part], False, masked).flatten(1)
+                    for masked in (True, False)
+                )
+                if bool(((plain - exact).norm(dim=1) > _ALIKE * exact.norm(dim=1)).any()):
+                    reach = max(reach, float(distances[part][-1]))
+                    break
+        return reach
 
     def _wave(self, planes: Sequence[Plane], wavelength: float, sampling: float) -> _Wave:
         model, values = self.model, self._values
@@ -169,11 +197,12 @@ class PointSources:
         shape = (len(rows), *self.model.detector.shape)
         images = torch.empty(shape, dtype=torch.float32, device=self.model.device)
         with torch.no_grad():
-            needs_double = self._needs_double(self.positions(rows, columns))
-            for double in (False, True):
-                selected = torch.nonzero(needs_double == double).flatten()
-                for part in selected.split(self._batch(double)) if len(selected) else ():
-                    images[part] = self._batch_of_images(rows[part], columns[part], double)
+            distances = self.positions(rows, columns).norm(dim=-1)
+            needs_double, masked = self._needs_double(distances), distances <= self.reach
+            for kind in ((False, False), (False, True), (True, True)):
+                selected = torch.nonzero((needs_double == kind[0]) & (masked == kind[1])).flatten()
+                for part in selected.split(self._batch(kind[0])) if len(selected) else ():
+                    images[part] = self._batch_of_images(rows[part], columns[part], *kind)
         return images
 
     def _indices(self, rows: Index, columns: Index) -> tuple[Tensor, Tensor]:
@@ -189,10 +218,10 @@ class PointSources:
             raise ShapeError(f"got {len(pair[0])} rows and {len(pair[1])} columns")
         return pair[0], pair[1]
 
-    def _needs_double(self, positions: Tensor) -> Tensor:
-        """Whether positions need double precision, (k,)."""
+    def _needs_double(self, distances: Tensor) -> Tensor:
+        """Whether sources at distances from the axis need double precision, (k,)."""
         radius = self._radius if self.model.dtype == torch.float64 else 0.0
-        return positions.norm(dim=-1) < _NEAR * radius
+        return distances < _NEAR * radius
 
     def _batch(self, double: bool) -> int:
         if self.route == "lattice":
@@ -200,7 +229,7 @@ class PointSources:
             return max(1, int(_BATCH_BYTES / size))
         return max(1, int(5 * _BATCH_BYTES / (16 * self.model.npix**2)))
 
-    def _batch_of_images(self, rows: Tensor, columns: Tensor, double: bool) -> Tensor:
+    def _batch_of_images(self, rows: Tensor, columns: Tensor, double: bool, masked: bool) -> Tensor:
         if self.route == "model":
             offsets = self.positions(rows, columns)
             return self.model(self._opd, offsets, **self._values).to(torch.float32)
@@ -209,7 +238,7 @@ class PointSources:
         real = torch.float64 if double else torch.float32
         total = torch.zeros(len(rows), ny, nx, dtype=real, device=self.model.device)
         for wave, weight in zip(self._waves, self.model.bandpass.weights, strict=True):
-            wave.add_intensity(total, rows, columns, float(weight))
+            wave.add_intensity(total, rows, columns, float(weight), masked)
         return self.model.detector.image(total, self._values).to(torch.float32)
 
 
@@ -297,14 +326,16 @@ class _Wave:
         x, y = (axis.to(field.device) for axis in axes)
         return MatrixFourier(like.grid, x, y, like.wavelength, field.dtype, shear).forward(field)
 
-    def add_intensity(self, total: Tensor, rows: Tensor, columns: Tensor, weight: float) -> None:
+    def add_intensity(
+        self, total: Tensor, rows: Tensor, columns: Tensor, weight: float, masked: bool
+    ) -> None:
         """Add the weighted intensities of sources to `total`, (k, samples in y, samples in x)."""
         k = self._oversample
         ny, nx = self._shape
         up, left = ny - 1 - rows, nx - 1 - columns
         direct, *occulted = self._tables[total.dtype]
         field = _cut(direct, up * k, left * k, (ny * k, nx * k))
-        if self._lattice is not None:
+        if masked and self._lattice is not None:
             blocked, focus, kernel = occulted
             qx, qy = self._per_pixel
             light = _cut(focus, up * qy, left * qx, tuple(blocked.shape)).mul_(blocked)
