@@ -15,9 +15,11 @@ if TYPE_CHECKING:
     from pyklip_diffrender.bridges import from_poppy, from_webbpsf
     from pyklip_diffrender.detection import (
         Detection,
+        Disk,
         WideField,
         contrast_curve,
         detect,
+        fit_disk,
         measure,
         wide_field,
     )
@@ -57,6 +59,7 @@ __all__ = [
     "Adam",
     "Detection",
     "DiffrenderSettings",
+    "Disk",
     "GaussNewton",
     "LinearModel",
     "Observation",
@@ -79,6 +82,7 @@ __all__ = [
     "detect",
     "drift",
     "fetch_calints",
+    "fit_disk",
     "from_poppy",
     "from_webbpsf",
     "known_systematics",
@@ -104,7 +108,7 @@ __all__ = [
 _NAMES = {
     "archive": "fetch_calints list_calints",
     "bridges": "from_poppy from_webbpsf",
-    "detection": "Detection WideField contrast_curve detect measure wide_field",
+    "detection": "Detection Disk WideField contrast_curve detect fit_disk measure wide_field",
     "instrument.nircam": "nircam_coronagraph",
     "linear.model": "LinearModel",
     "optics.system": "OpticalSystem",

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pyklip_diffrender.detection import Detection, WideField, detect, wide_field
+from pyklip_diffrender.detection import Detection, Disk, WideField, detect, fit_disk, wide_field
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.io.units import require_bound
@@ -30,7 +31,7 @@ class Reduction:
     sequence : Sequence
         What was reduced, cut to the fitted pixels.
     fit : Refinement
-        All frames of the target, fitted together.
+        All frames of the target, fitted together; without the light of a disk, if that was fitted.
     detection : Detection
     references : tuple of Refinement
         One for each reference star.
@@ -40,6 +41,8 @@ class Reduction:
         Reference stars that could not be fitted, and why.
     wide : WideField or None
         The search of the whole frames, if it was asked for.
+    disk : Disk or None
+        Extended light about the star, if it was asked for.
     """
 
     sequence: Sequence
@@ -49,6 +52,7 @@ class Reduction:
     systematics: Systematics | None = None
     failed: tuple[tuple[str, str], ...] = ()
     wide: WideField | None = None
+    disk: Disk | None = None
 
     def __repr__(self) -> str:
         return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"
@@ -85,6 +89,8 @@ class Reduction:
         written.append(self.detection.fits[0].write(folder / "fit.fits"))
         if self.wide is not None:
             written += self.wide.write(folder)
+        if self.disk is not None:
+            written.append(self.disk.write(folder))
         if self.systematics is not None:
             written.append(self.systematics.write(folder / "systematics.fits"))
         return written + report.write_report(self, folder, written)
@@ -101,6 +107,7 @@ def reduce(
     settings: GaussNewton | None = None,
     threshold: float = 5.0,
     wide: bool = False,
+    disk: bool = False,
     device: str = "cpu",
     progress: bool = False,
 ) -> Reduction:
@@ -132,6 +139,8 @@ def reduce(
     wide : bool
         Search the whole frames as well, see `wide_field`. If sources beyond the fitted pixels are
         bright enough to be seen in these, the star is fitted once more without their light.
+    disk : bool
+        Fit extended light about the star, see `fit_disk`, and search the frames without it.
     device : str
         PyTorch device of the optical model.
     progress : bool
@@ -143,11 +152,19 @@ def reduce(
 
     Raises
     ------
+    IncompatibleSetupError
+        For `wide` together with `disk`: beyond the fitted pixels a disk would be taken for point
+        sources.
     DiffrenderError
         If the target cannot be fitted. A reference star that cannot be is left out.
     """
     # Before the fits, which take minutes.
     require_bound(threshold, "threshold", "positive")
+    if wide and disk:
+        raise IncompatibleSetupError(
+            "got wide=True and disk=True, expected one of them: beyond the fitted pixels a disk "
+            "would be taken for point sources"
+        )
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
     wavefront = wavefront_for(opd, sequence.date)
@@ -170,6 +187,11 @@ def reduce(
     }
     with stage("2 of 4: wavefront"):
         fit = refine(model, sequence.science, wavefront, **options)
+    extended = None
+    if disk:
+        with stage("2 of 4: extended light, and wavefront without it"):
+            extended = fit_disk(fit, progress=progress)
+            fit = extended.fit
     with stage("3 of 4: search"):
         detection = detect(fit, threshold=threshold, progress=progress)
         outside = wide_field(detection, whole) if wide else None
@@ -187,4 +209,5 @@ def reduce(
         choice.systematics,
         choice.failed,
         outside,
+        extended,
     )

@@ -32,7 +32,7 @@ _DEMO = ("demo.fits", "demo.ecsv", "candidates.ecsv", "demo.png")
 _REDUCTION = (
     "detection.fits", "candidates.ecsv", "contrast.ecsv", "fit.fits", "systematics.fits",
     "astrometry.csv", "wide_field.fits", "wide_field_candidates.ecsv", "wide_field_contrast.ecsv",
-    "report.html", "summary.json", "detection.png",
+    "disk.fits", "report.html", "summary.json", "detection.png",
 )  # fmt: skip
 
 
@@ -292,6 +292,7 @@ def _reduction(
     size: int,
     threshold: float,
     wide: bool,
+    disk: bool,
     systematics: str,
     opd: Path | None,
     opd_folder: Path | None,
@@ -329,6 +330,7 @@ def _reduction(
             systematics=known,
             threshold=threshold,
             wide=wide,
+            disk=disk,
             device=run.device,
             progress=run.progress,
         )

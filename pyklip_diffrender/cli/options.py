@@ -224,6 +224,8 @@ search = _all(
            section="Fit and search", help="S/N of a candidate."),
     option("--wide", is_flag=True, section="Fit and search",
            help="Search the whole frames as well, to their edge."),
+    option("--disk", is_flag=True, section="Fit and search",
+           help="Fit extended light about the star, such as a disk, together with the star."),
     option("--systematics", default="auto", show_default=True, metavar="CHOICE",
            section="Fit and search",
            help="Pattern of the model's error: auto (the package's library, else the reference "

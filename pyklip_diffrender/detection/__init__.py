@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import small_sample_factor
+from pyklip_diffrender.detection.disk import Disk, fit_disk
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure
 from pyklip_diffrender.detection.wide_search import WideField, wide_field
@@ -17,9 +18,11 @@ from pyklip_diffrender.detection.wide_search import WideField, wide_field
 __all__ = [
     "Candidates",
     "Detection",
+    "Disk",
     "WideField",
     "contrast_curve",
     "detect",
+    "fit_disk",
     "measure",
     "small_sample_factor",
     "wide_field",

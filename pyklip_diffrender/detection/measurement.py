@@ -80,7 +80,7 @@ def measured_shape(
     single_frame = len(fits) == 1 and len(fits[0].frames) == 1
     factor = scatter
     for _ in range(_ROUNDS if bright and single_frame else 0):
-        fit = without_light(fits[0], total * image)
+        fit = without_light(fits[0], {0: total * image})
         amplitude, error = _amplitude(fit.star_only, shape)
         total += amplitude
         factor = 1.0 if fit.status.calibrated else scatter

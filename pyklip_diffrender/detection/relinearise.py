@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import has_only_reference_stars
-from pyklip_diffrender.refinement import Refinement, refine, refine_again
+from pyklip_diffrender.refinement import Refinement, refine_again
+from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["lacks_candidates", "with_companions", "without_light"]
 
@@ -49,20 +48,24 @@ def with_companions(
     return refined
 
 
-def without_light(fit: Refinement, light: NDArray[np.float64]) -> Refinement:
-    """Refine the star of a single frame again after light (ny, nx) is subtracted from the data.
+def without_light(
+    fit: Refinement, light: Mapping[int, Image], original: Sequence[Observation] | None = None
+) -> Refinement:
+    """Refine the star again after light is subtracted from the data, without companions.
 
     The errors of the data still contain the photon noise of that light.
+
+    Parameters
+    ----------
+    fit : Refinement
+    light : mapping of int to ndarray, (ny, nx)
+        By frame.
+    original : sequence of Observation, optional
+        The frames from which it is subtracted; default those of the fit.
     """
-    (frame,) = fit.frames
-    observation = replace(frame.observation, data=frame.observation.data - light)
-    return refine(
-        frame.model,
-        observation,
-        fit.initial,
-        settings=fit.settings,
-        start=frame.start,
-        systematics=fit.systematics,
-        plan=fit.plan or "off",
-        seed=fit.seed,
-    )
+    observations = original or [frame.observation for frame in fit.frames]
+    frames = [
+        replace(frame, observation=replace(observation, data=observation.data - light.get(k, 0.0)))
+        for k, (frame, observation) in enumerate(zip(fit.frames, observations, strict=True))
+    ]
+    return refine_again(replace(fit, frames=tuple(frames)), companions=())

@@ -131,18 +131,27 @@ class Templates:
             images[k] = (frame.flux * sources).cpu()
         return images
 
+    def pixels_of(self, k: int, offsets: Tensor) -> NDArray[np.float64]:
+        """Rows and columns in frame k, (2, n), of positions in the first frame, (n, 2)."""
+        return self._pixels(k, self._turned(k, offsets)).numpy()
+
+    def _pixels(self, k: int, offsets: Tensor) -> Tensor:
+        """Rows and columns of positions in frame k, (2, n)."""
+        frame = self.frames[k]
+        detector = frame.model.detector
+        first = self._points(k).positions([0], [0])[0].cpu()
+        x, y = (self._star(frame) + offsets - first).T
+        return torch.stack(
+            [(y - detector.shear * x) / detector.pixelscale[1], x / detector.pixelscale[0]]
+        )
+
     def _near(self, k: int, offsets: Tensor) -> Tensor:
         """Sources in frame k, each moved to the nearest of the places in `_points`.
 
         Those that are not on the detector have no light.
         """
-        frame = self.frames[k]
-        detector = frame.model.detector
-        first = self._points(k).positions([0], [0])[0].cpu()
-        x, y = (self._star(frame) + offsets - first).T
-        fine = torch.stack([(y - detector.shear * x) / detector.pixelscale[1],
-                            x / detector.pixelscale[0]])  # fmt: skip
-        fine = (_FINE * fine).round().to(torch.int64)
+        detector = self.frames[k].model.detector
+        fine = (_FINE * self._pixels(k, offsets)).round().to(torch.int64)
         pixel = torch.div(fine + _FINE // 2, _FINE, rounding_mode="floor")
         part = fine - _FINE * pixel
         ny, nx = detector.shape

@@ -18,15 +18,15 @@ from pyklip_diffrender.plotting.panels import (
     turned,
     unit_label,
 )
-from pyklip_diffrender.plotting.results import plot_detection
+from pyklip_diffrender.plotting.results import plot_detection, plot_disk
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pyklip_diffrender.detection import Detection, WideField
+    from pyklip_diffrender.detection import Detection, Disk, WideField
 
-__all__ = ["draw_search", "draw_star", "draw_wavefronts"]
+__all__ = ["draw_disk", "draw_search", "draw_star", "draw_wavefronts"]
 
 _SIZE = (4.6, 3.7)
 """Of a panel, inches: its letters are as large as a page's where it is as wide as a phone."""
@@ -42,6 +42,13 @@ def draw_search(detection: Detection | WideField) -> list[Figure]:
     """The S/N map with the candidates, and the contrast curve."""
     figures, axes = _panels(2)
     plot_detection(detection, axes)
+    return figures
+
+
+def draw_disk(disk: Disk) -> list[Figure]:
+    """The frames without the star, and the extended light."""
+    figures, axes = _panels(2)
+    plot_disk(disk, axes)
     return figures
 
 

@@ -29,14 +29,20 @@ from pyklip_diffrender.plotting.panels import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from pyklip_diffrender.detection import Detection, WideField
+    from pyklip_diffrender.detection import Detection, Disk, WideField
     from pyklip_diffrender.optics.grid import PupilGrid
     from pyklip_diffrender.optics.planes import Wavefront
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.refinement import Refinement
     from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["plot_detection", "plot_observation", "plot_refinement", "plot_system"]
+__all__ = [
+    "plot_detection",
+    "plot_disk",
+    "plot_observation",
+    "plot_refinement",
+    "plot_system",
+]
 
 _LIGHT = "magma"
 _SIGNED = "RdBu_r"
@@ -178,6 +184,26 @@ def plot_detection(detection: Detection | WideField, ax: Any = None) -> NDArray[
     # Below the axes: candidates may be anywhere in them.
     right.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
     return np.array([snr_axes, right])
+
+
+def plot_disk(disk: Disk, ax: Any = None) -> NDArray[Any]:
+    """See `Disk.plot`."""
+    axes = axes_for(ax, 2)
+    observation = disk.fit.frames[0].observation
+    extent = extent_of(disk.grid[0, :, 0], disk.grid[:, 0, 1])
+    limit = float(np.nanpercentile(disk.light[0], 99)) or float(np.nanmax(disk.error))
+    for each, image, title in (
+        (axes[0], disk.image, "frames without the star"),
+        (axes[1], disk.light[0], "extended light"),
+    ):
+        show(
+            each, image, extent, bar=unit_label(observation.unit), title=title, cmap=_SIGNED,
+            vmin=-limit, vmax=limit,
+        )  # fmt: skip
+        label_sky(each)
+        if observation.position_angles is not None:
+            draw_compass(each, observation.position_angle)
+    return np.array(axes)
 
 
 def _snr_norm(snr: NDArray[np.float64]) -> Any:

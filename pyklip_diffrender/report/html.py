@@ -40,6 +40,7 @@ _PRODUCTS = {
     "candidates.ecsv": "the candidates with all columns",
     "contrast.ecsv": "the contrast curve",
     "astrometry.csv": "epoch and positions of the candidates, for orbitize!",
+    "disk.fits": "the extended light: frames without the star, and its sources",
     "fit.fits": "the fit, for Refinement.read",
     "systematics.fits": "the pattern of the model's error, for other reductions",
     "summary.json": "the content of this page, for programs",
@@ -53,6 +54,7 @@ def page(
     stars: Sequence[Sequence[Picture]],
     wavefront: Sequence[Picture],
     wide: Sequence[Picture] = (),
+    disk: Sequence[Picture] = (),
     files: Sequence[str] = (),
 ) -> str:
     """The report.
@@ -61,8 +63,8 @@ def page(
     ----------
     summary : dict
         See `summarise`.
-    search, wavefront, wide : sequence of Picture
-        Those of whole frames, `wide`, may be missing.
+    search, wavefront, wide, disk : sequence of Picture
+        Those of whole frames, `wide`, and of extended light, `disk`, may be missing.
     stars : sequence of sequence of Picture
         One for each frame of the target that is shown.
     files : sequence of str
@@ -83,6 +85,11 @@ def page(
         *(
             [pieces.section("Whole frames", pieces.pictures(wide, "pair"), _wide(summary))]
             if wide
+            else []
+        ),
+        *(
+            [pieces.section("Extended light", pieces.pictures(disk, "pair"), _disk(summary))]
+            if disk
             else []
         ),
         pieces.section("Star subtraction", *_star(summary, stars)),
@@ -192,6 +199,21 @@ def _candidates(summary: Mapping[str, Any]) -> str:
         + pieces.table(header, rows)
         + pieces.note(note)
         + _on_sky(summary["candidates"])
+    )
+
+
+def _disk(summary: Mapping[str, Any]) -> str:
+    """What was fitted as extended light."""
+    disk = summary["disk"]
+    axis = (
+        ""
+        if disk["position_angle_deg"] is None
+        else f" Its long axis has a position angle of {disk['position_angle_deg']:.1f} deg."
+    )
+    return pieces.note(
+        f"Altogether {scientific(disk['contrast'])} of the star's light, in {disk['sources']} "
+        f"sources that lower chi-squared by {disk['chi2_decrease']:.0f}.{axis} The search and the "
+        "limits above are for frames without this light. A planet in a disk is part of it."
     )
 
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pyklip_diffrender.detection import WideField
-from pyklip_diffrender.plotting import draw_search, draw_star, draw_wavefronts, to_png
+from pyklip_diffrender.detection import Disk, WideField
+from pyklip_diffrender.plotting import draw_disk, draw_search, draw_star, draw_wavefronts, to_png
 from pyklip_diffrender.plotting.panels import unit_label
 from pyklip_diffrender.reduction import Reduction
 from pyklip_diffrender.report.summary import wavefronts
@@ -16,6 +16,7 @@ from pyklip_diffrender.report.words import number
 __all__ = [
     "MOST_FRAMES",
     "Picture",
+    "disk_pictures",
     "search_pictures",
     "star_pictures",
     "wavefront_pictures",
@@ -114,6 +115,24 @@ def wide_pictures(wide: WideField) -> list[Picture]:
     )
 
 
+def disk_pictures(disk: Disk) -> list[Picture]:
+    """The frames without the star, and the extended light that was fitted."""
+    return _pictures(
+        draw_disk(disk),
+        (
+            "Image of the extended light: the frames without the star.",
+            "Frames minus the star, turned to the orientation of the first one and averaged. "
+            "The star was fitted together with the extended light, which therefore is not "
+            "subtracted with it.",
+        ),
+        (
+            "Image of the extended light that was fitted.",
+            "Light of the non-negative sources that were fitted together with the star, as the "
+            "coronagraph shows it in the first frame.",
+        ),
+    )
+
+
 def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
     """Data, model and residual of a frame."""
     detection = reduction.detection
@@ -125,6 +144,7 @@ def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
         else ""
     )
     mean = f", the mean of {count} integrations" if count > 1 else ""
+    mean += "" if reduction.disk is None else ", without the extended light"
     return _pictures(
         draw_star(detection, frame),
         (

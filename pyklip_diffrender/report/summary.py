@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pyklip_diffrender import __version__
-from pyklip_diffrender.detection import Detection, WideField
+from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.reduction import Reduction
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.report.words import advice, sentence
+from pyklip_diffrender.report.words import MANY, advice, sentence
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["summarise", "wavefronts"]
@@ -62,7 +62,11 @@ def summarise(reduction: Reduction) -> dict[str, Any]:
         "status": {
             "name": fit.status.name,
             "message": fit.status.message,
-            "advice": advice(fit.status, patterned=reduction.systematics is not None),
+            "advice": advice(
+                fit.status,
+                patterned=reduction.systematics is not None,
+                many=reduction.disk is None and len(detection.table) >= MANY,
+            ),
             "usable": fit.status.usable,
             "calibrated": fit.status.calibrated,
         },
@@ -76,6 +80,7 @@ def summarise(reduction: Reduction) -> dict[str, Any]:
         "systematics": _systematics(reduction),
         "candidates": _candidates(detection),
         "wide_field": None if reduction.wide is None else _wide_field(reduction.wide),
+        "disk": None if reduction.disk is None else _disk(reduction.disk),
         "limits": _limits(detection),
         "contrast_curve": _curve(detection.contrast_curve),
         "frames": [
@@ -175,6 +180,16 @@ def _rows(table: QTable) -> list[dict[str, Any]]:
 def _wide_field(wide: WideField) -> dict[str, Any]:
     """Candidates and limits in the whole frames."""
     return {"candidates": _rows(wide.table), "contrast_curve": _curve(wide.contrast_curve)}
+
+
+def _disk(disk: Disk) -> dict[str, Any]:
+    """Extended light in numbers."""
+    return {
+        "contrast": disk.contrast,
+        "sources": len(disk.contrasts),
+        "chi2_decrease": disk.gain,
+        "position_angle_deg": disk.orientation,
+    }
 
 
 def _false_alarm(detection: Detection, snr: float, separation: float) -> float:

@@ -9,6 +9,7 @@ from typing import Any
 from pyklip_diffrender.refinement import Status
 
 __all__ = [
+    "MANY",
     "advice",
     "number",
     "plus_minus",
@@ -57,14 +58,49 @@ _REFERENCES = (
 )
 
 
-def advice(status: Status, *, patterned: bool) -> str:
-    """What to do about the status of a fit, with or without a known pattern of its error."""
-    missing = status is Status.MODEL_MISMATCH and not patterned
-    return _ADVICE[status] + (_REFERENCES if missing else "")
+MANY = 3
+"""Number of candidates from which extended light is likely."""
+
+_EXTENDED = (
+    " Several candidates about one star are more often parts of a disk, or residuals of the star, "
+    "than planets: repeat the reduction with --disk, reduce(disk=True) in Python."
+)
+
+
+def advice(status: Status, *, patterned: bool, many: bool = False) -> str:
+    """What to do about the status of a fit.
+
+    Parameters
+    ----------
+    status : Status
+    patterned : bool
+        Whether the pattern of the model's error was known.
+    many : bool
+        Whether there are so many candidates that extended light is likely.
+    """
+    if status is not Status.MODEL_MISMATCH:
+        return _ADVICE[status]
+    missing = "" if patterned else _REFERENCES
+    return _ADVICE[status] + missing + (_EXTENDED if many else "")
 
 
 def sentence(summary: Mapping[str, Any]) -> str:
-    """The result in a sentence or two."""
+    """The result in a few sentences."""
+    if summary["disk"] is not None:
+        return " ".join([_extended(summary), _compact(summary)])
+    return _compact(summary)
+
+
+def _extended(summary: Mapping[str, Any]) -> str:
+    """The extended light in a sentence."""
+    disk = summary["disk"]
+    angle = disk["position_angle_deg"]
+    along = "" if angle is None else f", its long axis at a position angle of {angle:.1f} deg"
+    return f"Extended light of {scientific(disk['contrast'])} of the star's was fitted{along}."
+
+
+def _compact(summary: Mapping[str, Any]) -> str:
+    """Companions, or the limit, in a sentence or two."""
     candidates, threshold = summary["candidates"], summary["threshold_snr"]
     if not candidates:
         return " ".join([f"No companion above {threshold:g} sigma.", *_limit(summary)])

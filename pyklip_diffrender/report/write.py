@@ -12,6 +12,7 @@ from pyklip_diffrender.reduction import Reduction
 from pyklip_diffrender.report.html import page
 from pyklip_diffrender.report.pictures import (
     MOST_FRAMES,
+    disk_pictures,
     search_pictures,
     star_pictures,
     wavefront_pictures,
@@ -48,6 +49,7 @@ def write_report(
         [star_pictures(reduction, frame) for frame in frames],
         wavefront_pictures(reduction, summary),
         [] if reduction.wide is None else wide_pictures(reduction.wide),
+        [] if reduction.disk is None else disk_pictures(reduction.disk),
         [path.name for path in (*files, html, data)],
     )
     written = {html: text, data: json.dumps(summary, indent=2, allow_nan=False) + "\n"}

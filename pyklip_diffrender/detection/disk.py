@@ -1,0 +1,345 @@
+"""Extended light about a star, such as a disk: non-negative sources fitted with the star.
+
+With the star marginalised as for point sources, the light a of sources on a grid of positions
+minimises
+
+    a^T M a / 2 - v^T a + s sum_j a_j / sigma_j,    a >= 0,
+
+where M and v are the normal equations of the sources' images and sigma_j is the standard deviation
+of source j alone. Frames of several rolls share the sources, which turn with the sky, while the
+star stays. The last term, a threshold of s standard deviations, keeps sources at zero that only
+noise asks for.
+
+The light of a disk biases the star that was fitted without it, beyond the range of the linear
+model. So the star is fitted again without that light, until the sources hardly change.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import QTable
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+from scipy.optimize import minimize
+
+from pyklip_diffrender.detection.field import Image, separation_of
+from pyklip_diffrender.detection.groups import groups_of
+from pyklip_diffrender.detection.relinearise import without_light
+from pyklip_diffrender.detection.storage import image_hdu
+from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.files import write_fits
+from pyklip_diffrender.io.progress import ProgressBar
+from pyklip_diffrender.io.units import to_arcsec
+from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["Disk", "fit_disk"]
+
+_log = logging.getLogger(__name__)
+
+_SPACING = 2
+"""Distance of neighbouring sources, pixels: about lambda/D in NIRCam's long-wave filters."""
+
+_THRESHOLD = 1.0
+"""Standard deviations that a source has to exceed."""
+
+_ROUNDS = 2
+"""Largest number of times that the star is fitted again."""
+
+_SIGNIFICANT = 4.0
+"""Decrease of chi-squared per source below which it is noise: it was 1.9 for a star without a disk,
+and 18 to 26 for stars with one."""
+
+_GAIN = 0.02
+"""Decrease of chi-squared per pixel below which the star is not fitted again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Disk:
+    """Extended light about a star.
+
+    Attributes
+    ----------
+    fit : Refinement
+        The star, fitted to the frames without the extended light.
+    light : tuple of ndarray, (ny, nx)
+        The extended light in every frame of the target, as the coronagraph shows it, in the data's
+        unit.
+    image : ndarray, (ny, nx)
+        Frames minus the star, turned to the orientation of the first one and averaged, in the
+        data's unit. It has the noise of the data and their resolution; NaN where no frame has a
+        valid pixel.
+    error : ndarray, (ny, nx)
+        Standard deviation of `image` for a known star.
+    grid : ndarray, (ny, nx, 2)
+        x, y of the first frame's pixels from the star, arcsec.
+    offsets : ndarray, (k, 2)
+        x, y from the star of the sources that are not zero, arcsec, in the first frame.
+    contrasts : ndarray, (k,)
+        Their light as a fraction of the star's, before the coronagraph. Empty if there is no
+        significant extended light; `light` is then 0.
+    gain : float
+        Decrease of chi-squared by the sources in the frames' first fit, with the star marginalised.
+    """
+
+    fit: Refinement
+    light: tuple[Image, ...]
+    image: Image
+    error: Image
+    grid: Image
+    offsets: Image
+    contrasts: Image
+    gain: float
+
+    def __repr__(self) -> str:
+        return (
+            f"<Disk: {len(self.contrasts)} sources, {self.contrast:.3g} of the star's light, "
+            f"chi-squared lower by {self.gain:.4g}>"
+        )
+
+    @property
+    def contrast(self) -> float:
+        """All extended light as a fraction of the star's."""
+        return float(self.contrasts.sum())
+
+    @property
+    def orientation(self) -> float | None:
+        """Position angle of the long axis of the light, degrees east of north, from 0 to 180.
+
+        The axis of the largest second moment of the sources about the star. None if there are no
+        sources, or where the orientation of the frames is not known.
+        """
+        north = self.fit.frames[0].observation.position_angles
+        if north is None or not len(self.contrasts):
+            return None
+        x, y = self.offsets.T
+        # Twice the angle, so that both sides of the star count alike.
+        doubled = 2 * np.arctan2(-x, y)
+        weight = self.contrasts * (x**2 + y**2)
+        angle = np.arctan2(weight @ np.sin(doubled), weight @ np.cos(doubled)) / 2
+        return float((np.degrees(angle) + north[0]) % 180)
+
+    def plot(self, ax: Any = None) -> NDArray[Any]:
+        """Draw the frames without the star, and the extended light in the first one.
+
+        Parameters
+        ----------
+        ax : two Axes, optional
+            Default those of a new figure.
+
+        Returns
+        -------
+        ndarray of Axes
+        """
+        from pyklip_diffrender import plotting
+
+        return plotting.plot_disk(self, ax)
+
+    @property
+    def table(self) -> QTable:
+        """The sources: x, y, contrast."""
+        x, y = self.offsets.T
+        return QTable({"x": x * u.arcsec, "y": y * u.arcsec, "contrast": self.contrasts})
+
+    def write(self, folder: str | os.PathLike[str]) -> Path:
+        """Write disk.fits; returns its path.
+
+        Its extensions are IMAGE, IMAGE_ERROR, LIGHT (one for every frame), OFFSET_X, OFFSET_Y and
+        the table SOURCES.
+        """
+        unit = self.fit.frames[0].observation.unit.to_string("fits")
+        sources = fits.BinTableHDU(self.table, name="SOURCES")
+        hdus = fits.HDUList(
+            [
+                fits.PrimaryHDU(),
+                image_hdu(self.image, "IMAGE", unit),
+                image_hdu(self.error, "IMAGE_ERROR", unit),
+                *(image_hdu(each, "LIGHT", unit, k) for k, each in enumerate(self.light, 1)),
+                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec"),
+                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec"),
+                sources,
+            ]
+        )
+        path = Path(folder) / "disk.fits"
+        write_fits(hdus, path)
+        return path
+
+
+def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) -> Disk:
+    """Fit extended light about a star together with the star.
+
+    The light may have any shape, but not be negative. What is symmetric about the star, or seen in
+    a single roll, is told from the star only by the prior on its wavefront: two rolls or more are
+    best. A planet in a disk is part of the extended light.
+
+    Parameters
+    ----------
+    fit : Refinement
+        Of the target. Its companions become part of the extended light.
+    inner : float or Quantity
+        Smallest separation of sources, arcsec.
+    progress : bool
+        Show progress bars.
+
+    Returns
+    -------
+    Disk
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For a fit that failed, that has no linear model, or that shows no target, or if `inner` is
+        not positive.
+    """
+    inner = float(to_arcsec(inner, "inner"))
+    if not inner > 0:
+        raise IncompatibleSetupError(f"inner: got {inner}, expected a positive number")
+    if not fit.status.usable:
+        raise IncompatibleSetupError(f"fit_disk: the fit {fit.status.message}")
+    original = [frame.observation for frame in fit.frames]
+    with ProgressBar("disk", shown=progress) as bar:
+        sources = _fit_sources(fit, inner)
+        first, gain = sources.gain, sources.gain
+        if gain < _SIGNIFICANT * len(sources):
+            _log.info("no extended light: %s", sources)
+            sources, gain = sources.dark(), 0.0
+        pixels = sum(int(original[k].combined().valid.sum()) for k in sources.light)
+        for _ in range(_ROUNDS):
+            bar.update(sources=len(sources))
+            if gain < _GAIN * pixels:
+                break
+            fit = without_light(fit, sources.light, original)
+            sources = _fit_sources(fit, inner, sources)
+            gain = sources.gain
+    image, error = _combined(fit, sources, original)
+    is_lit = sources.contrasts > 0
+    return Disk(
+        fit=fit,
+        light=tuple(sources.light[k] for k in sorted(sources.light)),
+        image=image,
+        error=error,
+        grid=sources.templates.grid,
+        offsets=sources.offsets[is_lit],
+        contrasts=sources.contrasts[is_lit],
+        gain=first,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Sources:
+    """Non-negative sources on a grid.
+
+    Attributes
+    ----------
+    templates : Templates
+    offsets : ndarray, (k, 2)
+        x, y from the star, arcsec.
+    contrasts : ndarray, (k,)
+    flux : float
+        That of the star, to which contrasts are relative.
+    light : dict of int to ndarray, (ny, nx)
+        By frame.
+    gain : float
+        Decrease of chi-squared with respect to the sources from which these were fitted.
+    """
+
+    templates: Templates
+    offsets: Image
+    contrasts: Image
+    flux: float
+    light: dict[int, Image]
+    gain: float
+
+    def __len__(self) -> int:
+        return int((self.contrasts > 0).sum())
+
+    def __str__(self) -> str:
+        return (
+            f"{len(self)} sources, {self.contrasts.sum():.3g} of the star's light, chi-squared "
+            f"lower by {self.gain:.4g}"
+        )
+
+    def dark(self) -> _Sources:
+        """The same without light."""
+        light = {k: np.zeros_like(each) for k, each in self.light.items()}
+        return replace(self, contrasts=np.zeros_like(self.contrasts), light=light)
+
+
+def _fit_sources(fit: Refinement, inner: float, start: _Sources | None = None) -> _Sources:
+    """Sources in the frames of a fit, to which the light of `start` is added again."""
+    ((linear, templates),) = groups_of([fit])
+    rows, columns = _positions(templates.grid, inner)
+    images = templates.at_pixels(rows, columns)
+    flux, before = fit.frames[0].flux, np.zeros(len(rows))
+    if start is not None:
+        linear = linear.without("companions", start.light)
+        before = start.contrasts * (start.flux / flux)
+    matrix, vector = (each.numpy() for each in linear.normal_equations(images))
+    contrasts = _brightest(matrix, vector, before)
+    light = {k: np.tensordot(contrasts, each.double().numpy(), 1) for k, each in images.items()}
+    gain = _gain(matrix, vector, contrasts) - _gain(matrix, vector, before)
+    sources = _Sources(templates, templates.grid[rows, columns], contrasts, flux, light, gain)
+    _log.info("extended light: %s", sources)
+    return sources
+
+
+def _positions(grid: Image, inner: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the pixels on which sources are."""
+    ny, nx = grid.shape[:2]
+    rows, columns = np.mgrid[0:ny:_SPACING, 0:nx:_SPACING].reshape(2, -1)
+    outside = separation_of(grid)[rows, columns] >= inner
+    return rows[outside], columns[outside]
+
+
+def _brightest(matrix: Image, vector: Image, start: Image) -> Image:
+    """The non-negative light that minimises the sum at the top of this module, (k,)."""
+    scale = np.sqrt(matrix.diagonal().clip(min=1e-300))
+    curvature, gradient = matrix / scale[:, None] / scale, vector / scale
+
+    def target(light: Image) -> tuple[float, Image]:
+        slope = curvature @ light - gradient + _THRESHOLD
+        return float(light @ (slope + _THRESHOLD - gradient) / 2), slope
+
+    solved = minimize(target, start * scale, jac=True, method="L-BFGS-B",
+                      bounds=[(0, None)] * len(scale), options={"maxiter": 2000})  # fmt: skip
+    return np.asarray(solved.x / scale)
+
+
+def _gain(matrix: Image, vector: Image, light: Image) -> float:
+    """Decrease of chi-squared by the light of sources."""
+    return float(2 * vector @ light - light @ matrix @ light)
+
+
+def _combined(
+    fit: Refinement, sources: _Sources, original: Sequence[Observation]
+) -> tuple[Image, Image]:
+    """Frames minus the star, turned onto the first one and averaged, and the errors."""
+    templates = sources.templates
+    total, weights = np.zeros((2, *templates.grid.shape[:2]))
+    for k, light in sources.light.items():
+        frame = original[k].combined()
+        valid = frame.valid[0]
+        # Invalid pixels get no weight, but their neighbours are interpolated from them.
+        left = np.where(valid, frame.data[0] - fit.frames[k].star, light)
+        weight = np.where(valid, frame.error[0], np.inf) ** -2
+        places = templates.pixels_of(k, torch.from_numpy(templates.grid.reshape(-1, 2)))
+        left, weight = (
+            map_coordinates(array, places, order=order, cval=0.0).reshape(total.shape)
+            for array, order in ((left, 3), (weight, 1))
+        )
+        total += weight * left
+        weights += weight
+    covered = weights > 0
+    safe = np.where(covered, weights, 1.0)
+    return np.where(covered, total / safe, np.nan), np.where(covered, safe**-0.5, np.nan)

@@ -1,0 +1,149 @@
+"""Extended light fitted together with the star, on two simulated rolls of a star with a ring."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from astropy.io import fits as astropy_fits
+from scipy.optimize import nnls
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.detection import disk as module
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.wavefront.opd import random_drift
+
+ROLLS = (20.0, 32.0)
+STAR = dr.Star(w2_magnitude=5.5)
+BRIGHTNESS, POSITION_ANGLE = 1e-4, 75.0
+OPTIONS = {"monochromatic": 4.5e-6, "npix": 128, "fov_pixels": 48}
+
+
+def ring(
+    model: dr.OpticalSystem, opd: np.ndarray, position_angle: float, points: int = 40
+) -> np.ndarray:
+    """Photons of a ring as bright as the star, its long axis at an angle from +y, (ny, nx)."""
+    angle = np.linspace(0, 2 * np.pi, points, endpoint=False)
+    along, across = 0.95 * np.cos(angle), 0.3 * np.sin(angle)
+    turn = np.deg2rad(position_angle)
+    x = across * np.cos(turn) - along * np.sin(turn)
+    y = across * np.sin(turn) + along * np.cos(turn)
+    with torch.no_grad():
+        images = [model(opd, offset).numpy() for offset in zip(x, y, strict=True)]
+    return np.asarray(STAR.photons * np.mean(images, axis=0))
+
+
+@cache
+def rolls(brightness: float) -> tuple[list[dr.Observation], list[np.ndarray]]:
+    """Two rolls of the star, and the light of its ring in them."""
+    model = dr.nircam_coronagraph("F444W", **OPTIONS)
+    actual = dr.random_opd(1, npix=128).data + random_drift(3, hours=40, npix=128).data
+    frames, rings = [], []
+    rng = np.random.default_rng(1)
+    for k, roll in enumerate(ROLLS):
+        rings.append(brightness * ring(model, actual, POSITION_ANGLE - roll))
+        starlight = dr.simulate(model, dr.Scene(star=STAR), actual, seed=4 + k)
+        counts = starlight.data[0] + rng.poisson(rings[k])
+        error = np.sqrt(np.maximum(counts, 0) + dr.Scene().read_noise ** 2)
+        frame = dr.Observation.from_arrays(
+            counts, error, pixelscale=starlight.pixelscale, name=f"roll{k}.fits"
+        )
+        frames.append(replace(frame, position_angles=np.array([roll])))
+    return frames, rings
+
+
+@cache
+def fitted(brightness: float = BRIGHTNESS) -> tuple[dr.Refinement, dr.Disk]:
+    """The star alone, and with extended light."""
+    frames, _ = rolls(brightness)
+    model = dr.nircam_coronagraph("F444W", **OPTIONS)
+    settings = dr.GaussNewton(cycles=10)
+    fit = dr.refine(model, frames, dr.random_opd(1, npix=128), settings=settings, plan="off")
+    return fit, dr.fit_disk(fit)
+
+
+def amount(image: np.ndarray, true: np.ndarray) -> float:
+    """How much of the true light an image has."""
+    return float((image * true).sum() / (true**2).sum())
+
+
+@pytest.mark.slow
+def test_a_ring_keeps_its_light() -> None:
+    fit, disk = fitted()
+    _, rings = rolls(BRIGHTNESS)
+    # A fit of the star alone takes all of the ring.
+    assert amount(np.nan_to_num(fit.frames[0].residual[0]), rings[0]) < 0.2
+    for light, true in zip(disk.light, rings, strict=True):
+        assert amount(light, true) == pytest.approx(1.0, abs=0.1)
+    assert amount(np.nan_to_num(disk.image), rings[0]) == pytest.approx(1.0, abs=0.1)
+    assert disk.contrast == pytest.approx(BRIGHTNESS, rel=0.15)
+    assert disk.orientation == pytest.approx(POSITION_ANGLE, abs=2)
+    assert disk.fit.chi2_per_pixel < fit.chi2_per_pixel / 10
+    deep, shallow = (dr.contrast_curve(each)["contrast"] for each in (disk.fit, fit))
+    assert np.median(shallow / deep) > 3
+
+
+@pytest.mark.slow
+def test_a_star_without_a_disk_has_none() -> None:
+    fit, disk = fitted(0.0)
+    assert disk.contrast == 0
+    assert len(disk.table) == 0
+    assert disk.orientation is None
+    assert disk.gain < 300
+    assert not np.any(disk.light)
+    assert disk.fit is fit
+
+
+def small_fit() -> dr.Refinement:
+    """A star without a companion in 24 x 24 pixels."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
+    opd = dr.random_opd(1, npix=128)
+    frame = dr.simulate(model, dr.Scene(star=STAR), opd, seed=1)
+    return dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=4), plan="off")
+
+
+def test_products_and_refusals(tmp_path: Path) -> None:
+    fit = small_fit()
+    for inner in (0, -0.3):
+        with pytest.raises(IncompatibleSetupError, match="inner: got"):
+            dr.fit_disk(fit, inner=inner)
+    disk = dr.fit_disk(fit, inner=0.4)
+    assert disk.image.shape == disk.error.shape == disk.light[0].shape == (24, 24)
+    np.testing.assert_allclose(disk.image, fit.frames[0].residual[0], atol=1e-9 * STAR.photons)
+    np.testing.assert_allclose(disk.error, fit.frames[0].observation.error[0])
+    lit = replace(disk, offsets=np.array([[0.5, 0.1], [-0.5, -0.1]]), contrasts=np.array([1, 2e-6]))
+    assert lit.orientation is None  # The frame's own orientation is not known.
+    with astropy_fits.open(lit.write(tmp_path)) as hdus:
+        names = [hdu.name for hdu in hdus[1:]]
+        assert names == ["IMAGE", "IMAGE_ERROR", "LIGHT", "OFFSET_X", "OFFSET_Y", "SOURCES"]
+        assert hdus["IMAGE"].header["BUNIT"] == "ph"
+        np.testing.assert_array_equal(hdus["SOURCES"].data["contrast"], lit.contrasts)
+    axes = lit.plot()
+    assert [ax.get_title(loc="left") for ax in axes] == [
+        "frames without the star",
+        "extended light",
+    ]
+
+
+def test_non_negative_light_is_that_of_scipy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_THRESHOLD", 0.0)
+    rng = np.random.default_rng(2)
+    columns, data = rng.normal(size=(60, 20)), rng.normal(size=60)
+    solved = module._brightest(columns.T @ columns, columns.T @ data, np.zeros(20))
+    expected = nnls(columns, data)[0]
+    assert 3 < (expected > 0).sum() < 17
+    np.testing.assert_allclose(solved, expected, atol=1e-4)
+    gain = module._gain(columns.T @ columns, columns.T @ data, expected)
+    assert gain == pytest.approx((data**2).sum() - ((data - columns @ expected) ** 2).sum())
+
+
+def test_the_threshold_is_in_standard_deviations() -> None:
+    """Sources that do not touch lose one standard deviation each, and those below it are dark."""
+    information = np.array([1.0, 4.0, 100.0])
+    light = np.array([3.0, 0.4, 0.5])
+    solved = module._brightest(np.diag(information), information * light, np.zeros(3))
+    np.testing.assert_allclose(solved, [2.0, 0.0, 0.4], atol=1e-5)
