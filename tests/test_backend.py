@@ -253,6 +253,28 @@ def test_every_file_keyword_and_slice_is_there_as_klip_leaves_it(
 
 
 @pytest.mark.usefixtures("registered")
+@pytest.mark.parametrize("highpass", [False, 8.0])
+def test_both_algorithms_in_one_call(
+    highpass: float | bool, imgs: np.ndarray, tmp_path: Path
+) -> None:
+    alone = {algo: (generic(imgs, ANGLES), tmp_path / algo) for algo in ("klip", "diffrender")}
+    expected = {
+        algo: reduce(*each, algo=algo, highpass=highpass)["x-KLmodes-all.fits"][0]
+        for algo, each in alone.items()
+    }
+    dataset = generic(imgs, ANGLES)
+    with backend():
+        files = reduce(dataset, tmp_path / "both", algo="diffrender + KLIP", highpass=highpass)
+    for name, algo in (("x", "diffrender"), ("x-klip", "klip")):
+        data, header = files[f"{name}-KLmodes-all.fits"]
+        np.testing.assert_array_equal(data, expected[algo])
+        assert ("DRALGO" in header) == (algo == "diffrender")
+    np.testing.assert_array_equal(dataset.output, alone["diffrender"][0].output)
+    np.testing.assert_array_equal(dataset.input, alone["diffrender"][0].input)
+    assert len(dataset.diffrender_results) == 1
+
+
+@pytest.mark.usefixtures("registered")
 def test_the_companion_stays_whole_and_the_star_and_the_pedestal_go(
     imgs: np.ndarray, tmp_path: Path
 ) -> None:
@@ -631,6 +653,16 @@ def test_one_model_for_several_wavelengths_is_refused(imgs: np.ndarray, tmp_path
     with backend(model={4.0: "a", 4.4: "b"}, subtractor=fake):
         reduce(dataset(), tmp_path)
     assert seen[-2:] == ["a", "b"]
+
+
+@pytest.mark.usefixtures("registered")
+@pytest.mark.parametrize("wvs", [(4.0, 4.0, 4.4, 4.4), (4.0, 4.4, 4.0)])
+def test_wavelengths_that_pyklip_would_mix_up_are_refused(
+    wvs: tuple[float, ...], imgs: np.ndarray, tmp_path: Path
+) -> None:
+    cube = np.tile(imgs[0], (len(wvs), 1, 1))
+    with pytest.raises(IncompatibleSetupError, match="one dataset for each filter"):
+        reduce(generic(cube, np.zeros(len(wvs)), wvs), tmp_path, mode="ADI+SDI")
 
 
 def test_no_filter_and_no_model(imgs: np.ndarray, tmp_path: Path) -> None:

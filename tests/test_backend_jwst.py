@@ -123,6 +123,43 @@ def test_the_fit_gets_recorded_pixels_errors_flags_and_headers(
     assert observation.header["BUNIT"] == "MJy/sr"
 
 
+def test_filters_are_fitted_one_by_one(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each with its model and the reference frames of its filter."""
+    seen, paths = [], []
+
+    def subtract(observation: Any, opd: Any, settings: Any, **context: Any) -> Any:
+        names = [path.name for path in context["references"].files]
+        seen.append((observation.filter, list(observation.position_angles), names))
+        return render(observation, opd, settings)
+
+    monkeypatch.setattr(
+        "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
+    )
+    setups = [(roll, name) for roll in (0.0, 10.0) for name in ("F356W", "F444W")]
+    for roll, name in setups:
+        paths.append(str(tmp_path / f"{name}_{roll:.0f}.fits"))
+        calints(Path(paths[-1]), rng, roll, NATIVE, nints=1, FILTER=name, TARGPROP="STAR")
+    others = [str(tmp_path / f"other_{name}.fits") for name in ("F444W", "F356W")]
+    for path in others:
+        name = Path(path).stem.removeprefix("other_")
+        calints(Path(path), rng, 0.0, NATIVE, FILTER=name, TARGPROP="OTHER")
+    with backend(opd=OPD):
+        dataset = JWSTData(paths, others)
+        reduce(dataset, tmp_path / "out", mode="ADI+RDI+SDI", psf_library=dataset.psflib)
+    assert seen == [
+        ("F356W", [0.0, 10.0], ["other_F356W.fits"]),
+        ("F444W", [0.0, 10.0], ["other_F444W.fits"]),
+    ]
+    assert dataset.output.shape[:3] == (2, 2, 2)
+    cube, header = fits.getdata(tmp_path / "out/x-KL1-speccube.fits", header=True)
+    assert cube.shape == (2, *SHAPE)
+    assert header["DRFILT"] == "F356W, F444W"
+    # Without the star, on both wavelengths.
+    assert np.nanmax(np.abs(cube)) < 0.02 * 1000
+
+
 @pytest.mark.usefixtures("registered")
 def test_center_keywords_and_dithers(tmp_path: Path, rng: np.random.Generator) -> None:
     path = tmp_path / "a_calints.fits"

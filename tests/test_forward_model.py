@@ -19,6 +19,7 @@ from pyklip.fmlib.nofm import NoFM
 from pyklip.klip import rotate
 from pyklip.parallelized import klip_dataset
 
+from pyklip_diffrender.detection import measure
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -37,7 +38,7 @@ pytestmark = [
 ]
 
 PIXEL, SIDE, STAMP = 0.062424185, 40, 17
-ANGLES = (0.0, 70.0)
+ANGLES = (15.0, 85.0)
 MODES = np.array([1, 3])
 CENTER = np.array([19.8, 19.4])
 FLUX, SKY = 1e10, 100.0
@@ -53,10 +54,12 @@ def model() -> OpticalSystem:
     return nircam_coronagraph("F444W", fov_pixels=SIDE, **NUMERICS)
 
 
-def place(angle: float, flipx: bool = False) -> Image:
+def place(
+    angle: float, flipx: bool = False, separation: float = SEPARATION, pa: float = PA
+) -> Image:
     """x, y in arcsec of the planet in a frame that pyKLIP turns by an angle."""
-    direction = np.radians(90 + (-PA if flipx else PA) - angle)
-    return PIXEL * SEPARATION * np.array([np.cos(direction), np.sin(direction)])
+    direction = np.radians(90 + (-pa if flipx else pa) - angle)
+    return PIXEL * separation * np.array([np.cos(direction), np.sin(direction)])
 
 
 def image(model: OpticalSystem, opd: Image, source: Any, shift: Any) -> Image:
@@ -83,13 +86,19 @@ def dataset(cube: Image, model: OpticalSystem, errors: Image, **settings: Any) -
     return made
 
 
-def planet_psf(opd: Image, made: Any) -> FMPlanetPSF:
+def planet_psf(
+    opd: Image,
+    made: Any,
+    separation: float = SEPARATION,
+    pa: float = PA,
+    contrast: float = CONTRAST,
+) -> FMPlanetPSF:
     """The planet as a user gives it: one PSF for each roll, half as bright, twice its flux."""
     camera = nircam_coronagraph("F444W", fov_pixels=STAMP, **NUMERICS)
-    places = [place(angle, made.flipx) for angle in ANGLES]
+    places = [place(angle, made.flipx, separation, pa) for angle in ANGLES]
     stamps = [[0.5 * image(camera, opd, each, -each)] for each in places]
     return FMPlanetPSF(
-        made.input.shape, MODES, SEPARATION, PA, CONTRAST, np.array(stamps), np.unique(made.wvs),
+        made.input.shape, MODES, separation, pa, contrast, np.array(stamps), np.unique(made.wvs),
         flux_conversion=np.full(len(made.input), 2.0), spectrallib=[np.ones(1)],
         spectrallib_units="contrast", input_psfs_pas=np.array(ANGLES),
     )  # fmt: skip
@@ -178,6 +187,39 @@ def test_the_forward_model_is_what_a_planet_adds_to_the_product(
     x = CENTER[0] - SEPARATION * np.sin(direction)
     peak = np.unravel_index(np.nanargmax(of_planet), of_planet.shape)
     np.testing.assert_allclose(peak, (CENTER[1] + SEPARATION * np.cos(direction), x), atol=1.0)
+
+
+@pytest.mark.usefixtures("registered")
+@pytest.mark.parametrize("flipx", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_the_products_say_what_the_fit_knows_of_the_planet(
+    flipx: bool, model: OpticalSystem, tmp_path: Path
+) -> None:
+    """The planet itself, wherever the guess is, with the errors of photon noise and star."""
+    star, planet = shots(model, OLD.data, flipx)
+    made = dataset(star + planet, model, np.sqrt(star))
+    made.flipx = flipx
+    guess = planet_psf(OLD.data, made, SEPARATION + 0.4, PA - 2.0, 1.3 * CONTRAST)
+    modelled(made, guess, tmp_path, algo="diffrender")
+    result = made.diffrender_results[0].subtraction.fits[0].result
+    for kind in ("fmpsf", "klipped"):
+        header = fits.getheader(tmp_path / f"x-{kind}-KLmodes-all.fits")
+        direction = np.radians(PA)
+        assert header["DRFMFLUX"] == pytest.approx(1 / 1.3, rel=0.02)
+        assert header["DRFMRA"] == pytest.approx(SEPARATION * np.sin(direction), abs=0.01)
+        assert header["DRFMDE"] == pytest.approx(SEPARATION * np.cos(direction), abs=0.01)
+        snr = measure(result, [place(ANGLES[0], flipx)])["snr"][0]
+        # Position and flux are independent of each other to first order.
+        assert header["DRFMFLUX"] / header["DRFMFERR"] == pytest.approx(snr, rel=0.1)
+        assert 1 / snr < header["DRFMRAER"] < 3 / snr
+        assert 1 / snr < header["DRFMDEER"] < 3 / snr
+
+
+@pytest.mark.usefixtures("registered")
+def test_no_planet_no_values(model: OpticalSystem, tmp_path: Path) -> None:
+    star, planet = shots(model, OLD.data)
+    made = dataset(star - planet, model, np.sqrt(star))
+    modelled(made, planet_psf(OLD.data, made), tmp_path, algo="diffrender")
+    assert "DRFMFLUX" not in fits.getheader(tmp_path / "x-klipped-KLmodes-all.fits")
 
 
 @pytest.mark.slow

@@ -50,6 +50,14 @@ def check_arguments(arguments: Mapping[str, Any], references: tuple[Path, ...]) 
             "mode: 'SDI' compares wavelengths, and this dataset has one. Use mode='ADI', or "
             "mode='RDI' with a psf_library: the star is rendered, so neither needs references"
         )
+    wavelengths = np.unique(dataset.wvs)
+    cubes, left_over = divmod(len(dataset.wvs), len(wavelengths))
+    if left_over or not np.array_equal(dataset.wvs, np.tile(wavelengths, cubes)):
+        raise IncompatibleSetupError(
+            f"dataset.wvs: pyKLIP takes frames of {len(wavelengths)} wavelengths for slices of "
+            "spectral cubes, one after the other from the shortest to the longest wavelength. "
+            "These have another order. Make one dataset for each filter, and reduce them one by one"
+        )
     if arguments["calibrate_flux"]:
         from pyklip.instruments.Instrument import Data
 
@@ -60,7 +68,7 @@ def check_arguments(arguments: Mapping[str, Any], references: tuple[Path, ...]) 
             )
     source = getattr(dataset, SOURCE, None)
     if source is not None:
-        require_same_setup(source.headers[0], references)
+        require_same_setup({h.get("FILTER"): h for h in source.headers}.values(), references)
 
 
 def check_settings(settings: DiffrenderSettings) -> None:

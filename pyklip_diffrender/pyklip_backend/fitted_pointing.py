@@ -137,6 +137,17 @@ class FittedPointing:
         )
         return x, y + detector.shear * x
 
+    def from_star(self, offset: Image) -> Image:
+        """x, y in arcsec from the fitted star, of a place in pixels from the header's star."""
+        star = self.frame.optical_values.get("star_offset", torch.zeros(2))
+        return np.subtract(self.position(offset), star.cpu().numpy())
+
+    @property
+    def resolution(self) -> float:
+        """lambda/D, arcsec."""
+        model = self.frame.model
+        return float(model.bandpass.mean_wavelength / model.diameter / ARCSEC)
+
     def _rendered(self, box: Window, source: tuple[float, float] | None) -> Image:
         x, y = self.pointing.observation.center[0] + self.away - (box.x, box.y)
         return self.frame.render(

@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
-from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 
@@ -45,11 +44,17 @@ class PlanetInFrame:
         x, y of the star in the frame.
     taken : float
         Largest change of the star because of the planet over the standard deviation of the star.
+    offset : ndarray, (2,)
+        x, y of the planet in pixels from the star.
+    contrast : float
+        Light of the planet over that of the star.
     """
 
     left: NDArray[np.float64]
     center: NDArray[np.float64]
     taken: float
+    offset: NDArray[np.float64]
+    contrast: float
 
 
 def is_planet(fm_class: Any) -> bool:
@@ -150,7 +155,9 @@ def planet_in_frames(
             taken = float(np.abs(change).max() / np.std(part.frame.star))
             center = part.pointing.observation.center[0]
             for frame, of_frame in zip(part.pointing.frames, factor, strict=True):
-                planets[int(frame)] = PlanetInFrame(of_frame * source.image - star, center, taken)
+                planets[int(frame)] = PlanetInFrame(
+                    of_frame * source.image - star, center, taken, source.offset, float(of_frame)
+                )
     return planets
 
 
@@ -216,9 +223,8 @@ class _Source:
             ours = filtered(ours)
         rows, columns = np.indices(group.shape)
         x, y = group.center[0] + offset
-        model = part.frame.model
-        resolution = model.bandpass.mean_wavelength / model.diameter / ARCSEC
-        radius = _APERTURE * resolution / np.sqrt(np.prod(model.detector.pixelscale))
+        pixelscale = np.sqrt(np.prod(part.frame.model.detector.pixelscale))
+        radius = _APERTURE * part.resolution / pixelscale
         # Where the user's PSF ends there is exactly nothing.
         near = (np.hypot(columns - x, rows - y) <= radius) & (users != 0)
         scale = users[near].sum() / ours[near].sum() if near.any() else 0.0
@@ -254,7 +260,5 @@ def _is_companion(result: Refinement, part: FittedPointing, source: _Source) -> 
     if not len(result.companions):
         return False
     # Companions are relative to the fitted star in the first frame, as are the parts.
-    star = part.frame.optical_values.get("star_offset", torch.zeros(2))
-    offset = np.subtract(part.position(source.offset), star.cpu().numpy())
-    resolution = part.frame.model.bandpass.mean_wavelength / part.frame.model.diameter / ARCSEC
-    return bool((np.hypot(*(result.companions[:, 1:] - offset).T) < resolution).any())
+    offset = part.from_star(source.offset)
+    return bool((np.hypot(*(result.companions[:, 1:] - offset).T) < part.resolution).any())

@@ -20,6 +20,7 @@ from pyklip_diffrender.pyklip_backend.forward_model import (
     planet_in_frames,
 )
 from pyklip_diffrender.pyklip_backend.placement import fill
+from pyklip_diffrender.pyklip_backend.planet_fit import planet_cards
 from pyklip_diffrender.pyklip_backend.reduction import Reduction
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
@@ -34,6 +35,7 @@ class ForwardReduction(Reduction):
     def __init__(self, arguments: Mapping[str, Any], settings: DiffrenderSettings) -> None:
         super().__init__(arguments, settings)
         self.fm_class = arguments["fm_class"]
+        self._planet_cards = fits.Header()
 
     def _check(self) -> None:
         check_forward_model(self.fm_class, self.settings)
@@ -43,8 +45,9 @@ class ForwardReduction(Reduction):
     def _verbose(self) -> bool:
         return not self.arguments["mute_progression"]
 
-    def _write_throughput(self, stage: Path, cards: fits.Header) -> None:
-        """The forward model says how much is left of the planet."""
+    def _write_extras(self, stage: Path, cards: fits.Header) -> None:
+        """Add what the fit says of the planet; the forward model says how much is left of it."""
+        cards.extend(self._planet_cards)
 
     def _star(self, subtraction: Subtraction) -> NDArray[np.float64]:
         """The star of the linear model's solution.
@@ -134,6 +137,10 @@ class ForwardReduction(Reduction):
                 flipx,
                 self._filter,
             )
+            if len(self.records) == 1:
+                first = next(part for part in record.subtraction.pointings if part.index == 0)
+                k = int(first.pointing.frames[0])
+                self._planet_cards = planet_cards(first, planets[k], parangs[frames[k]], flipx)
             for k, planet in planets.items():
                 fill(planet.left, record.frames.observation.valid[k])
                 image = planet.left if self._filter is None else self._filter(planet.left)

@@ -39,7 +39,11 @@ from pyklip_diffrender.pyklip_backend.products import (
     staging,
     stamp,
 )
-from pyklip_diffrender.pyklip_backend.references import References, library_files
+from pyklip_diffrender.pyklip_backend.references import (
+    References,
+    files_of_setup,
+    library_files,
+)
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction, subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.throughput import (
@@ -109,7 +113,7 @@ class Reduction:
             with staging(folder) as stage:
                 reduce(**{**self.arguments, "outputdir": str(stage)})
                 cards = provenance(self.records)
-                self._write_throughput(stage, cards)
+                self._write_extras(stage, cards)
                 stamp(stage, cards)
         except BaseException:
             vars(self.dataset).clear()
@@ -224,8 +228,8 @@ class Reduction:
             outputs += (aligned_before(imgs, centers, wvs, center, dtype),)
         return outputs
 
-    def _write_throughput(self, stage: Path, cards: fits.Header) -> None:
-        """Write the throughput map, and add its median to the cards of all products.
+    def _write_extras(self, stage: Path, cards: fits.Header) -> None:
+        """Write what pyKLIP does not: the throughput map, with its median in all products.
 
         Fits without a linear model have none.
         """
@@ -282,6 +286,7 @@ class Reduction:
             files = self._reference_files()
             if self._rdi and not files:
                 self._tell("psf_library is not used: no JWSTData read its files after register()")
+            files = files_of_setup(observation.header, files)
             references = References(files, frames.references)
             subtraction = subtract_by_refinement(
                 observation,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,14 @@ if TYPE_CHECKING:
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
 
-__all__ = ["ChosenPattern", "References", "library_files", "pattern_for", "require_same_setup"]
+__all__ = [
+    "ChosenPattern",
+    "References",
+    "files_of_setup",
+    "library_files",
+    "pattern_for",
+    "require_same_setup",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -106,8 +113,14 @@ def library_files(dataset: Any, psf_library: Any) -> tuple[Path, ...]:
     return tuple(path for path in paths if path.name in names)
 
 
-def require_same_setup(header: fits.Header, files: Sequence[Path]) -> None:
-    """Refuse reference files of another filter, mask or detector than the target's.
+def require_same_setup(headers: Iterable[fits.Header], files: Sequence[Path]) -> None:
+    """Refuse reference files of other filters, masks or detectors than those of the target.
+
+    Parameters
+    ----------
+    headers : iterable of Header
+        Of the target, one for each of its set-ups.
+    files : sequence of Path
 
     Raises
     ------
@@ -115,16 +128,30 @@ def require_same_setup(header: fits.Header, files: Sequence[Path]) -> None:
     CorruptFileError
         If a file is gone.
     """
+    targets = list(headers)
     for path in files:
-        with open_fits(path) as hdus:
-            theirs = hdus[0].header
-            for key in _SETUP:
-                ours, other = header.get(key), theirs.get(key)
-                if None not in (ours, other) and str(ours).strip() != str(other).strip():
-                    raise IncompatibleSetupError(
-                        f"psf_library: {path.name} was taken with {key} {other}, the target with "
-                        f"{ours}. Give only reference frames of the same set-up"
-                    )
+        differences = [_difference(header, path) for header in targets]
+        if all(differences):
+            raise IncompatibleSetupError(
+                f"psf_library: {path.name} was taken with {differences[0]}. Give only reference "
+                "frames of the same set-up"
+            )
+
+
+def files_of_setup(header: fits.Header, files: Sequence[Path]) -> tuple[Path, ...]:
+    """The reference files of the filter, mask and detector of a header of the target."""
+    return tuple(path for path in files if _difference(header, path) is None)
+
+
+def _difference(header: fits.Header, path: Path) -> str | None:
+    """How the set-up of a reference file differs from that of the target, in words."""
+    with open_fits(path) as hdus:
+        theirs = hdus[0].header
+        for key in _SETUP:
+            ours, other = header.get(key), theirs.get(key)
+            if None not in (ours, other) and str(ours).strip() != str(other).strip():
+                return f"{key} {other}, the target with {ours}"
+    return None
 
 
 def pattern_for(

@@ -13,7 +13,7 @@ import logging
 import threading
 import warnings
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from typing import Any
 
@@ -43,6 +43,9 @@ logger = logging.getLogger(__name__)
 
 ALGORITHM = "diffrender"
 """Value of the argument `algo` of `klip_dataset`."""
+
+BOTH = f"{ALGORITHM}+klip"
+"""The same, for KLIP's products beside those of this backend."""
 
 
 class _Patches:
@@ -222,10 +225,15 @@ def _takes_klip() -> bool | None:
     return _registry.replace if force is None else force
 
 
+def _name(algo: Any) -> str:
+    """The argument `algo` in lower case and without spaces."""
+    return "".join(str(algo).lower().split())
+
+
 def _is_ours(algo: Any) -> bool:
     """Whether a call with this `algo` is for this backend."""
-    name = str(algo).lower()
-    return name == ALGORITHM or (name == "klip" and bool(_takes_klip()))
+    name = _name(algo)
+    return name in (ALGORITHM, BOTH) or (name == "klip" and bool(_takes_klip()))
 
 
 def _warn_of_klip(dataset: Any, function: str) -> None:
@@ -270,7 +278,10 @@ def dispatch(*args: Any, **kwargs: Any) -> None:
     arguments = call.arguments
     if _is_ours(arguments["algo"]):
         settings = _settings_for(arguments["dataset"])
+        before = dict(vars(arguments["dataset"]))
         Reduction(arguments, settings).run(klip_dataset.original)
+        if _name(arguments["algo"]) == BOTH:
+            _run_klip(klip_dataset.original(), arguments, before)
     else:
         if str(arguments["algo"]).lower() == "klip":
             _warn_of_klip(arguments["dataset"], "klip_dataset")
@@ -279,9 +290,40 @@ def dispatch(*args: Any, **kwargs: Any) -> None:
         mark_filtered(arguments["dataset"])
 
 
+def _run_klip(
+    klip_dataset: Callable[..., None], arguments: Mapping[str, Any], before: Mapping[str, Any]
+) -> None:
+    """Write KLIP's products beside those of this backend, whose results stay in the dataset.
+
+    Parameters
+    ----------
+    klip_dataset : callable
+        That of pyKLIP.
+    arguments : mapping
+        Of the call.
+    before : mapping
+        Attributes of the dataset before the call, from which KLIP starts.
+    """
+    attributes = vars(arguments["dataset"])
+    after = dict(attributes)
+    attributes.clear()
+    attributes.update(before)
+    try:
+        prefix = f"{arguments['fileprefix']}-klip"
+        klip_dataset(**{**arguments, "algo": "klip", "fileprefix": prefix})
+    finally:
+        attributes.clear()
+        attributes.update(after)
+
+
 def dispatch_fm(*args: Any, **kwargs: Any) -> Any:
     """Handle a call of `pyklip.fm.klip_dataset`, to which this package adds an argument `algo`."""
     klip_dataset = _patches().fm_klip_dataset
+    if _name(kwargs.get("algo")) == BOTH:
+        raise IncompatibleSetupError(
+            f"algo: pyklip.fm.klip_dataset takes 'diffrender' or 'klip', not {BOTH!r}, because an "
+            "fm_class is for one of them. Call it twice"
+        )
     if not _is_ours(kwargs.get("algo", "klip")):
         _warn_of_klip(args[0] if args else kwargs.get("dataset"), "pyklip.fm.klip_dataset")
         return klip_dataset.original()(*args, **kwargs)

@@ -6,11 +6,15 @@ Run from the root of the project::
 
 Every trial simulates two rolls of a star with a planet, and frames of a reference star, all with
 drifted wavefronts; runs `pyklip.fm.klip_dataset` with an `FMPlanetPSF` whose position and flux are
-somewhat wrong; and fits the product with `FMAstrometry`. For the contrast (as a fraction of the
-truth) and the position (pixels) it prints the weighted mean of the differences from the truth, the
-mean and scatter of these differences in units of the errors that `FMAstrometry` gives, and how many
-are within one and two errors. "difference" fits the difference of the products with and without the
-planet, in which the noise cancels: only the error of the forward model is left.
+somewhat wrong; and fits the product with `FMAstrometry`, with one or two of its kernels. "own" are
+the values and errors that diffrender writes into the headers of its products. Trials without them
+are left out of "own"; the number of trials is printed.
+
+For the contrast (as a fraction of the truth) and the position (pixels) it prints the weighted mean
+of the differences from the truth, the mean and scatter of these differences in units of their
+errors, and how many are within one and two errors. "difference" fits the difference of the products
+with and without the planet, in which the noise cancels: only the error of the forward model is
+left.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import argparse
 import contextlib
 import io
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +41,7 @@ from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import random_drift
 
 Image = NDArray[np.float64]
+Errors = NDArray[np.float64]
 
 SIDE, STAMP, BOX = 64, 31, 13
 PIXEL = 0.062424185
@@ -47,6 +52,8 @@ DITHERS = ((0.0, 0.0), (0.015, 0.015), (-0.015, 0.015), (-0.015, -0.015), (0.015
 NUMERICS: dict[str, Any] = {"npix": 128, "occulter_sampling": 2.0, "monochromatic": 4.44e-6}
 CENTER = np.full(2, (SIDE - 1) / 2)
 FWHM = 2.4
+KERNELS: dict[str, list[float]] = {"diag": [], "matern32": [3.0]}
+"""Kernels of `FMAstrometry` with their first correlation lengths, as spaceKLIP has them."""
 
 
 class Trial:
@@ -100,17 +107,26 @@ class Trial:
         direction = np.radians(90 + angle - roll)
         return [PIXEL * separation * float(f(direction)) for f in (np.cos, np.sin)]
 
-    def fitted(self, mode: str, **settings: Any) -> NDArray[np.float64]:
-        """Contrast, x and y (pixels) minus the truth, and their errors, (2, 3)."""
-        return self.measured_in(*self.images(self.frames, mode, **settings))
+    def fitted(
+        self, mode: str, kernels: Sequence[str] = ("diag",), **settings: Any
+    ) -> dict[str, Errors]:
+        """Contrast, x and y (pixels) minus the truth, and their errors, (2, 3), by method."""
+        model, product, header = self.images(self.frames, mode, **settings)
+        values = {kernel: self.measured_in(model, product, kernel) for kernel in kernels}
+        if "DRFMFLUX" in header:
+            errors = [header[key] for key in ("DRFMFERR", "DRFMRAER", "DRFMDEER")]
+            own = [header[key] for key in ("DRFMFLUX", "DRFMRA", "DRFMDE")]
+            values["own"] = self.compared(own, errors)
+        return values
 
-    def difference(self, **settings: Any) -> NDArray[np.float64]:
+    def difference(self, **settings: Any) -> dict[str, Errors]:
         """The same in the difference of the products with and without the planet."""
-        model, product = self.images(self.frames, "ADI", **settings)
-        return self.measured_in(model, product - self.images(self.empty, "ADI", **settings)[1])
+        model, product, _ = self.images(self.frames, "ADI", **settings)
+        product = product - self.images(self.empty, "ADI", **settings)[1]
+        return {"diag": self.measured_in(model, product, "diag")}
 
-    def images(self, frames: Image, mode: str, **settings: Any) -> list[Image]:
-        """Forward model and product."""
+    def images(self, frames: Image, mode: str, **settings: Any) -> tuple[Image, Image, fits.Header]:
+        """Forward model, product and its header."""
         dataset = GenericData(
             frames.copy(),
             np.tile(CENTER, (len(ROLLS), 1)),
@@ -149,29 +165,31 @@ class Trial:
                 subsections=1, numbasis=[5], movement=0, numthreads=1, mute_progression=True,
                 psf_library=library, aligned_center=CENTER,
             )  # fmt: skip
-            return [
-                fits.getdata(Path(folder) / f"x-{name}-KLmodes-all.fits")[0].astype(float)
+            path = Path(folder) / "x-klipped-KLmodes-all.fits"
+            model, product = (
+                fits.getdata(path.with_name(path.name.replace("klipped", name)))[0].astype(float)
                 for name in ("fmpsf", "klipped")
-            ]
+            )
+            return model, product, fits.getheader(path)
 
-    def measured_in(self, model: Image, product: Image) -> NDArray[np.float64]:
+    def measured_in(self, model: Image, product: Image, kernel: str) -> Errors:
         """What `FMAstrometry` finds, minus the truth, and its errors."""
         fit = FMAstrometry(*self.guess[:2], fitboxsize=BOX)
         fit.generate_fm_stamp(model, CENTER, padding=5)
         fit.generate_data_stamp(product, CENTER, dr=4, exclusion_radius=3 * FWHM)
-        fit.set_kernel("diag", [], [])
-        fit.set_bounds(1.5, 1.5, 1.0, [])
-        fit.fit_astrometry(nwalkers=24, nburn=60, nsteps=120, save_chain=False, numthreads=1)
-        direction = np.radians(self.angle)
-        truth = (
-            self.contrast,
-            *(self.separation * np.array([np.sin(direction), np.cos(direction)])),
-        )
+        length = KERNELS[kernel]
+        fit.set_kernel(kernel, length, ["l"] * len(length))
+        fit.set_bounds(1.5, 1.5, 1.0, [1.0] * len(length))
+        fit.fit_astrometry(nwalkers=24, nburn=150, nsteps=150, save_chain=False, numthreads=1)
         found = (fit.raw_flux, fit.raw_RA_offset, fit.raw_Dec_offset)
-        scales = (self.guess[2], 1.0, 1.0)
-        values = [each.bestfit * scale for each, scale in zip(found, scales, strict=True)]
-        errors = [each.error * scale for each, scale in zip(found, scales, strict=True)]
-        return np.array([np.subtract(values, truth), errors])
+        return self.compared([each.bestfit for each in found], [each.error for each in found])
+
+    def compared(self, values: Sequence[float], errors: Sequence[float]) -> Errors:
+        """Flux as a multiple of the guess, and position, minus the truth; and their errors."""
+        direction, scales = np.radians(self.angle), np.array([self.guess[2], 1.0, 1.0])
+        place = self.separation * np.array([np.sin(direction), np.cos(direction)])
+        truth = (self.contrast, *place)
+        return np.array([scales * values - truth, scales * errors])
 
 
 def main() -> None:
@@ -180,30 +198,31 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=12)
     parser.add_argument("--contrast", type=float, default=4e-6)
     options = parser.parse_args()
-    methods: dict[str, Callable[[Trial], NDArray[np.float64]]] = {
-        "diffrender": lambda trial: trial.fitted("ADI", keep_detected=False),
+    reductions: dict[str, Callable[[Trial], dict[str, Errors]]] = {
+        "diffrender": lambda trial: trial.fitted("ADI", tuple(KERNELS), keep_detected=False),
         "diffrender, detected kept": lambda trial: trial.fitted("ADI", keep_detected=True),
         "diffrender, difference": lambda trial: trial.difference(keep_detected=False),
         "KLIP, RDI": lambda trial: trial.fitted("RDI"),
     }
-    results: dict[str, list[NDArray[np.float64]]] = {name: [] for name in methods}
+    results: dict[str, list[Errors]] = {}
     for seed in range(options.trials):
         trial = Trial(seed, options.contrast)
-        for name, method in methods.items():
+        for reduction, method in reductions.items():
             np.random.seed(seed)  # emcee has no other way.  # noqa: NPY002
-            results[name].append(method(trial))
-            (contrast, x, y), errors = results[name][-1]
-            print(
-                f"{seed} {name}: contrast {contrast / options.contrast:+.3f} +- "
-                f"{errors[0] / options.contrast:.3f}, x {x:+.3f} +- {errors[1]:.3f}, "
-                f"y {y:+.3f} +- {errors[2]:.3f}", flush=True,
-            )  # fmt: skip
+            for kind, ((contrast, x, y), errors) in method(trial).items():
+                name = f"{reduction}, {kind}"
+                results.setdefault(name, []).append(np.array([(contrast, x, y), errors]))
+                print(
+                    f"{seed} {name}: contrast {contrast / options.contrast:+.3f} +- "
+                    f"{errors[0] / options.contrast:.3f}, x {x:+.3f} +- {errors[1]:.3f}, "
+                    f"y {y:+.3f} +- {errors[2]:.3f}", flush=True,
+                )  # fmt: skip
     for name, each in results.items():
         away, errors = np.moveaxis(np.array(each), 1, 0)
         pulls, weights = away / errors, errors**-2.0
         bias = (weights * away).sum(axis=0) / weights.sum(axis=0)
         expected = weights.sum(axis=0) ** -0.5
-        print(name)
+        print(f"{name}: {len(each)} trials")
         for k, (what, unit) in enumerate((("contrast", options.contrast), ("x", 1.0), ("y", 1.0))):
             print(
                 f"  {what}: bias {bias[k] / unit:+.3f} +- {expected[k] / unit:.3f}, mean pull "

@@ -1,0 +1,92 @@
+"""The planet of a forward model as the linear model of the fit measures it.
+
+A fit of the product, such as `pyklip.fitpsf.FMAstrometry`, has to estimate the noise from an
+annulus about the star. The linear model knows the noise of every pixel and what the star takes, so
+that its values are more precise and its errors are those of the values.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import numpy as np
+from astropy.io import fits
+
+from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.pyklip_backend.forward_model import PlanetInFrame
+
+__all__ = ["planet_cards"]
+
+logger = logging.getLogger(__name__)
+
+
+def planet_cards(
+    part: FittedPointing, planet: PlanetInFrame, angle: float, flipx: bool
+) -> fits.Header:
+    """Flux and position of a planet with their errors, as cards for the products.
+
+    Parameters
+    ----------
+    part : FittedPointing
+        The pointing of the fit's first frame.
+    planet : PlanetInFrame
+        The forward model there.
+    angle : float
+        Degrees counter-clockwise by which pyKLIP turns the pointing.
+    flipx : bool
+        See `pyklip.klip.rotate`.
+
+    Returns
+    -------
+    Header
+        Empty if no source is within lambda/D of the planet's place in the forward model.
+    """
+    from pyklip_diffrender.detection.calibration import calibration_errors
+    from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
+    from pyklip_diffrender.detection.error_inflation import error_inflation
+    from pyklip_diffrender.detection.groups import groups_of
+
+    cards = fits.Header()
+    start, resolution = part.from_star(planet.offset), part.resolution
+    others = Candidates.of_fit(part.result)
+    for k in reversed(range(len(others))):
+        if np.hypot(*(others.offsets[k].numpy() - start)) < resolution:
+            others = others.without(k)
+    groups = groups_of([part.result])
+    sources = refine_candidates(
+        groups, others.with_one_more(start, planet.contrast), resolution / 2
+    )
+    moved = sources.offsets[-1].numpy() - start
+    flux = float(sources.contrasts[-1]) / planet.contrast
+    if not (np.hypot(*moved) < resolution and flux > 0):
+        logger.info("no source within lambda/D of the planet of the forward model")
+        return cards
+    covariance = sources.covariance.numpy().reshape(3, len(sources), 3, len(sources))[:, -1, :, -1]
+    factor = error_inflation([part.result], groups, sources.offsets)
+    error = factor * np.sqrt(covariance[0, 0])
+    snr = sources.contrasts[-1:] / error
+    calibration = factor * float(calibration_errors(groups, sources.offsets[-1:], snr)[1, 0])
+    detector = part.frame.model.detector
+    # From arcsec along x and y to pixels, then as pyKLIP turns the frames; east is to the left.
+    pixels = np.linalg.inv([[1.0, 0.0], [detector.shear, 1.0]])
+    pixels /= np.array(detector.pixelscale)[:, np.newaxis]
+    cosine, sine = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    turn[0] *= 1 if flipx else -1
+    place = turn @ (planet.offset + pixels @ moved)
+    jacobian = turn @ pixels
+    deviations = factor * np.sqrt(np.diag(jacobian @ covariance[1:, 1:] @ jacobian.T))
+    cards["DRFMFLUX"] = (flux, "fitted flux over that of the forward model")
+    cards["DRFMFERR"] = (
+        float(np.hypot(error / planet.contrast, flux * calibration)),
+        "standard deviation of DRFMFLUX",
+    )
+    for axis, name, value, deviation in zip(
+        ("RA", "DE"), ("east", "north"), place, deviations, strict=True
+    ):
+        cards[f"DRFM{axis}"] = (float(value), f"[pixel] fitted position {name} of the star")
+        cards[f"DRFM{axis}ER"] = (float(deviation), f"[pixel] standard deviation of DRFM{axis}")
+    return cards
