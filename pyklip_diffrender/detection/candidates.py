@@ -24,7 +24,7 @@ __all__ = ["Candidates", "refine_candidates", "strongest_peak"]
 _log = logging.getLogger(__name__)
 
 _ITERATIONS = 12
-_SETTLED = 0.05
+_SETTLED = 0.02
 """A position whose step is shorter than this many standard deviations stays where it is, so that
 its images are used again; the fit ends when all steps are shorter."""
 
