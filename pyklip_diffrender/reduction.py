@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from astropy import units as u
+
 from pyklip_diffrender.detection import Detection, WideField, detect, wide_field
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import stage
-from pyklip_diffrender.io.units import require_bound
+from pyklip_diffrender.io.units import require_bound, to_bytes
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Systematics, refine
 from pyklip_diffrender.refinement.pattern_choice import PatternRequest, choose_systematics
 from pyklip_diffrender.scene.real_frames import model_for
@@ -102,6 +104,7 @@ def reduce(
     threshold: float = 5.0,
     wide: bool = False,
     device: str = "cpu",
+    memory: float | str | u.Quantity | None = None,
     progress: bool = False,
 ) -> Reduction:
     """Search a sequence of real frames for planets.
@@ -134,6 +137,9 @@ def reduce(
         bright enough to be seen in these, the star is fitted once more without their light.
     device : str
         PyTorch device of the optical model.
+    memory : float, str or Quantity, optional
+        Memory that the process may take, bytes or such as "2 GB"; see `GaussNewton`, whose value
+        it replaces.
     progress : bool
         Show progress bars.
 
@@ -148,6 +154,7 @@ def reduce(
     """
     # Before the fits, which take minutes.
     require_bound(threshold, "threshold", "positive")
+    limit = None if memory is None else to_bytes(memory, "memory")
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
     wavefront = wavefront_for(opd, sequence.date)
@@ -160,6 +167,7 @@ def reduce(
         wavefront,
         systematics=systematics,
         settings=settings,
+        memory=limit,
         progress=progress,
     )
     sequence = replace(sequence, science=choice.science)

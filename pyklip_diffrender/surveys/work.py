@@ -77,7 +77,7 @@ def planet_image(
     away = torch.tensor(Planet.from_offset(1.0, *offset).rotated(roll).offset, dtype=torch.float64)
     with torch.no_grad():
         image = frame.model(torch.from_numpy(frame.opd), star_offset=star + away, **values)
-    return frame.flux * np.asarray(image.double().numpy())
+    return frame.flux * np.asarray(image.double().cpu().numpy())
 
 
 def _with_planet(frames: abc.Sequence[FrameFit], planet: Injection) -> Sequence:
