@@ -293,6 +293,7 @@ def _reduction(
     threshold: float,
     wide: bool,
     systematics: str,
+    memory: str | None,
     opd: Path | None,
     opd_folder: Path | None,
     opd_date: str | None,
@@ -330,6 +331,7 @@ def _reduction(
             threshold=threshold,
             wide=wide,
             device=run.device,
+            memory=memory,
             progress=run.progress,
         )
         with stage("4 of 4: products"):

@@ -41,7 +41,12 @@ _CELLS = 1.9
 """Cells of the occulter per lambda/D. With this number one cell per pixel is enough at all
 wavelengths of F444W, down to 3.9 um; two cells per pixel would take four times as long."""
 
-_BATCH_BYTES = 2.5e7
+_BATCH_BYTES = 1e7
+"""Bytes of the fields in the pupil whose propagation is computed at a time, which takes several
+times as much. Larger batches are not faster."""
+
+_ROWS = 128
+"""Number of modes whose images are computed at a time."""
 
 _PIECE = 16
 """Number of modes whose fields are multiplied at a time."""
@@ -227,8 +232,9 @@ class WavefrontResponse:
             (2 * weight) * field.to(torch.complex64).conj()
             for field, weight in zip(self._kept(fields), self.coarse.bandpass.weights, strict=True)
         ]
-        for start in range(0, count, self._batch):
-            part = slice(start, min(start + self._batch, count))
+        step = _ROWS if self.stored else self._batch
+        for start in range(0, count, step):
+            part = slice(start, min(start + step, count))
             total = _weighted_sum(self._changes(part), conjugates)
             for rows, parts in ((images[:modes], total.real), (images[modes:], total.imag)):
                 wanted = rows[part]

@@ -225,6 +225,8 @@ class Solver:
             or (equations.kappa, equations.robust) != (kappa, robust)
             or len(equations.current) != count
         ):
+            del equations
+            self._equations = None
             equations = linearise(self.objective, state, kappa, modes, robust)
         update = self._solve(layout, equations, errors=True)
         linear = LinearModel(

@@ -182,7 +182,10 @@ class GaussNewton:
 
     def memory_beside(self, arrays: float) -> float:
         """Bytes of `memory` that remain beside the process and arrays of so many bytes."""
-        return math.inf if self.memory is None else max(0.0, self.memory - _PROCESS - arrays)
+        if self.memory is None:
+            return math.inf
+        # Some of what is freed does not return to the system at once.
+        return max(0.0, 0.9 * self.memory - _PROCESS - arrays)
 
     @classmethod
     def nircam(cls, **changes: Any) -> GaussNewton:
