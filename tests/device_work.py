@@ -31,8 +31,8 @@ __all__ = [
 Array = NDArray[np.float64]
 
 NPIX, SIZE = 64, 24
-PLANET = dr.Planet(1e-4, 0.5, 120.0)
-QUICK = {"free": ("star_offset", "flux", "background"), "max_iterations": 5}
+PLANET = dr.Planet(3e-4, 0.5, 120.0)
+QUICK = {"free": ("star_offset", "flux", "background"), "max_iterations": 10}
 VALUES = {
     "star_offset": (0.01, -0.02),
     "lyot_shift": (0.002, 0.001),
@@ -58,9 +58,10 @@ def tensors(model: OpticalSystem) -> dict[str, torch.Tensor]:
 
 
 def frame(k: int = 0, *planets: dr.Planet, **details: object) -> dr.Observation:
-    """A star, rolled by 20 degrees a frame."""
+    """A star through a drifted wavefront, rolled by 20 degrees a frame."""
     scene = dr.Scene(dr.Star(exposure=200.0), planets=planets)
-    seen = dr.simulate(model_on("cpu"), scene, opd(), seed=3 + k)
+    drifted = opd() + 0.02 * dr.random_opd(2, npix=NPIX).data
+    seen = dr.simulate(model_on("cpu"), scene, drifted, seed=3 + k)
     return replace(seen, position_angles=np.full(len(seen), 20.0 * k), **details)  # type: ignore[arg-type]
 
 
@@ -89,6 +90,8 @@ def fitted(
 
 def reached(fit: Refinement) -> list[float]:
     assert fit.status.usable
+    assert fit.frames[0].coefficients is not None
+    assert np.any(fit.frames[0].coefficients != 0)
     return [fit.chi2_per_pixel, *fit.frames[0].values["star_offset"], fit.frames[0].flux]
 
 
