@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from astropy import units as u
+
 from pyklip_diffrender.detection import Detection, Disk, WideField, detect, fit_disk, wide_field
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import stage
-from pyklip_diffrender.io.units import require_bound
+from pyklip_diffrender.io.units import require_bound, to_bytes
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Systematics, refine
 from pyklip_diffrender.refinement.pattern_choice import PatternRequest, choose_systematics
 from pyklip_diffrender.scene.real_frames import model_for
@@ -109,6 +111,7 @@ def reduce(
     wide: bool = False,
     disk: bool = False,
     device: str = "cpu",
+    memory: float | str | u.Quantity | None = None,
     progress: bool = False,
 ) -> Reduction:
     """Search a sequence of real frames for planets.
@@ -143,6 +146,9 @@ def reduce(
         Fit extended light about the star, see `fit_disk`, and search the frames without it.
     device : str
         PyTorch device of the optical model.
+    memory : float, str or Quantity, optional
+        Memory that the process may take, bytes or such as "2 GB"; see `GaussNewton`, whose value
+        it replaces.
     progress : bool
         Show progress bars.
 
@@ -165,6 +171,7 @@ def reduce(
             "got wide=True and disk=True, expected one of them: beyond the fitted pixels a disk "
             "would be taken for point sources"
         )
+    limit = None if memory is None else to_bytes(memory, "memory")
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
     wavefront = wavefront_for(opd, sequence.date)
@@ -177,6 +184,7 @@ def reduce(
         wavefront,
         systematics=systematics,
         settings=settings,
+        memory=limit,
         progress=progress,
     )
     sequence = replace(sequence, science=choice.science)

@@ -1,7 +1,7 @@
-"""The two tiers of tests, fixtures for all, and an environment in which runs repeat.
+"""The tiers of tests, fixtures for all, and an environment in which runs repeat.
 
 Plain ``pytest`` leaves out what is marked ``slow`` and tries few examples in each property test;
-``pytest --full`` runs everything.
+``pytest --full`` runs everything but what needs a GPU; ``pytest -m gpu`` runs that.
 """
 
 from __future__ import annotations
@@ -54,12 +54,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
             item.add_marker("fuzz")
-    if config.getoption("--full"):
-        return
-    slow = [item for item in items if item.get_closest_marker("slow")]
-    if slow:
-        config.hook.pytest_deselected(items=slow)
-        items[:] = [item for item in items if not item.get_closest_marker("slow")]
+    absent = set() if config.getoption("--full") else {"slow"}
+    if "gpu" not in config.getoption("markexpr"):
+        absent.add("gpu")
+    left_out = [item for item in items if any(map(item.get_closest_marker, absent))]
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in set(left_out)]
 
 
 @pytest.fixture(scope="session", autouse=True)

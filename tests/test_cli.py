@@ -394,6 +394,7 @@ def test_reduce_passes_its_options_on_and_names_the_products(
     products = tmp_path / "products"
     arguments = ["reduce", str(frames), "--opd-folder", str(maps), "--opd-date", "before"]
     arguments += ["-o", str(products), "--size", "6", "--threshold", "4", "--systematics", "off"]
+    arguments += ["--memory", "2 GB"]
     assert main(arguments) == 0
     shown = capsys.readouterr()
     assert "what was found\n" in shown.out
@@ -402,7 +403,7 @@ def test_reduce_passes_its_options_on_and_names_the_products(
     (call,) = reduced
     assert call.arguments["opd"].name == "opd_2022-07-20.fits"
     wanted = {"size": 6, "threshold": 4.0, "systematics": "off", "device": "cpu"}
-    assert wanted.items() <= call.arguments.items()
+    assert {**wanted, "memory": "2 GB"}.items() <= call.arguments.items()
     # Not on a terminal: no bar, but the stages.
     assert call.arguments["progress"] is False
     assert "4 of 4: products" in shown.err

@@ -271,6 +271,18 @@ def test_values_out_of_bounds_say_what_was_got_and_expected(
     assert isinstance(caught.value, ValueError)
 
 
+def test_memory_is_text_a_quantity_or_bytes() -> None:
+    for memory in ("2 GB", "2000MB", 2 * u.Gbyte, 2e9):
+        assert dr.GaussNewton(memory=memory).memory == 2e9
+    assert dr.GaussNewton(memory="2 GiB").memory == 2 * 1024**3
+    assert dr.GaussNewton().memory is None
+    for memory in ("much", "2", "2 m", 2 * u.m):
+        with pytest.raises(UnitError, match="memory: got"):
+            dr.GaussNewton(memory=memory)
+    with pytest.raises(IncompatibleSetupError, match="memory: got -1 byte"):
+        dr.GaussNewton(memory=-1)
+
+
 def test_single_numbers_and_pairs() -> None:
     assert to_number(np.array([3.0]), u.m, "x") == 3.0
     assert to_pair(3 * u.mas, u.arcsec, "x") == (0.003, 0.003)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from scipy.stats import multivariate_normal
 
-from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
 from pyklip_diffrender.linear.response import (
     NANOMETRE,
+    Responses,
     WavefrontResponse,
     coarse_copy,
     downsample,
@@ -113,9 +116,29 @@ def test_wavefront_response_takes_the_field_of_the_star_it_is_asked_about(
     torch.testing.assert_close(response.image(fields, values), 2 * here, rtol=1e-6, atol=0)
 
 
-def test_a_response_larger_than_the_limit_is_refused(opd: torch.Tensor) -> None:
-    with pytest.raises(IncompatibleSetupError, match=r"modes on 20 x 24.*0\.0 GB.*fewer"):
-        WavefrontResponse(system(), BASIS, opd, {}, npix=64, memory_limit=1e5)
+def test_responses_that_are_not_stored_are_the_same(
+    opd: torch.Tensor, values: dict[str, torch.Tensor]
+) -> None:
+    """Room for one response: the other is computed again, about its own wavefront."""
+    model = system(npix=64)
+    start = downsample(opd, 64)
+    basis = FourierModes(3)
+    fields = model.fields(start, **values)
+    images = {}
+    for memory in (math.inf, 8 * len(basis) * 20 * 24, 100.0):
+        responses = Responses(model, basis, npix=64, keep=2, memory=memory)
+        near, far = (
+            responses.near(shifted, values)
+            for shifted in (start, start + 2e-7 * model.entrance.lit)
+        )
+        assert responses.near(start, values) is near
+        assert (near.stored, far.stored) == (memory == math.inf, memory > 1000)
+        images[memory] = [each.image(fields, values, 5) for each in (near, far)]
+    every = list(images.values())
+    for others in every[1:]:
+        for image, expected in zip(others, every[0], strict=True):
+            assert float((image - expected).norm() / expected.norm()) < 1e-6
+    assert float((every[0][0] - every[0][1]).norm() / every[0][0].norm()) > 0.01
 
 
 @pytest.mark.hard

@@ -332,9 +332,11 @@ def test_rolls_share_an_unknown_pattern_where_nothing_is_known(
         header=header,
     )
 
-    def chosen(*rolls: Observation, request: str = "auto") -> PatternChoice:
+    def chosen(*rolls: Observation, request: str = "auto", **options: float) -> PatternChoice:
         system, opd = cast(OpticalSystem, None), cast(OPDMap, None)
-        return pattern_choice.choose_systematics(rolls, [], system, opd, systematics=request)
+        return pattern_choice.choose_systematics(
+            rolls, [], system, opd, systematics=request, **options
+        )
 
     pattern = chosen(roll, roll).systematics
     assert pattern is not None
@@ -343,7 +345,9 @@ def test_rolls_share_an_unknown_pattern_where_nothing_is_known(
     assert (values == 0).all()
     assert (errors == 0.03).all()
     assert pattern.pedestal == 1.9
-    assert chosen(roll, roll).settings == GaussNewton.nircam(min_model_error=0.002)
+    preset = GaussNewton.nircam(min_model_error=0.002)
+    assert chosen(roll, roll).settings == preset
+    assert chosen(roll, roll, memory=2e9).settings == replace(preset, memory=2e9)
     assert chosen(roll, replace(roll, unit=u.DN / u.s)).systematics is not None
     # One roll, different pixels, pixels that are not known, other instruments, and "off".
     elsewhere = replace(roll, first_pixel=(601, 1600))

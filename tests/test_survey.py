@@ -567,6 +567,22 @@ def test_an_interrupted_command_says_that_it_can_go_on(
     assert list(table["status"]) == ["finished", "waiting", "waiting"]
 
 
+def test_jobs_aim_at_less_than_the_memory_of_their_worker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = []
+
+    def work(job: Job, folder: Path, memory: float | None = None) -> dict[str, Any]:
+        limits.append(memory)
+        return stub(job, folder)
+
+    monkeypatch.setattr("pyklip_diffrender.surveys.work.reduce_job", work)
+    config = inputs(tmp_path / "data", 1)
+    survey({**config, "memory_limit": "4 GB"}, tmp_path / "limited")
+    survey(config, tmp_path / "free")
+    assert limits == [3.2e9, None]
+
+
 def test_a_configuration_with_mistakes_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

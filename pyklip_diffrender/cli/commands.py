@@ -294,6 +294,7 @@ def _reduction(
     wide: bool,
     disk: bool,
     systematics: str,
+    memory: str | None,
     opd: Path | None,
     opd_folder: Path | None,
     opd_date: str | None,
@@ -332,6 +333,7 @@ def _reduction(
             wide=wide,
             disk=disk,
             device=run.device,
+            memory=memory,
             progress=run.progress,
         )
         with stage("4 of 4: products"):

@@ -230,6 +230,8 @@ search = _all(
            section="Fit and search",
            help="Pattern of the model's error: auto (the package's library, else the reference "
            "stars), references (both), off, or a systematics.fits of an earlier reduction."),
+    option("--memory", metavar="SIZE", section="Fit and search",
+           help='Memory that the process may take, such as "2 GB"; default: as much as it needs.'),
     option("--dry-run", is_flag=True, section="Output",
            help="Show frames, wavefront map, steps, time and memory, and stop."),
     option("--json", is_flag=True, section="Output",

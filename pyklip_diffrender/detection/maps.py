@@ -12,6 +12,7 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.io.progress import ProgressBar
+from pyklip_diffrender.refinement import GaussNewton
 
 __all__ = ["Maps"]
 
@@ -42,12 +43,23 @@ class Maps:
         self.grid = self.groups[0][1].grid
         ny, nx = self.shape = self.grid.shape[:2]
         frames = sum(len(templates.frames) for _, templates in self.groups)
-        self._stores = 4.0 * frames * (ny * nx) ** 2 <= _STORE
+        self._stores = 4.0 * frames * (ny * nx) ** 2 <= min(_STORE, self._spare())
         self._stored: dict[tuple[int, int], dict[int, Tensor]] = {}
         total = np.zeros((3, ny * nx))
         for g, pixels, images in self._batches("S/N map"):
             total[:, pixels] += torch.stack(self.groups[g][0].weigh(images)).numpy()
         self.numerator, self.information, self.photon = total.reshape(3, ny, nx)
+
+    def _spare(self) -> float:
+        """Bytes that the settings of the fits leave beside the linear models."""
+        models = sum(
+            4.0 * frame.jacobian.numel() for linear, _ in self.groups for frame in linear.frames
+        )
+        return min(
+            templates.fit.settings.memory_beside(models)
+            for _, templates in self.groups
+            if isinstance(templates.fit.settings, GaussNewton)
+        )
 
     def _batches(self, name: str) -> Iterator[tuple[int, slice, dict[int, Tensor]]]:
         """Index of the group, flat indices of pixels, and their templates by frame."""

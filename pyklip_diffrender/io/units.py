@@ -114,6 +114,24 @@ def to_number(value: Any, unit: str | u.UnitBase, name: str, bound: Bound = "any
     return number
 
 
+def to_bytes(value: Any, name: str) -> float:
+    """Convert text such as "2 GB", a Quantity or a number of bytes to bytes.
+
+    Raises
+    ------
+    UnitError
+        For text that is not a number with a unit of memory, or another unit.
+    ShapeError, NonFiniteError, IncompatibleSetupError
+        See `to_number`; 0 is out of bounds.
+    """
+    if isinstance(value, str):
+        try:
+            value = u.Quantity(value)
+        except (TypeError, ValueError) as error:
+            raise UnitError(f"{name}: got {value!r}, expected memory such as '2 GB'") from error
+    return to_number(value, u.byte, name, "positive")
+
+
 def to_pair(
     value: Any, unit: str | u.UnitBase, name: str, bound: Bound = "any"
 ) -> tuple[float, float]:

@@ -40,6 +40,9 @@ __all__ = ["LinearFrame", "LinearModel", "TemplateProducts", "Unknown", "summed_
 _BATCH = 512
 """Number of templates that are processed at a time."""
 
+_PIXELS = 1024
+"""Number of pixels that are processed at a time, where there is a number for every unknown."""
+
 
 class Unknown(NamedTuple):
     """One unknown of a fit.
@@ -377,6 +380,20 @@ class LinearModel:
             self.curvature[remaining][:, remaining],
         )
 
+    def _predictors(self, frame: LinearFrame) -> Tensor:
+        """L^-1 G of a frame with P + G G^T = L L^T, (unknowns, pixels), float64."""
+        basis = torch.empty(len(self.vector), frame.weight.numel(), dtype=torch.float64)
+        weight, shared = frame.weight.flatten(), (frame.weight * frame.common).flatten()
+        for pixels in _pieces(basis.shape[1]):
+            white = frame.jacobian.flatten(1)[:, pixels].double() * weight[pixels]
+            whitened = frame.onto_unknowns(white, len(self.vector))
+            if self.shares_pattern:
+                whitened -= self._summed_rows[:, pixels] * shared[pixels]
+            basis[:, pixels] = torch.linalg.solve_triangular(
+                self._factor, whitened * self._scale[:, None], upper=False
+            )
+        return basis
+
     def left_out(self, size: int = 5, frame: int = 0) -> tuple[Tensor, Tensor]:
         """Residual of every patch of pixels, predicted from all pixels outside the patch.
 
@@ -394,17 +411,10 @@ class LinearModel:
         """
         part = self.frames[frame]
         ny, nx = part.residual.shape
-        white = part.jacobian.double() * part.weight
-        basis = torch.zeros(len(self.vector), ny * nx, dtype=torch.float64)
-        basis.copy_(part.onto_unknowns(white.flatten(1), len(self.vector)))
         precision = torch.ones(ny, nx, dtype=torch.float64)
         if self.shares_pattern:
-            shared = part.weight * part.common
-            basis -= self._summed_rows * shared.flatten()
-            precision -= shared**2
-        basis = torch.linalg.solve_triangular(
-            self._factor, basis * self._scale[:, None], upper=False
-        ).reshape(-1, ny, nx)
+            precision -= (part.weight * part.common) ** 2
+        basis = self._predictors(part).reshape(-1, ny, nx)
         residual = torch.full((ny, nx), torch.nan, dtype=torch.float64)
         deviation = residual.clone()
         for y in range(0, ny, size):
@@ -429,5 +439,13 @@ def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Tensor:
     """W c summed over frames with the derivative by every unknown, (unknowns, pixels), float32."""
     total = torch.zeros(unknowns, frames[0].weight.numel(), dtype=torch.float32)
     for frame in frames:
-        total += frame.onto_unknowns(frame.summed(frame.jacobian).flatten(1), unknowns)
+        scale = frame.summed(torch.ones(())).flatten()
+        for pixels in _pieces(total.shape[1]):
+            on_rows = frame.jacobian.flatten(1)[:, pixels] * scale[pixels]
+            total[:, pixels] += frame.onto_unknowns(on_rows, unknowns)
     return total
+
+
+def _pieces(pixels: int) -> list[slice]:
+    """Parts of an image of which arrays with all unknowns are small."""
+    return [slice(start, start + _PIXELS) for start in range(0, pixels, _PIXELS)]

@@ -16,7 +16,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.linear.parameter_derivatives import field_derivatives, image_derivatives
@@ -42,10 +41,15 @@ _CELLS = 1.9
 """Cells of the occulter per lambda/D. With this number one cell per pixel is enough at all
 wavelengths of F444W, down to 3.9 um; two cells per pixel would take four times as long."""
 
-_BATCH_BYTES = 2.5e7
+_BATCH_BYTES = 1e7
+"""Bytes of the fields in the pupil whose propagation is computed at a time, which takes several
+times as much. Larger batches are not faster."""
+
+_ROWS = 128
+"""Number of modes whose images are computed at a time."""
 
 _PIECE = 16
-"""Number of modes whose images are computed at a time."""
+"""Number of modes whose fields are multiplied at a time."""
 
 
 def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
@@ -109,15 +113,11 @@ class WavefrontResponse:
         Pupil samples of the coarse copy that does the propagations.
     wavelengths : int
         Largest number of wavelengths at which derivatives are computed.
-    memory_limit : float
-        Largest number of bytes to store.
+    stored : bool
+        Compute and store the derivatives now; otherwise they are computed in every call of `image`
+        until `store` is called.
     progress : bool
         Show a progress bar.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If the response would be larger than `memory_limit`.
     """
 
     def __init__(
@@ -130,50 +130,72 @@ class WavefrontResponse:
         names: tuple[str, ...] = (),
         npix: int = 128,
         wavelengths: int = 4,
-        memory_limit: float = 4e9,
+        stored: bool = True,
         progress: bool = False,
     ) -> None:
-        self.model, self.names = model, names
+        self.model, self.basis, self.names = model, basis, names
         self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
-        coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
-        self.coarse = coarse
-        ny, nx = (n * model.detector.oversample for n in model.detector.shape)
-        size = 8.0 * len(basis) * ny * nx * len(bandpass.wavelengths)
-        if size > memory_limit:
-            raise IncompatibleSetupError(
-                f"the response of {len(basis)} modes on {ny} x {nx} samples at "
-                f"{len(bandpass.wavelengths)} wavelengths takes {size / 1e9:.1f} GB, more than "
-                f"the limit of {memory_limit / 1e9:.1f} GB. Fit a smaller field, fewer wavelengths "
-                "or fewer modes, or raise the limit"
-            )
-        self.size = size
-        """Number of bytes stored."""
-        self.fields = [
-            torch.empty(len(basis), ny, nx, dtype=torch.complex64, device=model.device)
-            for _ in bandpass.wavelengths
-        ]
-        full = PupilGrid.full(coarse.npix, coarse.diameter)
-        window = coarse.entrance.grid
+        self.coarse = coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
+        self._progress = progress
+        self._fields: list[Tensor] | None = None
+        pixels = math.prod(model.detector.shape) * model.detector.oversample**2
+        self.size = 8 * len(basis) * pixels * len(bandpass.wavelengths)
+        """Number of bytes that are stored."""
         complex_bytes = 16 if coarse.dtype == torch.float64 else 8
-        batch = max(1, int(_BATCH_BYTES / (complex_bytes * math.prod(window.shape)) / 2))
+        samples = math.prod(coarse.entrance.grid.shape)
+        self._batch = max(1, int(_BATCH_BYTES / (complex_bytes * samples) / 2))
+        small = downsample(opd, coarse.npix)
+        self._values = coarse.values(values)
         with torch.no_grad():
-            small = downsample(opd, coarse.npix)
-            pupils = [coarse.pupil_field(small, w, values) for w in bandpass.wavelengths]
-            with ProgressBar("response", len(basis), shown=progress) as bar:
-                for start in range(0, len(basis), batch):
-                    stop = min(start + batch, len(basis))
-                    sampled = basis.modes(full, start, stop)
-                    modes = coarse.entrance.on_window(sampled).to(model.device, coarse.dtype)
-                    for kept, wavefront in zip(self.fields, pupils, strict=True):
-                        # d(exp(i k OPD)) = i k exp(i k OPD) d(OPD), for 1 nm.
-                        wavenumber = 2 * math.pi / wavefront.wavelength * NANOMETRE
-                        moved = replace(
-                            wavefront, field=modes * (1j * wavenumber * wavefront.field)
-                        )
-                        kept[start:stop] = coarse.propagate(moved, values)
-                    bar.update(stop - start)
-        self._slopes = field_derivatives(coarse, downsample(opd, coarse.npix), values, names)
-        _log.debug("response of %d modes at %d pupil samples", len(basis), coarse.npix)
+            self._pupils = [
+                coarse.pupil_field(small, w, self._values) for w in bandpass.wavelengths
+            ]
+        self._slopes = field_derivatives(coarse, small, values, names)
+        if stored:
+            self.store()
+
+    @property
+    def stored(self) -> bool:
+        """Whether the derivatives are stored."""
+        return self._fields is not None
+
+    def store(self) -> None:
+        """Compute the derivatives and store them."""
+        ny, nx = (n * self.model.detector.oversample for n in self.model.detector.shape)
+        count = len(self.basis)
+        fields = [
+            torch.empty(count, ny, nx, dtype=torch.complex64, device=self.model.device)
+            for _ in self._pupils
+        ]
+        with ProgressBar("response", count, shown=self._progress) as bar:
+            for start in range(0, count, self._batch):
+                part = slice(start, min(start + self._batch, count))
+                for kept, change in zip(fields, self._changes(part), strict=True):
+                    kept[part] = change
+                bar.update(part.stop - start)
+        self._fields = fields
+        _log.debug("response of %d modes at %d pupil samples", count, self.coarse.npix)
+
+    def forget(self) -> None:
+        """Free the memory of the derivatives."""
+        self._fields = None
+
+    @torch.no_grad()
+    def _changes(self, part: slice) -> list[Tensor]:
+        """Derivatives of the field with respect to some modes, for each wavelength."""
+        if self._fields is not None:
+            return [kept[part] for kept in self._fields]
+        coarse = self.coarse
+        full = PupilGrid.full(coarse.npix, coarse.diameter)
+        sampled = self.basis.modes(full, part.start, part.stop)
+        modes = coarse.entrance.on_window(sampled).to(self.model.device, coarse.dtype)
+        changes = []
+        for wavefront in self._pupils:
+            # d(exp(i k OPD)) = i k exp(i k OPD) d(OPD), for 1 nm.
+            wavenumber = 2 * math.pi / wavefront.wavelength * NANOMETRE
+            moved = replace(wavefront, field=modes * (1j * wavenumber * wavefront.field))
+            changes.append(coarse.propagate(moved, self._values).to(torch.complex64))
+        return changes
 
     def image(
         self,
@@ -203,22 +225,21 @@ class WavefrontResponse:
         Tensor, (modes + amplitude_modes, ny, nx), float32
             Light per pixel (fraction of what the pupil collects) per nm.
         """
-        modes = len(self.fields[0]) if modes is None else modes
-        shape = (modes + amplitude_modes, *self.fields[0].shape[1:])
-        total = torch.zeros(shape, device=self.model.device)
+        modes = len(self.basis) if modes is None else modes
+        detector, count = self.coarse.detector, max(modes, amplitude_modes)
+        images = torch.empty(modes + amplitude_modes, *detector.shape, device=self.model.device)
         conjugates = [
             (2 * weight) * field.to(torch.complex64).conj()
             for field, weight in zip(self._kept(fields), self.coarse.bandpass.weights, strict=True)
         ]
-        # Pieces that fit in the processor's cache are faster than the whole product.
-        for start in range(0, max(modes, amplitude_modes), _PIECE):
-            piece = slice(start, start + _PIECE)
-            real, imaginary = total[:modes][piece], total[modes:][piece]
-            for conjugate, change in zip(conjugates, self.fields, strict=True):
-                product = change[piece] * conjugate
-                real += product[: len(real)].real
-                imaginary += product[: len(imaginary)].imag
-        return self.coarse.detector.image(total, values)
+        step = _ROWS if self.stored else self._batch
+        for start in range(0, count, step):
+            part = slice(start, min(start + step, count))
+            total = _weighted_sum(self._changes(part), conjugates)
+            for rows, parts in ((images[:modes], total.real), (images[modes:], total.imag)):
+                wanted = rows[part]
+                wanted.copy_(detector.image(parts[: len(wanted)].contiguous(), values))
+        return images
 
     def parameters(self, fields: Sequence[Tensor], values: dict[str, Tensor]) -> Tensor:
         """Derivative of the image with respect to the other parameters, (components, ny, nx)."""
@@ -227,6 +248,17 @@ class WavefrontResponse:
     def _kept(self, fields: Sequence[Tensor]) -> list[Tensor]:
         """The star's fields at the wavelengths of the response."""
         return [fields[k] for k in self._kept_wavelengths]
+
+
+def _weighted_sum(changes: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
+    """Sum over wavelengths of changes (modes, ny, nx) times weights (ny, nx)."""
+    total = torch.zeros_like(changes[0])
+    # Pieces that fit in the processor's cache are faster than the whole product.
+    for start in range(0, len(total), _PIECE):
+        piece = slice(start, start + _PIECE)
+        for change, weight in zip(changes, weights, strict=True):
+            total[piece] += change[piece] * weight
+    return total
 
 
 _OPENINGS = 20.0
@@ -252,8 +284,9 @@ class Responses:
         the position is off by four times that error.
     keep : int
         Number of responses to store: one for each frame, because star positions differ.
-    memory_limit : float
-        Largest number of bytes of one response.
+    memory : float
+        Number of bytes of responses to store. Those that do not fit are computed again whenever
+        they are needed, the oldest first, about the same wavefront.
     progress : bool
         Show progress bars.
     """
@@ -267,12 +300,12 @@ class Responses:
         wavelengths: int = 4,
         relinearise: float = 0.05,
         keep: int = 1,
-        memory_limit: float = 4e9,
+        memory: float = math.inf,
         progress: bool = False,
     ) -> None:
         self.keep = keep
         self.model, self.basis, self.npix, self.wavelengths = model, basis, npix, wavelengths
-        self.relinearise, self.memory_limit, self.progress = relinearise, memory_limit, progress
+        self.relinearise, self.memory, self.progress = relinearise, memory, progress
         self._kept: list[tuple[Tensor, dict[str, Tensor], WavefrontResponse]] = []
         self._slopes: tuple[Tensor, dict[str, Tensor], dict[str, list[Tensor]]] | None = None
         self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
@@ -313,6 +346,7 @@ class Responses:
         for opd_then, values_then, response in reversed(self._kept):
             if self._change(inside - opd_then, values, values_then) <= self.relinearise:
                 return response
+            del response  # Or its memory could not be freed.
         # Memory is freed first, because the new response is as large as the old one.
         del self._kept[: max(0, len(self._kept) + 1 - self.keep)]
         response = WavefrontResponse(
@@ -323,11 +357,20 @@ class Responses:
             names=names,
             npix=self.npix,
             wavelengths=self.wavelengths,
-            memory_limit=self.memory_limit,
+            stored=False,
             progress=self.progress,
         )
+        if response.size <= self.memory:
+            self._make_room(response.size)
+            response.store()
         self._kept.append((inside, dict(values), response))
         return response
+
+    def _make_room(self, size: int) -> None:
+        """Free the oldest responses until as many bytes can be stored."""
+        stored = [response for _, _, response in self._kept if response.stored]
+        while stored and sum(each.size for each in stored) + size > self.memory:
+            stored.pop(0).forget()
 
     def _change(self, moved: Tensor, values: dict[str, Tensor], others: dict[str, Tensor]) -> float:
         """Relative change of the field, rms over the pupil."""

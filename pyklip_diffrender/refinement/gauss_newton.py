@@ -31,6 +31,9 @@ __all__ = ["Solver", "count_modes_below"]
 _TRIES = 7
 """Largest number of attempts at a step, with increasing damping."""
 
+_RESPONSES = 4e9
+"""Largest number of bytes of stored derivatives."""
+
 _IMPROBABLE = 1.5
 """Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
 
@@ -77,6 +80,8 @@ class Solver:
                 "flux is not free and start has no 'flux': how bright is the star? Add 'flux' to "
                 "free, or give start={'flux': light that the pupil collects}"
             )
+        jacobians = 4.0 * len(problems) * (len(basis) + settings.prior.amplitude_modes(basis))
+        jacobians *= math.prod(problems[0].observation.shape)
         responses = Responses(
             problems[0].model,
             basis,
@@ -84,6 +89,7 @@ class Solver:
             wavelengths=settings.response_wavelengths,
             relinearise=settings.relinearise,
             keep=len(problems),
+            memory=min(_RESPONSES, settings.memory_beside(jacobians)),
             progress=progress,
         )
         self.objective = Objective(
@@ -175,6 +181,7 @@ class Solver:
             Decrease, or expected decrease, of the penalised chi-squared per pixel.
         """
         layout, objective = state.joint, self.objective
+        self._equations = None  # The next ones are as large.
         equations = self._equations = linearise(objective, state, kappa, modes, objective.robust)
         weights = objective.weights(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
@@ -218,6 +225,8 @@ class Solver:
             or (equations.kappa, equations.robust) != (kappa, robust)
             or len(equations.current) != count
         ):
+            del equations
+            self._equations = None
             equations = linearise(self.objective, state, kappa, modes, robust)
         update = self._solve(layout, equations, errors=True)
         linear = LinearModel(

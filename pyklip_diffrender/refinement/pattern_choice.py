@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -17,7 +17,7 @@ from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.library import known_systematics
 from pyklip_diffrender.refinement.registration import register
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.refinement.settings import Adam, GaussNewton
+from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
 from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.opd import OPDMap
@@ -83,6 +83,7 @@ def choose_systematics(
     *,
     systematics: PatternRequest = "auto",
     settings: GaussNewton | Adam | None = None,
+    memory: float | None = None,
     progress: bool = False,
 ) -> PatternChoice:
     """Choose the pattern of the model's error for a target.
@@ -102,6 +103,8 @@ def choose_systematics(
         show the same pixels of the detector share a pattern of which only the size is known.
     settings : GaussNewton or Adam, optional
         Of the fits; default those of `refine`.
+    memory : float, optional
+        See `GaussNewton.memory`; by default that of the settings.
     progress : bool
         Show progress bars.
 
@@ -113,7 +116,10 @@ def choose_systematics(
         If frames that must be moved cannot be fitted. A reference star that cannot be is left out.
     """
     require_request(systematics)
-    common: dict[str, Any] = {"settings": settings, "progress": progress}
+    common: dict[str, Any] = {
+        "settings": _limited(settings, science[0], memory),
+        "progress": progress,
+    }
     fits: list[Refinement] = []
     failed: list[tuple[str, str]] = []
     pattern = systematics if isinstance(systematics, Systematics) else None
@@ -131,7 +137,17 @@ def choose_systematics(
         _log.info("pattern of the model's error: %s", pattern)
     if pattern is not None and settings is None and science[0].is_nircam:
         settings = GaussNewton.nircam(min_model_error=_KNOWN_MODEL_ERROR)
+    settings = _limited(settings, science[0], memory)
     return PatternChoice(tuple(science), pattern, settings, tuple(fits), tuple(failed))
+
+
+def _limited(
+    settings: GaussNewton | Adam | None, observation: Observation, memory: float | None
+) -> GaussNewton | Adam | None:
+    """Settings with a limit of the memory, if there is one."""
+    if memory is None or isinstance(settings, Adam):
+        return settings
+    return replace(settings or settings_for(observation), memory=memory)
 
 
 def _unknown_pattern(science: Sequence[Observation]) -> Systematics | None:

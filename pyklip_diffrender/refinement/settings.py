@@ -11,7 +11,7 @@ import numpy as np
 from astropy import units as u
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import set_numbers, to_unit
+from pyklip_diffrender.io.units import set_numbers, to_bytes, to_unit
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
@@ -19,6 +19,9 @@ from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = ["Adam", "GaussNewton", "settings_for"]
+
+_PROCESS = 1e9
+"""Memory that the package and PyTorch take, with what a fit needs for a while, bytes."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,11 @@ class GaussNewton:
     robust : float
         Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain
         least squares.
+    memory : float, str or Quantity, optional
+        Memory that the process may take, bytes or such as "2 GB"; the process alone takes 1 GB of
+        it. Derivatives that do not fit are computed in parts whenever they are needed, which
+        takes longer and gives the same result. The Jacobians of the frames are always stored. By
+        default derivatives take up to 4 GB.
 
     Raises
     ------
@@ -108,8 +116,11 @@ class GaussNewton:
     min_model_error: float = 0.0
     relinearise: float = 0.05
     robust: float = math.inf
+    memory: float | None = None
 
     def __post_init__(self) -> None:
+        if self.memory is not None:
+            object.__setattr__(self, "memory", to_bytes(self.memory, "memory"))
         try:
             cycles = np.atleast_1d(np.asarray(self.cycles, dtype=float))
         except (TypeError, ValueError) as reason:
@@ -168,6 +179,13 @@ class GaussNewton:
                 "free is empty and wavefront is False: nothing to fit. Name parameters in free, "
                 "such as ('flux', 'background'), or set wavefront=True"
             )
+
+    def memory_beside(self, arrays: float) -> float:
+        """Bytes of `memory` that remain beside the process and arrays of so many bytes."""
+        if self.memory is None:
+            return math.inf
+        # Some of what is freed does not return to the system at once.
+        return max(0.0, 0.9 * self.memory - _PROCESS - arrays)
 
     @classmethod
     def nircam(cls, **changes: Any) -> GaussNewton:

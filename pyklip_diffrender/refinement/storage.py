@@ -164,7 +164,7 @@ def model_facts(model: OpticalSystem) -> dict[str, Any] | None:
 
 
 def model_of(facts: dict[str, Any] | None, name: str) -> OpticalSystem:
-    """Make a model from the arguments of `model_facts`.
+    """Make a model from the arguments of `model_facts`, on the CPU.
 
     Raises
     ------
@@ -176,7 +176,8 @@ def model_of(facts: dict[str, Any] | None, name: str) -> OpticalSystem:
             f"{name}: the model of this fit was not made by nircam_coronagraph, so it "
             "cannot be made from the file. Pass the model: Refinement.read(path, model=model)"
         )
-    return nircam_coronagraph(**facts)
+    # This machine may not have the device of the fit.
+    return nircam_coronagraph(**{**facts, "device": "cpu"})
 
 
 def image(hdus: fits.HDUList, name: str, frame: int) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from astropy.table import Table
 from tqdm import tqdm
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.surveys.config import Config, read_config
 from pyklip_diffrender.surveys.execution import in_this_process, with_dask
 from pyklip_diffrender.surveys.folders import Record, clean, prepare, read_record, staging
@@ -24,6 +26,9 @@ from pyklip_diffrender.surveys.tables import row, table_of, write_tables
 __all__ = ["run_survey", "survey"]
 
 _log = logging.getLogger(__name__)
+
+_OF_WORKER = 0.8
+"""Memory that jobs are to take, as a fraction of the worker's, which is killed at 0.95."""
 
 _SHARE = 20.0
 """The tables are written again after this many times the seconds that writing them took."""
@@ -75,7 +80,11 @@ def survey(
     """
     from pyklip_diffrender.surveys.work import reduce_job
 
-    return run_survey(config, output, reduce_job, scheduler, progress=progress)
+    limit = read_config(config).memory_limit
+    work: Work = reduce_job
+    if limit is not None:
+        work = partial(reduce_job, memory=_OF_WORKER * to_bytes(limit, "memory_limit"))
+    return run_survey(config, output, work, scheduler, progress=progress)
 
 
 def run_survey(

@@ -25,12 +25,13 @@ _SAME = 0.1
 """A candidate this near to an injected planet is the planet, arcsec."""
 
 
-def reduce_job(job: Job, folder: Path) -> dict[str, Any]:
+def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str, Any]:
     """Reduce a sequence, perhaps with a planet in it, and write the products."""
     options = job.options
     common: dict[str, Any] = {
         "size": options.size,
         "threshold": options.threshold,
+        "memory": memory,
         "settings": GaussNewton.nircam(**options.settings) if options.settings else None,
     }
     if job.injection is not None and job.base is not None:
@@ -77,7 +78,7 @@ def planet_image(
     away = torch.tensor(Planet.from_offset(1.0, *offset).rotated(roll).offset, dtype=torch.float64)
     with torch.no_grad():
         image = frame.model(torch.from_numpy(frame.opd), star_offset=star + away, **values)
-    return frame.flux * np.asarray(image.double().numpy())
+    return frame.flux * np.asarray(image.double().cpu().numpy())
 
 
 def _with_planet(frames: abc.Sequence[FrameFit], planet: Injection) -> Sequence:

@@ -84,7 +84,8 @@ class PointSources:
         sampling: float = 1.5,
         offset: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        self.model, self._offset = model, torch.tensor(offset, dtype=torch.float64)
+        self.model = model
+        self._offset = torch.tensor(offset, dtype=torch.float64, device=model.device)
         fixed = {name: value for name, value in (values or {}).items() if name != "star_offset"}
         with torch.no_grad():
             self._opd = model.opd(opd).detach()
@@ -172,7 +173,7 @@ class PointSources:
             for axis in detector.axes(self._values)
         )
         centres = torch.stack([x[columns], y[rows] + detector.shear * x[columns]], dim=-1)
-        return centres + self._offset.to(centres.device)
+        return centres + self._offset
 
     def images(self, rows: Index, columns: Index) -> Tensor:
         """Images of point sources, each at `offset` from the middle of a pixel.

@@ -1,0 +1,153 @@
+"""What the package computes on a device, for tests on a pretended one and on a GPU.
+
+Every function takes the arguments of `model_on` and returns arrays that do not depend on the device
+beyond rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
+from pyklip_diffrender.linear.response import Responses
+from pyklip_diffrender.optics.fast.point_sources import PointSources
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.refinement import GaussNewton, Refinement
+from pyklip_diffrender.wavefront.bases import FourierModes
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
+
+__all__ = [
+    "PLANET", "QUICK", "SIZE", "fitted", "forward_mode", "frame", "gradient", "image", "model_on",
+    "opd", "point_sources", "reached", "response", "rolls", "search", "settings", "tensors",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+
+NPIX, SIZE = 64, 24
+PLANET = dr.Planet(3e-4, 0.5, 120.0)
+QUICK = {"free": ("star_offset", "flux", "background"), "max_iterations": 10}
+VALUES = {
+    "star_offset": (0.01, -0.02),
+    "lyot_shift": (0.002, 0.001),
+    "lyot_rotation": 0.3,
+    "detector_shift": (0.02, 0.01),
+    "blur": 0.03,
+    "si_zernikes": np.full(36, 2e-9),
+}
+"""Every parameter of the model, off its default."""
+
+
+def model_on(device: Any, **changes: object) -> OpticalSystem:
+    arguments = {"monochromatic": 4.5e-6, "npix": NPIX, "fov_pixels": SIZE, **changes}
+    return dr.nircam_coronagraph("F444W", device=device, **arguments)  # type: ignore[arg-type]
+
+
+def opd() -> Array:
+    return dr.random_opd(1, npix=NPIX).data
+
+
+def tensors(model: OpticalSystem) -> dict[str, torch.Tensor]:
+    return model.values(VALUES)
+
+
+def frame(k: int = 0, *planets: dr.Planet, **details: object) -> dr.Observation:
+    """A star through a drifted wavefront, rolled by 20 degrees a frame."""
+    scene = dr.Scene(dr.Star(exposure=200.0), planets=planets)
+    drifted = opd() + 0.02 * dr.random_opd(2, npix=NPIX).data
+    seen = dr.simulate(model_on("cpu"), scene, drifted, seed=3 + k)
+    return replace(seen, position_angles=np.full(len(seen), 20.0 * k), **details)  # type: ignore[arg-type]
+
+
+def rolls() -> list[dr.Observation]:
+    """Two rolls of a star with a planet, and a reference star."""
+    return [frame(0, PLANET), frame(1, PLANET.rotated(20.0)), frame(2, reference=True)]
+
+
+def settings(**changes: object) -> GaussNewton:
+    """A fit of all parameters, of the wavefront and of the pupil's amplitude."""
+    chosen: dict[str, object] = {
+        "free": GaussNewton.nircam().free,
+        "basis": FourierModes(2),
+        "prior": WavefrontPrior(amplitude_cycles=1.5, amplitude_scale=1.0),
+        "response_npix": NPIX,
+        **changes,
+    }
+    return GaussNewton(**chosen)  # type: ignore[arg-type]
+
+
+def fitted(
+    device: Any, frames: Sequence[dr.Observation], changes: Any = None, **model: object
+) -> Refinement:
+    return dr.refine(model_on(device, **model), frames, opd(), settings=settings(**(changes or {})))
+
+
+def reached(fit: Refinement) -> list[float]:
+    assert fit.status.usable
+    assert fit.frames[0].coefficients is not None
+    assert np.any(fit.frames[0].coefficients != 0)
+    return [fit.chi2_per_pixel, *fit.frames[0].values["star_offset"], fit.frames[0].flux]
+
+
+def search(device: Any, frames: Sequence[dr.Observation], **model: object) -> list[float]:
+    """A joint fit, its search, measurements and limits."""
+    changes = {**QUICK, "drift": WavefrontPrior(scales={"texture": 0.05})}
+    fit = fitted(device, frames, changes, **model)
+    detection = dr.detect(fit, inner=0.1)
+    assert len(detection.table) > 0
+    return [
+        *reached(fit),
+        *np.asarray(detection.table["contrast"]),
+        *np.asarray(dr.measure(fit, [PLANET.offset])["contrast"]),
+        *np.asarray(dr.contrast_curve(fit)["contrast"]),
+        float(np.nanstd(detection.subtracted[0])),
+    ]
+
+
+def image(device: Any, **changes: object) -> list[Array]:
+    model = model_on(device, **changes)
+    return [model(opd(), **tensors(model)).cpu().numpy()]
+
+
+def gradient(device: Any, **changes: object) -> list[Array]:
+    model = model_on(device, **changes)
+    phase = torch.as_tensor(opd(), device=device).requires_grad_()
+    values = {name: value.requires_grad_() for name, value in tensors(model).items()}
+    model(phase, **values).square().sum().backward()
+    return [each.grad.cpu().numpy().ravel() for each in (phase, *values.values())]  # type: ignore[union-attr]
+
+
+def forward_mode(device: Any, **changes: object) -> list[Array]:
+    model = model_on(device, **changes)
+    start = torch.as_tensor(opd(), device=device)
+    return [parameter_jacobian(model, start, tensors(model), tuple(VALUES)).cpu().numpy()]
+
+
+def point_sources(device: Any, **changes: object) -> list[Array]:
+    model = model_on(device, **changes)
+    sources = PointSources(model, opd(), tensors(model), offset=(0.01, 0.0))
+    return [sources.images([3, 12, 20], [12, 12, 4]).cpu().numpy()]
+
+
+def response(device: Any, **changes: object) -> list[Array]:
+    """Linearisation about values on the processor, which is where a fit keeps its unknowns."""
+    model = model_on(device, **changes)
+    values = {name: value.cpu() for name, value in tensors(model).items()}
+    start = torch.as_tensor(opd(), device=device)
+    responses = Responses(model, FourierModes(2), npix=NPIX // 2)
+    with torch.no_grad():
+        fields = model.fields(start, **values)
+    names = ("star_offset", "lyot_shift", "blur")
+    near = responses.near(start, values, names)
+    slopes = (
+        near.image(fields, values, amplitude_modes=3),
+        near.parameters(fields, values),
+        responses.parameters(start, values, names, fields),
+    )
+    return [each.cpu().numpy().ravel() for each in slopes]

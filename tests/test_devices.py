@@ -1,0 +1,216 @@
+"""All work on an accelerator, without one: nothing mixes devices, and the results are the same.
+
+The device is pretended, see `pretend_device`; tests/test_gpu.py runs on a real one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import device_work as work
+import numpy as np
+import poppy
+import pytest
+import torch
+from device_work import QUICK, SIZE, fitted, frame, model_on, opd, reached, settings
+from numpy.typing import NDArray
+from pretend_device import DEVICE, pretended
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.bridges import from_poppy
+from pyklip_diffrender.detection import wide_field
+from pyklip_diffrender.linear.forward_mode import jacfwd
+from pyklip_diffrender.optics.detector_effects import GaussianBlur, LinearResampling, PixelCrosstalk
+from pyklip_diffrender.optics.rotation import SplineRotation
+from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Systematics
+from pyklip_diffrender.surveys.work import planet_image
+
+Array = NDArray[np.float64]
+
+
+def agree(compute: Callable[[Any], Sequence[Array | float]], rtol: float) -> None:
+    """Compare what a function of a device returns there with what it returns on the processor."""
+    expected = compute("cpu")
+    with pretended():
+        got = compute(DEVICE)
+    for ours, theirs in zip(got, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=rtol, atol=rtol * np.abs(theirs).max())
+
+
+# -- the pretended device ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        lambda there, here: there + here,
+        lambda there, here: here.mul_(there),
+        lambda there, here: there[0] * here,
+        lambda there, here: torch.stack([there, here]),
+        lambda there, here: torch.where(there > 0, there, here),
+        lambda there, here: here[there.long()],
+        lambda there, here: torch.zeros_like(there) + torch.zeros(3, device=here.device),
+        lambda there, here: there.numpy(),
+        lambda there, here: np.asarray(there),
+        lambda there, here: jacfwd(lambda x: x * here)(there),
+    ],
+)
+def test_the_pretended_device_refuses_to_mix(mistake: Callable[..., object]) -> None:
+    with pretended():
+        there, here = torch.ones(3, device=DEVICE), torch.ones(3)
+        with pytest.raises((RuntimeError, TypeError), match=r"one device|\.cpu\(\)"):
+            mistake(there, here)
+
+
+def test_the_pretended_device_follows_data() -> None:
+    with pretended():
+        here = torch.linspace(0, 1, 3, requires_grad=True)
+        there = here.to(DEVICE)
+        assert (2 * there[torch.tensor([0, 1])]).device == DEVICE
+        assert torch.as_tensor([1.0], device=DEVICE).device == DEVICE
+        assert there.detach().cpu().numpy().shape == (3,)
+        (there * torch.ones(3, device=DEVICE)).sum().backward()
+        assert here.grad is not None
+        assert here.grad.device == here.device != DEVICE
+        assert jacfwd(torch.sin)(there.detach()).device == DEVICE
+
+
+# -- images and derivatives ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("compute", "rtol"),
+    [
+        (work.image, 1e-9),
+        (work.gradient, 1e-9),
+        (work.response, 1e-5),
+        pytest.param(work.forward_mode, 1e-9, marks=pytest.mark.slow),
+        pytest.param(work.point_sources, 1e-5, marks=pytest.mark.slow),
+    ],
+)
+def test_images_and_derivatives(compute: Callable[..., list[Array]], rtol: float) -> None:
+    agree(compute, rtol)
+
+
+@pytest.mark.slow
+def test_every_plane_and_effect_of_the_detector() -> None:
+    def planes(device: Any) -> list[Array]:
+        model = model_on(device, occulter_sampling=3.0)
+        fields = model.debug(opd(), **work.tensors(model))
+        return [np.abs(field.cpu().numpy()).ravel() for field in fields.values()]
+
+    def effects(device: Any) -> list[Array]:
+        smooth = torch.as_tensor(opd() * 1e9, device=device)
+        kernel = np.array([[0.01, 0.02, 0.03], [0.04, 0.8, 0.05], [0.06, 0.07, 0.08]])
+        rows, columns = np.mgrid[: work.NPIX, : work.NPIX]
+        chain = (
+            GaussianBlur(1.2),
+            SplineRotation(7.0, smooth.shape),
+            PixelCrosstalk(kernel),
+            LinearResampling(rows + 0.3, columns - 0.2, smooth.shape),
+        )
+        return [effect(smooth).cpu().numpy().ravel() for effect in chain]
+
+    agree(planes, rtol=1e-9)
+    agree(effects, rtol=1e-9)
+    with pretended():
+        assert len(model_on(DEVICE).plot(opd=opd())) == 4
+        hdus = model_on(DEVICE).calc_psf(nlambda=2)
+        assert hdus["DET_SAMP"].data.sum() > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("trainable", [(), ("aberrations",)])
+def test_sampled_planes(trainable: tuple[str, ...]) -> None:
+    def rendered(device: Any) -> list[Array]:
+        system = poppy.OpticalSystem(npix=work.NPIX, pupil_diameter=6.5)
+        system.add_pupil(poppy.CircularAperture(radius=3.0))
+        system.add_pupil(poppy.ZernikeWFE("aberrations", radius=3.2, coefficients=[0, 0, 0, 1e-7]))
+        system.add_image(poppy.BandLimitedCoron(kind="circular", sigma=5.0))
+        system.add_pupil(poppy.SecondaryObscuration(secondary_radius=0.7))
+        system.add_detector(pixelscale=0.06, fov_pixels=SIZE)
+        model = from_poppy(system, 4.5e-6, trainable=trainable, device=device)
+        return [model(opd(), (0.02, 0.01)).detach().cpu().numpy()]
+
+    agree(rendered, rtol=1e-9)
+
+
+# -- fits and searches ---------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_fit_of_everything() -> None:
+    frames = [frame()]
+    agree(lambda device: reached(fitted(device, frames, {"max_iterations": 10})), rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_search_of_rolls_with_a_reference_star() -> None:
+    frames = work.rolls()
+    agree(lambda device: work.search(device, frames), rtol=2e-3)
+
+
+@pytest.mark.slow
+def test_what_a_search_leaves_behind(tmp_path: Path) -> None:
+    """Products, and a fit that is read where there is no such device."""
+    with pretended():
+        fit = fitted(DEVICE, [frame(0, work.PLANET)], QUICK)
+        detection = dr.detect(fit, inner=0.1)
+        detection.write(tmp_path)
+        assert len(detection.left_out) == 2
+        detection.measure_shape(np.exp(-(detection.grid**2).sum(axis=-1)))
+        assert fit.frames[0].render((SIZE + 4, SIZE)).shape == (SIZE + 4, SIZE)
+        assert planet_image(fit.frames[0], work.PLANET.offset).shape == (SIZE, SIZE)
+        fit.write(tmp_path / "fit.fits")
+    read = Refinement.read(tmp_path / "fit.fits")
+    assert read.model.device.type == "cpu"
+    np.testing.assert_array_equal(read.frames[0].star, fit.frames[0].star)
+
+
+@pytest.mark.slow
+def test_planning_and_the_full_model() -> None:
+    scene = dr.Scene(dr.Star(exposure=20.0))
+    seen = dr.simulate(model_on("cpu", npix=256), scene, dr.random_opd(1, npix=256), seed=3)
+
+    def reduced(device: Any) -> list[float]:
+        model = model_on(device, npix=256)
+        simple = GaussNewton(cycles=4)
+        return reached(dr.refine(model, seen, dr.random_opd(1, npix=256), settings=simple))
+
+    agree(reduced, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_adam_and_systematics() -> None:
+    seen = frame()
+    pattern = 0.01 * np.sin(np.arange(SIZE**2).reshape(SIZE, SIZE))
+    known = Systematics(pattern, 0.1 * np.abs(pattern), tuple(seen.center[0]), 0.5)
+
+    def descent(device: Any) -> list[float]:
+        fit = dr.refine(model_on(device), seen, opd(), settings=Adam(iterations=5))
+        return [record["loss"] for record in fit.history]
+
+    def corrected(device: Any) -> list[float]:
+        start = opd()
+        fit = dr.refine(
+            model_on(device), [seen, frame(1)], start, settings=settings(**QUICK), systematics=known
+        )
+        learned = dr.learn_systematics([fitted(device, [frame(k)], QUICK) for k in (0, 1)])
+        return [*reached(fit), float(np.std(learned.pattern))]
+
+    agree(descent, rtol=1e-6)
+    agree(corrected, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_whole_frames() -> None:
+    frames = [dr.simulate(model_on("cpu", fov_pixels=60), dr.Scene(), opd(), seed=3)]
+
+    def reduced(device: Any) -> list[float]:
+        fit = fitted(device, [each.cutout(SIZE) for each in frames], QUICK)
+        found = wide_field(dr.detect(fit), frames)
+        return [float(np.nanstd(found.contrast)), float(np.nanmedian(found.error))]
+
+    agree(reduced, rtol=1e-3)
