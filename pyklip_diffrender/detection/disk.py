@@ -296,8 +296,9 @@ def _fit_sources(fit: Refinement, inner: float, start: _Sources | None = None) -
 
 def _positions(grid: Image, inner: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of the pixels on which sources are."""
-    ny, nx = grid.shape[:2]
-    rows, columns = np.mgrid[0:ny:_SPACING, 0:nx:_SPACING].reshape(2, -1)
+    # The last ones, too, because the light of a disk goes on beyond the frame.
+    axes = (np.unique(np.append(np.arange(0, n, _SPACING), n - 1)) for n in grid.shape[:2])
+    rows, columns = (each.ravel() for each in np.meshgrid(*axes, indexing="ij"))
     outside = separation_of(grid)[rows, columns] >= inner
     return rows[outside], columns[outside]
 
