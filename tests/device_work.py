@@ -18,6 +18,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
 from pyklip_diffrender.linear.response import Responses
 from pyklip_diffrender.optics.fast.point_sources import PointSources
+from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.wavefront.bases import FourierModes
@@ -31,7 +32,8 @@ __all__ = [
 Array = NDArray[np.float64]
 
 NPIX, SIZE = 64, 24
-PLANET = dr.Planet(3e-4, 0.5, 120.0)
+BASIS = FourierModes(2)
+PLANET = dr.Planet(1e-4, 0.5, 120.0)
 QUICK = {"free": ("star_offset", "flux", "background"), "max_iterations": 10}
 VALUES = {
     "star_offset": (0.01, -0.02),
@@ -60,21 +62,22 @@ def tensors(model: OpticalSystem) -> dict[str, torch.Tensor]:
 def frame(k: int = 0, *planets: dr.Planet, **details: object) -> dr.Observation:
     """A star through a drifted wavefront, rolled by 20 degrees a frame."""
     scene = dr.Scene(dr.Star(exposure=200.0), planets=planets)
-    drifted = opd() + 0.02 * dr.random_opd(2, npix=NPIX).data
+    grid = PupilGrid.full(NPIX)
+    drifted = opd() + BASIS.opd(3e-9 * torch.linspace(-1, 1, len(BASIS)), grid).numpy()
     seen = dr.simulate(model_on("cpu"), scene, drifted, seed=3 + k)
     return replace(seen, position_angles=np.full(len(seen), 20.0 * k), **details)  # type: ignore[arg-type]
 
 
 def rolls() -> list[dr.Observation]:
     """Two rolls of a star with a planet, and a reference star."""
-    return [frame(0, PLANET), frame(1, PLANET.rotated(20.0)), frame(2, reference=True)]
+    return [frame(0, PLANET), frame(1, PLANET.rotated(-20.0)), frame(2, reference=True)]
 
 
 def settings(**changes: object) -> GaussNewton:
     """A fit of all parameters, of the wavefront and of the pupil's amplitude."""
     chosen: dict[str, object] = {
         "free": GaussNewton.nircam().free,
-        "basis": FourierModes(2),
+        "basis": BASIS,
         "prior": WavefrontPrior(amplitude_cycles=1.5, amplitude_scale=1.0),
         "response_npix": NPIX,
         **changes,
@@ -140,7 +143,7 @@ def response(device: Any, **changes: object) -> list[Array]:
     model = model_on(device, **changes)
     values = {name: value.cpu() for name, value in tensors(model).items()}
     start = torch.as_tensor(opd(), device=device)
-    responses = Responses(model, FourierModes(2), npix=NPIX // 2)
+    responses = Responses(model, BASIS, npix=NPIX // 2)
     with torch.no_grad():
         fields = model.fields(start, **values)
     names = ("star_offset", "lyot_shift", "blur")

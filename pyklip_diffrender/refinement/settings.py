@@ -20,7 +20,7 @@ from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = ["Adam", "GaussNewton", "settings_for"]
 
-_PROCESS = 1e9
+_PROCESS = 1.3e9
 """Memory that the package and PyTorch take, with what a fit needs for a while, bytes."""
 
 
@@ -80,10 +80,10 @@ class GaussNewton:
         Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain
         least squares.
     memory : float, str or Quantity, optional
-        Memory that the process may take, bytes or such as "2 GB"; the process alone takes 1 GB of
-        it. Derivatives that do not fit are computed in parts whenever they are needed, which
-        takes longer and gives the same result. The Jacobians of the frames are always stored. By
-        default derivatives take up to 4 GB.
+        Memory that the process should take, bytes or such as "2 GB", of which it needs 1.3 GB
+        for itself. Derivatives that do not fit are computed in parts whenever they are needed,
+        which takes longer and gives the same result. The Jacobians of the frames are always
+        stored, so that a low limit may be exceeded. By default derivatives take up to 4 GB.
 
     Raises
     ------
