@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from astropy.io import fits as astropy_fits
+from matplotlib import pyplot
 from scipy.optimize import nnls
 
 import pyklip_diffrender as dr
@@ -123,6 +124,7 @@ def test_products_and_refusals(tmp_path: Path) -> None:
         assert hdus["IMAGE"].header["BUNIT"] == "ph"
         np.testing.assert_array_equal(hdus["SOURCES"].data["contrast"], lit.contrasts)
     axes = lit.plot()
+    pyplot.close(axes[0].figure)
     assert [ax.get_title(loc="left") for ax in axes] == [
         "frames without the star",
         "extended light",

@@ -92,7 +92,7 @@ class PointSources:
             if self._opd.ndim != 2:
                 raise ShapeError(f"opd: got shape {tuple(self._opd.shape)}, expected one map")
             self._values = {name: value.detach() for name, value in model.values(fixed).items()}
-            self._radius = 0.0
+            self._radius, self.reach = 0.0, math.inf
             self._waves = self._prepared(sampling)
             self.route = "lattice" if self._waves else "model"
             if any(isinstance(p, SampledOcculter) for p in model.planes) and not self._agrees():
