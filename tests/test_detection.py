@@ -144,7 +144,7 @@ def radius(found: Detection) -> Image:
 
 
 @pytest.mark.parametrize(
-    ("size", "count"), [("world", 3), pytest.param("large", 6, marks=pytest.mark.slow)]
+    ("size", "count"), [("world", 3), pytest.param("large", 6, marks=pytest.mark.study)]
 )
 def test_snr_scatters_by_one_where_there_is_nothing(
     request: pytest.FixtureRequest, size: str, count: int
