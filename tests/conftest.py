@@ -54,7 +54,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
             item.add_marker("fuzz")
-    absent = set() if config.getoption("--full") else {"slow"}
+    absent = set() if config.getoption("--full") else {"slow", "study"}
     if "gpu" not in config.getoption("markexpr"):
         absent.add("gpu")
     left_out = [item for item in items if any(map(item.get_closest_marker, absent))]
