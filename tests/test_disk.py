@@ -112,6 +112,10 @@ def test_products_and_refusals(tmp_path: Path) -> None:
     for inner in (0, -0.3):
         with pytest.raises(IncompatibleSetupError, match="inner: got"):
             dr.fit_disk(fit, inner=inner)
+    reference = replace(fit.frames[0].observation, reference=True)
+    star = replace(fit, frames=(replace(fit.frames[0], observation=reference),))
+    with pytest.raises(IncompatibleSetupError, match="got a reference star"):
+        dr.fit_disk(star)
     disk = dr.fit_disk(fit, inner=0.4)
     assert disk.image.shape == disk.error.shape == disk.light[0].shape == (24, 24)
     np.testing.assert_allclose(disk.image, fit.frames[0].residual[0], atol=1e-9 * STAR.photons)

@@ -240,7 +240,7 @@ def test_a_high_pass_filter_applies_to_the_forward_model(
 @pytest.mark.usefixtures("registered")
 def test_a_planet_of_the_fit_loses_no_light(model: OpticalSystem, tmp_path: Path) -> None:
     star, planet = shots(model, OLD.data)
-    known = replace(LINEAR, companions=(Planet.from_offset(CONTRAST, *place(0.0)),))
+    known = replace(LINEAR, companions=(Planet.from_offset(CONTRAST, *place(ANGLES[0])),))
     made = dataset(star + planet, model, np.sqrt(star), fit=known)
     of_planet, product = modelled(made, planet_psf(OLD.data, made), tmp_path, algo="diffrender")
     turned = [rotate(*each, CENTER) for each in zip(planet, ANGLES, strict=True)]

@@ -33,7 +33,7 @@ from scipy.ndimage import map_coordinates
 from scipy.optimize import minimize
 
 from pyklip_diffrender.detection.field import Image, separation_of
-from pyklip_diffrender.detection.groups import groups_of
+from pyklip_diffrender.detection.groups import groups_of, has_only_reference_stars
 from pyklip_diffrender.detection.relinearise import without_light
 from pyklip_diffrender.detection.storage import image_hdu
 from pyklip_diffrender.detection.templates import Templates
@@ -181,7 +181,7 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
 
     The light may have any shape, but not be negative. What is symmetric about the star, or seen in
     a single roll, is told from the star only by the prior on its wavefront: two rolls or more are
-    best. A planet in a disk is part of the extended light.
+    best. Planets are part of the extended light, too: `detect` them without it first.
 
     Parameters
     ----------
@@ -201,12 +201,28 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
     IncompatibleSetupError
         For a fit that failed, that has no linear model, or that shows no target, or if `inner` is
         not positive.
+
+    Examples
+    --------
+    A star without a disk has no extended light:
+
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=4), plan="off")
+    >>> dr.fit_disk(fit).contrast
+    0.0
     """
     inner = float(to_arcsec(inner, "inner"))
     if not inner > 0:
         raise IncompatibleSetupError(f"inner: got {inner}, expected a positive number")
     if not fit.status.usable:
         raise IncompatibleSetupError(f"fit_disk: the fit {fit.status.message}")
+    if has_only_reference_stars(fit):
+        raise IncompatibleSetupError(
+            "fit_disk: expected frames of the target, got a reference star"
+        )
     original = [frame.observation for frame in fit.frames]
     with ProgressBar("disk", shown=progress) as bar:
         sources = _fit_sources(fit, inner)

@@ -213,7 +213,7 @@ def _disk(summary: Mapping[str, Any]) -> str:
     return pieces.note(
         f"Altogether {scientific(disk['contrast'])} of the star's light, in {disk['sources']} "
         f"sources that lower chi-squared by {disk['chi2_decrease']:.0f}.{axis} The search and the "
-        "limits above are for frames without this light. A planet in a disk is part of it."
+        "limits above are for frames without this light. Planets may be part of it."
     )
 
 
