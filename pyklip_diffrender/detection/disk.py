@@ -58,8 +58,8 @@ _ROUNDS = 2
 """Largest number of times that the star is fitted again."""
 
 _SIGNIFICANT = 4.0
-"""Decrease of chi-squared per source below which it is noise: it was 1.9 for a simulated star without
-a disk, and 11 to 26 for stars with one."""
+"""Decrease of chi-squared per source below which it is noise: it was 1.9 for a simulated star
+without a disk, and 11 to 26 for stars with one."""
 
 _GAIN = 0.02
 """Decrease of chi-squared per pixel below which the star is not fitted again."""
