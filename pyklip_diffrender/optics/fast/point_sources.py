@@ -44,8 +44,8 @@ _ALIKE = 0.01
 """Largest relative rms difference from the images of the model at which the outer parts of a mask,
 or all of it, are ignored. An error of a percent of a planet's template costs 5e-5 of its S/N."""
 
-_STEP = 4
-"""Number of pixels by which the reach of the mask is searched."""
+_TESTED = 12
+"""Number of sources just beyond the mask with which it is decided whether to ignore it there."""
 
 
 class PointSources:
@@ -71,8 +71,8 @@ class PointSources:
         A mask of several parts is reduced to the first one if that changes the images of a few
         test sources by a percent at most.
     reach : float
-        Distance from the axis, arcsec, beyond which the mask changes images by a percent at most.
-        There, it is ignored: images are then the same but for a shift, and cost next to nothing.
+        Distance from the axis, arcsec, beyond which the mask is ignored, because it changes images
+        by a percent at most: they are then the same but for a shift, and cost next to nothing.
     """
 
     def __init__(
@@ -124,25 +124,23 @@ class PointSources:
         return bool((away <= _ALIKE * exact.flatten(1).norm(dim=1)).all())
 
     def _reach(self) -> float:
-        """Search the reach of the mask, from the outside, to the right and towards a corner."""
+        """The radius of the mask if the mask can be ignored beyond it, else infinity."""
         if self.route == "model" or not self._radius:
             return math.inf
         ny, nx = self.model.detector.shape
-        reach = 0.0
-        for slope in (0.0, ny / nx):
-            columns = torch.arange(nx // 2, nx)
-            rows = ((ny - 1) / 2 + slope * (columns - (nx - 1) / 2)).round().to(torch.int64)
-            distances = self.positions(rows, columns).norm(dim=-1)
-            for last in range(len(rows), 0, -_STEP):
-                part = slice(max(0, last - _STEP), last)
-                exact, plain = (
-                    self._batch_of_images(rows[part], columns[part], False, masked).flatten(1)
-                    for masked in (True, False)
-                )
-                if bool(((plain - exact).norm(dim=1) > _ALIKE * exact.norm(dim=1)).any()):
-                    reach = max(reach, float(distances[part][-1]))
-                    break
-        return reach
+        rows, columns = torch.unravel_index(torch.arange(ny * nx), (ny, nx))
+        distances = self.positions(rows, columns).norm(dim=-1).cpu()
+        nearest = distances.argsort()
+        nearest = nearest[distances[nearest] > self._radius][:_TESTED]
+        if not len(nearest):
+            return math.inf
+        # A mask with a sharp edge changes images far beyond it.
+        exact, plain = (
+            self._batch_of_images(rows[nearest], columns[nearest], False, masked).flatten(1)
+            for masked in (True, False)
+        )
+        alike = ((plain - exact).norm(dim=1) <= _ALIKE * exact.norm(dim=1)).all()
+        return self._radius if bool(alike) else math.inf
 
     def _wave(self, planes: Sequence[Plane], wavelength: float, sampling: float) -> _Wave:
         model, values = self.model, self._values
