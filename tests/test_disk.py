@@ -15,6 +15,7 @@ from scipy.optimize import nnls
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import disk as module
+from pyklip_diffrender.detection.groups import groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.wavefront.opd import random_drift
 
@@ -82,6 +83,12 @@ def test_a_ring_keeps_its_light() -> None:
         assert amount(light, true) == pytest.approx(1.0, abs=0.1)
     assert amount(np.nan_to_num(disk.image), rings[0]) == pytest.approx(1.0, abs=0.1)
     assert disk.contrast == pytest.approx(BRIGHTNESS, rel=0.15)
+    # The second roll is turned by 12 degrees, 3 pixels at this separation.
+    ((_, templates),) = groups_of([disk.fit])
+    place = torch.tensor([[0.9, 0.3]], dtype=torch.float64)
+    light = templates.at(place)[1][0].numpy()
+    peak = np.unravel_index(light.argmax(), light.shape)
+    np.testing.assert_allclose(templates.pixels_of(1, place)[:, 0], peak, atol=1.2)
     assert disk.orientation == pytest.approx(POSITION_ANGLE, abs=2)
     assert disk.fit.chi2_per_pixel < fit.chi2_per_pixel / 10
     deep, shallow = (dr.contrast_curve(each)["contrast"] for each in (disk.fit, fit))
