@@ -33,7 +33,7 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.linear.model import Unknown
+from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, refine

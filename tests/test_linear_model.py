@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.linear.model import LinearFrame, LinearModel, Unknown
+from pyklip_diffrender.linear.frames import LinearFrame, Unknown
+from pyklip_diffrender.linear.model import LinearModel
 
 NY, NX = 6, 7
 SHARED, DRIFT = 6, 2

@@ -23,7 +23,7 @@ with the weights W c. The frames' `common` is c.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -34,90 +34,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
+from pyklip_diffrender.linear.frames import LinearFrame, Unknown, pixel_pieces, summed_rows
 
-__all__ = ["LinearFrame", "LinearModel", "TemplateProducts", "Unknown", "summed_rows"]
+__all__ = ["LinearModel", "TemplateProducts"]
 
 _BATCH = 512
 """Number of templates that are processed at a time."""
-
-_PIXELS = 1024
-"""Number of pixels that are processed at a time, where there is a number for every unknown."""
-
-
-class Unknown(NamedTuple):
-    """One unknown of a fit.
-
-    Attributes
-    ----------
-    name : str
-        A parameter of the parameter table, or "companions", "amplitude", "modes" or "drift".
-    component : int
-        Index within that parameter.
-    frame : int
-        The frame whose own value it is; -1 if all frames share it.
-    """
-
-    name: str
-    component: int
-    frame: int = -1
-
-    def __str__(self) -> str:
-        suffix = "" if self.frame < 0 else f" of frame {self.frame}"
-        return f"{self.name}[{self.component}]{suffix}"
-
-
-@dataclass(frozen=True)
-class LinearFrame:
-    """One frame's part of a linear model.
-
-    Attributes
-    ----------
-    residual : Tensor, (ny, nx), float64
-        Data minus prediction where the model is linearised.
-    weight : Tensor, (ny, nx), float64
-        1 / standard deviation; 0 for masked pixels.
-    jacobian : Tensor, (rows, ny, nx), float32
-        Derivatives of the pixels with respect to the unknowns, in the data's unit.
-    rows : Tensor, (rows,), int64
-        Index of the unknown that each row belongs to.
-    drift : Tensor, (some,), int64
-        Indices of the unknowns by which the leading wavefront modes of this frame differ from
-        those of the other frames.
-    first_mode : int
-        Index of the first wavefront mode among the rows.
-    common : Tensor, (ny, nx), float64
-        c of the pattern that the frames share, in the data's unit; 0 without one.
-    """
-
-    residual: Tensor
-    weight: Tensor
-    jacobian: Tensor
-    rows: Tensor
-    drift: Tensor
-    first_mode: int
-    common: Tensor
-
-    def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
-        """Sum values by row, (rows, k), to values by unknown, (size, k)."""
-        total = torch.zeros(size, *on_rows.shape[1:], dtype=on_rows.dtype)
-        total.index_add_(0, self.rows, on_rows)
-        count = len(self.drift)
-        return total.index_add_(0, self.drift, on_rows[self.first_mode : self.first_mode + count])
-
-    def of_unknowns(self, values: Tensor) -> Tensor:
-        """Values by row from values by unknown; the adjoint of `onto_unknowns`."""
-        rows = values[self.rows]
-        rows[self.first_mode : self.first_mode + len(self.drift)] += values[self.drift]
-        return rows
-
-    def summed(self, images: Tensor) -> Tensor:
-        """This frame's part of the sum W c x over frames, for images x, (..., ny, nx)."""
-        return images * (self.weight**2 * self.common).to(images.dtype)
-
-    def image(self, values: Tensor) -> Tensor:
-        """Change of the image, (..., ny, nx), for changes of the unknowns, (size, ...)."""
-        on_rows = self.of_unknowns(values).float()
-        return torch.tensordot(on_rows, self.jacobian, dims=([0], [0])).double()
 
 
 class TemplateProducts(NamedTuple):
@@ -384,7 +306,7 @@ class LinearModel:
         """L^-1 G of a frame with P + G G^T = L L^T, (unknowns, pixels), float64."""
         basis = torch.empty(len(self.vector), frame.weight.numel(), dtype=torch.float64)
         weight, shared = frame.weight.flatten(), (frame.weight * frame.common).flatten()
-        for pixels in _pieces(basis.shape[1]):
+        for pixels in pixel_pieces(basis.shape[1]):
             white = frame.jacobian.flatten(1)[:, pixels].double() * weight[pixels]
             whitened = frame.onto_unknowns(white, len(self.vector))
             if self.shares_pattern:
@@ -433,19 +355,3 @@ class LinearModel:
                     counts, covariance.diagonal().sqrt() / weight
                 )
         return residual, deviation
-
-
-def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Tensor:
-    """W c summed over frames with the derivative by every unknown, (unknowns, pixels), float32."""
-    total = torch.zeros(unknowns, frames[0].weight.numel(), dtype=torch.float32)
-    for frame in frames:
-        scale = frame.summed(torch.ones(())).flatten()
-        for pixels in _pieces(total.shape[1]):
-            on_rows = frame.jacobian.flatten(1)[:, pixels] * scale[pixels]
-            total[:, pixels] += frame.onto_unknowns(on_rows, unknowns)
-    return total
-
-
-def _pieces(pixels: int) -> list[slice]:
-    """Parts of an image of which arrays with all unknowns are small."""
-    return [slice(start, start + _PIXELS) for start in range(0, pixels, _PIXELS)]

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pyklip_diffrender.io.progress import ProgressBar
-from pyklip_diffrender.linear.model import Unknown
+from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.companions import bright_companions
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.gauss_newton import Solver, count_modes_below

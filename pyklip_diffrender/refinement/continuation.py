@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.linear.model import Unknown
+from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.linear.model import Unknown
+from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.scene.objects import Planet

@@ -9,7 +9,7 @@ import torch
 from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
-from pyklip_diffrender.linear.model import LinearFrame, summed_rows
+from pyklip_diffrender.linear.frames import LinearFrame, summed_rows
 from pyklip_diffrender.refinement.objective import Objective, State
 
 __all__ = ["NormalEquations", "linearise"]

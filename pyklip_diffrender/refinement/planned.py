@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.linear.model import Unknown
+from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.linear.response import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem

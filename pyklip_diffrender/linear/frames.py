@@ -1,0 +1,107 @@
+"""The unknowns of a linear model, and the part that one frame has in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = ["LinearFrame", "Unknown", "pixel_pieces", "summed_rows"]
+
+_PIXELS = 1024
+"""Number of pixels that are processed at a time, where there is a number for every unknown."""
+
+
+class Unknown(NamedTuple):
+    """One unknown of a fit.
+
+    Attributes
+    ----------
+    name : str
+        A parameter of the parameter table, or "companions", "amplitude", "modes" or "drift".
+    component : int
+        Index within that parameter.
+    frame : int
+        The frame whose own value it is; -1 if all frames share it.
+    """
+
+    name: str
+    component: int
+    frame: int = -1
+
+    def __str__(self) -> str:
+        suffix = "" if self.frame < 0 else f" of frame {self.frame}"
+        return f"{self.name}[{self.component}]{suffix}"
+
+
+@dataclass(frozen=True)
+class LinearFrame:
+    """One frame's part of a linear model.
+
+    Attributes
+    ----------
+    residual : Tensor, (ny, nx), float64
+        Data minus prediction where the model is linearised.
+    weight : Tensor, (ny, nx), float64
+        1 / standard deviation; 0 for masked pixels.
+    jacobian : Tensor, (rows, ny, nx), float32
+        Derivatives of the pixels with respect to the unknowns, in the data's unit.
+    rows : Tensor, (rows,), int64
+        Index of the unknown that each row belongs to.
+    drift : Tensor, (some,), int64
+        Indices of the unknowns by which the leading wavefront modes of this frame differ from
+        those of the other frames.
+    first_mode : int
+        Index of the first wavefront mode among the rows.
+    common : Tensor, (ny, nx), float64
+        c of the pattern that the frames share, in the data's unit; 0 without one.
+    """
+
+    residual: Tensor
+    weight: Tensor
+    jacobian: Tensor
+    rows: Tensor
+    drift: Tensor
+    first_mode: int
+    common: Tensor
+
+    def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
+        """Sum values by row, (rows, k), to values by unknown, (size, k)."""
+        total = torch.zeros(size, *on_rows.shape[1:], dtype=on_rows.dtype)
+        total.index_add_(0, self.rows, on_rows)
+        count = len(self.drift)
+        return total.index_add_(0, self.drift, on_rows[self.first_mode : self.first_mode + count])
+
+    def of_unknowns(self, values: Tensor) -> Tensor:
+        """Values by row from values by unknown; the adjoint of `onto_unknowns`."""
+        rows = values[self.rows]
+        rows[self.first_mode : self.first_mode + len(self.drift)] += values[self.drift]
+        return rows
+
+    def summed(self, images: Tensor) -> Tensor:
+        """This frame's part of the sum W c x over frames, for images x, (..., ny, nx)."""
+        return images * (self.weight**2 * self.common).to(images.dtype)
+
+    def image(self, values: Tensor) -> Tensor:
+        """Change of the image, (..., ny, nx), for changes of the unknowns, (size, ...)."""
+        on_rows = self.of_unknowns(values).float()
+        return torch.tensordot(on_rows, self.jacobian, dims=([0], [0])).double()
+
+
+def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Tensor:
+    """W c summed over frames with the derivative by every unknown, (unknowns, pixels), float32."""
+    total = torch.zeros(unknowns, frames[0].weight.numel(), dtype=torch.float32)
+    for frame in frames:
+        scale = frame.summed(torch.ones(())).flatten()
+        for pixels in pixel_pieces(total.shape[1]):
+            on_rows = frame.jacobian.flatten(1)[:, pixels] * scale[pixels]
+            total[:, pixels] += frame.onto_unknowns(on_rows, unknowns)
+    return total
+
+
+def pixel_pieces(pixels: int) -> list[slice]:
+    """Parts of an image of which arrays with all unknowns are small."""
+    return [slice(start, start + _PIXELS) for start in range(0, pixels, _PIXELS)]
