@@ -40,8 +40,8 @@ Fits = Refinement | Sequence[Refinement]
 _log = logging.getLogger(__name__)
 
 _MAX_CANDIDATES = 10
-"""Largest number of candidates. More of them about one star are parts of something extended, and all
-positions are fitted again with every one that is added."""
+"""Largest number of candidates. More of them about one star are parts of something extended, and
+all positions are fitted again with every one that is added."""
 
 _WORTH_A_LOOK = 0.6
 """Part of the threshold from which a peak is judged by the scatter without it."""
