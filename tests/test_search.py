@@ -44,7 +44,7 @@ class MadeUpMaps:
 def test_a_dismissed_peak_is_not_taken_again(monkeypatch: pytest.MonkeyPatch) -> None:
     maps, fitted = MadeUpMaps(), []
 
-    def refine(groups: Any, candidates: Candidates, reach: float) -> Candidates:
+    def refine(groups: Any, candidates: Candidates, reach: float, *_: int) -> Candidates:
         fitted.append(len(candidates))
         away = [
             np.hypot(*(candidates.offsets.numpy() - maps.grid[pixel]).T).reshape(-1)

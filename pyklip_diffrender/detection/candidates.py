@@ -104,7 +104,9 @@ class Candidates:
         return self.covariance.diagonal().clamp(min=0).sqrt().reshape(3, -1).T
 
 
-def refine_candidates(groups: Sequence[Group], candidates: Candidates, reach: float) -> Candidates:
+def refine_candidates(
+    groups: Sequence[Group], candidates: Candidates, reach: float, iterations: int = _ITERATIONS
+) -> Candidates:
     """Fit contrasts and positions of all candidates together.
 
     Gauss-Newton steps with the star marginalised.
@@ -116,6 +118,8 @@ def refine_candidates(groups: Sequence[Group], candidates: Candidates, reach: fl
         Starting values.
     reach : float
         Longest step of a position, arcsec.
+    iterations : int
+        Largest number of steps.
     """
     if not len(candidates):
         return candidates
@@ -123,7 +127,7 @@ def refine_candidates(groups: Sequence[Group], candidates: Candidates, reach: fl
     offsets, contrasts = candidates.offsets.clone(), candidates.contrasts.clone()
     identity = torch.eye(3 * count, dtype=torch.float64)
     covariance, converged = identity, False
-    for _ in range(_ITERATIONS):
+    for _ in range(iterations):
         # The model is linear in contrasts. The column of a position is slope times contrast.
         matrix = torch.zeros(3 * count, 3 * count, dtype=torch.float64)
         vector = torch.zeros(3 * count, dtype=torch.float64)

@@ -43,6 +43,10 @@ _MAX_CANDIDATES = 10
 """Largest number of candidates. More of them about one star are parts of something extended, and
 all positions are fitted again with every one that is added."""
 
+_STEPS = 6
+"""Largest number of steps of the positions while candidates are added or dropped. Point sources
+settle in these; parts of something extended do not, and would take most of the time."""
+
 _WORTH_A_LOOK = 0.6
 """Part of the threshold from which a peak is judged by the scatter without it."""
 
@@ -329,6 +333,8 @@ def _search(
         if peak is None or max(len(candidates), len(dismissed)) >= _MAX_CANDIDATES:
             # The factor may have grown since a candidate was accepted.
             if not len(candidates) or candidates.snr(factor).min() >= threshold:
+                if not candidates.converged:
+                    candidates = refine_candidates(groups, candidates, reach=pixel / 2)
                 return candidates, factor
             weakest = int(candidates.snr(factor).argmin())
             dismissed = torch.cat([dismissed, candidates.offsets[weakest, None]])
@@ -336,7 +342,7 @@ def _search(
             continue
         contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
         candidates = candidates.with_one_more(grid[peak], contrast)
-        candidates = refine_candidates(groups, candidates, reach=pixel / 2)
+        candidates = refine_candidates(groups, candidates, pixel / 2, _STEPS)
         _log.info("candidates at %s arcsec", candidates.offsets.tolist())
 
 
@@ -402,7 +408,7 @@ def _without_weakest(
 ) -> Candidates:
     """The other candidates, fitted again."""
     weakest = int(candidates.snr(factor).argmin())
-    return refine_candidates(groups, candidates.without(weakest), reach=pixel / 2)
+    return refine_candidates(groups, candidates.without(weakest), pixel / 2, _STEPS)
 
 
 def _resolution(fit: Refinement) -> float:
