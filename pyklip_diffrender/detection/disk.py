@@ -34,9 +34,11 @@ from scipy.optimize import minimize
 
 from pyklip_diffrender.detection.field import Image, separation_of
 from pyklip_diffrender.detection.groups import groups_of, has_only_reference_stars
+from pyklip_diffrender.detection.headers import primary_hdu, world_coordinates
 from pyklip_diffrender.detection.relinearise import without_light
+from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.storage import image_hdu
-from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.detection.templates import Templates, pixel_grid
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.io.progress import ProgressBar
@@ -158,16 +160,25 @@ class Disk:
         Its extensions are IMAGE, IMAGE_ERROR, LIGHT (one for every frame), OFFSET_X, OFFSET_Y and
         the table SOURCES.
         """
-        unit = self.fit.frames[0].observation.unit.to_string("fits")
+        first = self.fit.frames[0].observation
+        unit, wcs = first.unit.to_string("fits"), world_coordinates(self.grid, first)
+        shown = [each for each in self.fit.frames if not each.observation.reference]
+        frames = [
+            world_coordinates(pixel_grid(each.model, each.optical_values), each.observation)
+            for each in shown
+        ]
         sources = fits.BinTableHDU(self.table, name="SOURCES")
         hdus = fits.HDUList(
             [
-                fits.PrimaryHDU(),
-                image_hdu(self.image, "IMAGE", unit),
-                image_hdu(self.error, "IMAGE_ERROR", unit),
-                *(image_hdu(each, "LIGHT", unit, k) for k, each in enumerate(self.light, 1)),
-                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec"),
-                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec"),
+                primary_hdu(first, self.fit.summary(), Sky.of([self.fit]).mjd),
+                image_hdu(self.image, "IMAGE", unit, wcs),
+                image_hdu(self.error, "IMAGE_ERROR", unit, wcs),
+                *(
+                    image_hdu(each, "LIGHT", unit, cards, k)
+                    for k, (each, cards) in enumerate(zip(self.light, frames, strict=True), 1)
+                ),
+                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec", wcs),
+                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
                 sources,
             ]
         )

@@ -19,6 +19,7 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor, scatter_profile
 from pyklip_diffrender.detection.field import Image, far_from, ring_pixels, separation_of
+from pyklip_diffrender.detection.headers import primary_hdu, world_coordinates
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.storage import image_hdu
 from pyklip_diffrender.detection.tables import candidate_table, in_words
@@ -158,14 +159,16 @@ class WideField:
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables."""
         folder = Path(folder)
+        about = self.detection
+        wcs = world_coordinates(self.grid, self.observation)
         hdus = fits.HDUList(
             [
-                fits.PrimaryHDU(),
-                image_hdu(self.snr, "SNR", ""),
-                image_hdu(self.contrast, "CONTRAST", ""),
-                image_hdu(self.error, "CONTRAST_ERROR", ""),
-                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec"),
-                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec"),
+                primary_hdu(self.observation, about._provenance, about.sky.mjd),
+                image_hdu(self.snr, "SNR", "", wcs),
+                image_hdu(self.contrast, "CONTRAST", "", wcs),
+                image_hdu(self.error, "CONTRAST_ERROR", "", wcs),
+                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec", wcs),
+                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
             ]
         )
         written = [folder / "wide_field.fits"]
