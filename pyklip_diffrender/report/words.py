@@ -157,8 +157,10 @@ def scientific(value: float, error: float | None = None) -> str:
     return f"({plus_minus(value / 10**power, error / 10**power)}) × {ten}"
 
 
-def probability(value: float) -> str:
-    """A probability of a false alarm."""
+def probability(value: float | None) -> str:
+    """A probability of a false alarm; "not known" for None."""
+    if value is None:
+        return number(None)
     if value < _TINY:
         return f"< {scientific(_TINY).replace('1.0 × ', '')}"
     return scientific(value) if value < 0.01 else f"{value:.2f}"
