@@ -114,7 +114,7 @@ Examples:
 )
 @click.argument("frames", type=file_type(), nargs=-1)
 @option("--target", metavar="STAR", section="Frames",
-        help="Name of the target; the other stars are references.")  # fmt: skip
+        help="Name of the target, in any spelling; the other stars are references.")  # fmt: skip
 @option("--filter", metavar="NAME", section="Frames", help="Which filter, if there are several.")
 @option(
     "--program",
