@@ -314,7 +314,7 @@ def _reduction(
         if dry_run:
             from pyklip_diffrender.cli.estimate import describe_plan
 
-            click.echo(describe_plan(sequence, size, systematics))
+            click.echo(describe_plan(sequence, size, systematics, wide=wide, disk=disk))
             return
         from pyklip_diffrender.io.progress import stage
         from pyklip_diffrender.plotting import draw_detection, save
