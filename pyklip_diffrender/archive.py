@@ -93,6 +93,11 @@ def list_calints(
     ------
     ArchiveError, IncompatibleSetupError
         See `fetch_calints`.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> print(dr.list_calints(1184, "G-7-34", filter="F444W"))  # doctest: +SKIP
     """
     mast = _mast()
     try:
@@ -167,6 +172,12 @@ def fetch_calints(
     -----
     DiffrenderWarning
         If some of the files are proprietary; they are left out.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> files = dr.fetch_calints(1184, "G-7-34", filter="F444W")  # doctest: +SKIP
+    >>> result = dr.reduce(files, "maps")  # doctest: +SKIP
     """
     mast = _mast()
     listing = list_calints(program, target, filter=filter, folder=folder)

@@ -93,6 +93,12 @@ class Disk:
         significant extended light; `light` is then 0.
     gain : float
         Decrease of chi-squared by the sources in the frames' first fit, with the star marginalised.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> result = dr.reduce("calints", "maps", disk=True)  # doctest: +SKIP
+    >>> result.disk.contrast, result.disk.orientation  # doctest: +SKIP
     """
 
     fit: Refinement

@@ -91,6 +91,18 @@ class Detection:
         x, y of the pixels from the star, arcsec.
     path : Path or None
         File that the detection was read from.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> scene = dr.Scene(planets=(dr.Planet(1e-4, 0.5, 54.0),))
+    >>> frame = dr.simulate(model, scene, opd, seed=1)
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=4), plan="off")
+    >>> detection = dr.detect(fit)
+    >>> print(f"{detection.table['separation'][0]:.2f}, S/N above 5: {len(detection.table)}")
+    0.50 arcsec, S/N above 5: 1
     """
 
     fits: tuple[Refinement, ...]

@@ -93,6 +93,12 @@ class WideField:
         See `contrast.contrast_table`.
     light : tuple of ndarray, (ny, nx)
         Light of the sources outside the fitted pixels in every frame, in the data's unit.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> result = dr.reduce("calints", "maps", wide=True)  # doctest: +SKIP
+    >>> print(result.wide)  # doctest: +SKIP
     """
 
     detection: Detection
@@ -202,6 +208,13 @@ def wide_field(
     ------
     IncompatibleSetupError
         For observations that are not those of the fit, or a detection of several fits.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> frame = dr.Observation.from_fits("roll1_calints.fits")  # doctest: +SKIP
+    >>> fit = dr.refine(dr.model_for(frame, 80), frame.cutout(80), "opd.fits")  # doctest: +SKIP
+    >>> wide = dr.wide_field(dr.detect(fit), [frame])  # doctest: +SKIP
     """
     threshold = detection.threshold if threshold is None else threshold
     frames = _frames(detection, observations)

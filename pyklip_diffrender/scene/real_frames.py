@@ -47,6 +47,16 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
     ------
     IncompatibleSetupError
         If the filter is not known, or the coronagraph is not one that is modelled.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pyklip_diffrender as dr
+    >>> ones = np.ones((24, 24))
+    >>> frame = dr.Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F444W")
+    >>> model = dr.model_for(frame, monochromatic=4.5e-6, npix=128)
+    >>> tuple(model().shape)
+    (24, 24)
     """
     if observation.filter is None:
         raise IncompatibleSetupError(

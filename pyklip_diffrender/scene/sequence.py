@@ -40,6 +40,17 @@ class Sequence:
         Frames of other stars through the same coronagraph, in order of time.
     excluded : tuple of (str, str)
         Names of the files that were left out, and why.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pyklip_diffrender as dr
+    >>> ones = np.ones((8, 8))
+    >>> frame = dr.Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F444W")
+    >>> dr.Sequence("HD 1", (frame,))
+    <Sequence: HD 1 in F444W, 1 of the target, 0 of reference stars>
+
+    >>> dr.Sequence.from_files("calints", target="HD 1")  # doctest: +SKIP
     """
 
     target: str
