@@ -414,5 +414,7 @@ def test_the_search_of_whole_frames_has_a_section_of_its_own(tmp_path: Path) -> 
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     (row,) = summary["wide_field"]["candidates"]
     assert row["fit_chi2"] == 1.3
+    assert summary["sentence"].endswith("Nothing was found farther from the star, in the whole "
+                                        "frames.")  # fmt: skip
     assert len(summary["wide_field"]["contrast_curve"]["contrast"]) == len(inner.contrast_curve)
     assert summarise(reduction())["wide_field"] is None
