@@ -308,14 +308,20 @@ def shown() -> dict[str, Any]:
     )
     detection = replace(whole.detection, fits=(fit,))
     again = replace(whole, sequence=sequence, fit=fit, detection=detection, systematics=known)
-    values = (evil, sequence, fit, detection, again, whole.fit.model, plan(), known)
+    wide = dr.WideField(
+        detection, 5.0, flat, flat, flat, flat, detection.error_factor, detection.table,
+        detection.contrast_curve,
+    )  # fmt: skip
+    disk = dr.Disk(fit, (), flat, flat, flat, np.ones((1, 2)), np.ones(1), 9.0)
+    values = (evil, sequence, fit, detection, again, whole.fit.model, plan(), known, fit.initial,
+              wide, disk)  # fmt: skip
     return {type(value).__name__: value for value in values}
 
 
 @pytest.mark.parametrize(
     "name",
     ["Observation", "Sequence", "Refinement", "Detection", "Reduction", "OpticalSystem", "Plan",
-     "Systematics"],
+     "Systematics", "OPDMap", "WideField", "Disk"],
 )  # fmt: skip
 def test_a_notebook_shows_a_small_escaped_summary(name: str) -> None:
     value = shown()[name]

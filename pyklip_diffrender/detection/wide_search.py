@@ -26,6 +26,7 @@ from pyklip_diffrender.detection.tables import candidate_table, in_words
 from pyklip_diffrender.detection.whole_frames import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing, write_fits
+from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement.companions import local_maxima
 from pyklip_diffrender.scene.observation import Observation
 
@@ -119,6 +120,13 @@ class WideField:
     def __str__(self) -> str:
         """The candidates in words, at most 80 columns wide."""
         return in_words(self.table, self.threshold)
+
+    def _repr_html_(self) -> str:
+        ny, nx = self.snr.shape
+        facts = {"Star": self.observation.target, "Pixels": f"{nx} x {ny}"}
+        title = f"WideField: {len(self.table)} candidates above {self.threshold:g} sigma"
+        columns = ("separation", "position_angle", "contrast", "contrast_error", "snr", "fit_chi2")
+        return html_summary(title, facts, self.table, columns)
 
     @property
     def observation(self) -> Observation:
