@@ -85,10 +85,11 @@ def demo(
     click.echo(
         f"\nA planet of contrast {contrast:g} at {separation:g} arcsec; the "
         f"wavefront map is {hours:g} h old.\nSNR: the paper's, in the planet's annulus. "
-        "Throughput: share of the planet's light kept.\nStar error: rms of what is left of the "
-        "star in that annulus, in units of the noise.\n"
+        "Throughput: fraction of the planet's light that is kept;\nit says nothing where much of "
+        "the star remains, as with the initial map. Star error: rms\nresidual of the star in that "
+        "annulus, in units of the noise.\n"
         f"Refinement: {result.fit.status.message}.\n\n"
-        "Point sources with the wavefront integrated out, which loses none of the planet:"
+        "Point sources with the wavefront marginalised, which loses none of the planet:"
     )
     for row in result.detection.table:
         click.echo(
