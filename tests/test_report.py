@@ -388,12 +388,15 @@ def test_the_page_fits_the_screen(folder: Path, tmp_path: Path, width: int, dark
     done = subprocess.run(
         [
             str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+            "--enable-logging=stderr",
             f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000",
             f"--blink-settings=preferredColorScheme={0 if dark else 1}",
             f"--window-size={width + 100},1000", "--dump-dom", holder.as_uri(),
         ],
         capture_output=True, text=True, check=True, timeout=120,
     )  # fmt: skip
+    # Errors and warnings of the page.
+    assert ":CONSOLE" not in done.stderr
     (said,) = re.findall(r'<pre id="report">(.+?)</pre>', done.stdout)
     seen = json.loads(said)
     assert seen["width"] == width
