@@ -3,23 +3,20 @@
     python examples/hip65426_pyklip.py CALINTS OPD [--output FOLDER]
 
 CALINTS is a NIRCam F444W file of one roll, OPD the wavefront map measured nearest in time. The
-script writes what pyKLIP writes, a table of companion candidates, and a figure.
+script writes what pyKLIP writes, maps and tables of companion candidates, and a figure.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 import time
 from pathlib import Path
 
 import numpy as np
-from astropy.table import QTable
 from pyklip.instruments.JWST import JWSTData
 from pyklip.parallelized import klip_dataset
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.plotting import save
 from pyklip_diffrender.refinement import Refinement
 
@@ -45,31 +42,6 @@ def reduce(frames: Path, opd: Path, folder: Path) -> Refinement:
         )
     (result,) = dataset.diffrender_results
     return result.subtraction.fits[0].result
-
-
-def candidates(fit: Refinement) -> QTable:
-    """Companions that the fit gave parameters of their own."""
-    rows = []
-    for (contrast, x, y), (error, x_error, y_error) in zip(
-        fit.companions, fit.companion_errors, strict=True
-    ):
-        rows.append(
-            (
-                math.hypot(x, y),
-                math.hypot(x * x_error, y * y_error) / math.hypot(x, y),
-                math.degrees(math.atan2(-x, y)) % 360,
-                contrast,
-                error,
-                contrast / error,
-            )
-        )
-    return QTable(
-        rows=rows,
-        names=("separation", "separation_error", "angle", "contrast", "contrast_error", "snr"),
-        units=("arcsec", "arcsec", "deg", None, None, None),
-        dtype=(float,) * 6,
-        meta={"angle": "counter-clockwise from +y of the array"},
-    )
 
 
 def away_from_companions(fit: Refinement) -> np.ndarray:
@@ -114,10 +86,10 @@ def main() -> None:
         share = residual_share(frame - fitted.companion_image, fitted.star, keep)
         print(f"mean |residual| / star, {name}: {100 * share:.2f} %")
     print(fit.parameters["name", "value", "error", "unit"][:9])
-    table = candidates(fit)
-    table.pprint_all()
-    with replacing(options.output / "candidates.ecsv") as path:
-        table.write(path, format="ascii.ecsv", overwrite=True)
+    # With the errors scaled to what the model does not explain.
+    detection = dr.detect(fit)
+    print(detection)
+    detection.write(options.output)
     save(fit.plot()[0].figure, options.output / "hip65426.png")
 
 

@@ -16,6 +16,7 @@ from astropy.table import QTable, Table
 
 from pyklip_diffrender.errors import ArchiveError, DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.files import open_fits, replacing
+from pyklip_diffrender.io.names import same_name, unknown_name
 from pyklip_diffrender.io.progress import ProgressBar
 
 __all__ = ["cache_folder", "fetch_calints", "list_calints"]
@@ -92,6 +93,11 @@ def list_calints(
     ------
     ArchiveError, IncompatibleSetupError
         See `fetch_calints`.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> print(dr.list_calints(1184, "G-7-34", filter="F444W"))  # doctest: +SKIP
     """
     mast = _mast()
     try:
@@ -166,6 +172,12 @@ def fetch_calints(
     -----
     DiffrenderWarning
         If some of the files are proprietary; they are left out.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> files = dr.fetch_calints(1184, "G-7-34", filter="F444W")  # doctest: +SKIP
+    >>> result = dr.reduce(files, "maps")  # doctest: +SKIP
     """
     mast = _mast()
     listing = list_calints(program, target, filter=filter, folder=folder)
@@ -244,25 +256,19 @@ def _chosen(observed: Table, target: str | None, filter: str | None) -> Table:
     ):
         if choice is None:
             continue
-        keep = [any(_same(choice, each) for each in names(value)) for value in observed[column]]
+        keep = [any(same_name(choice, each) for each in names(value)) for value in observed[column]]
         if not any(keep):
-            known = sorted({each for value in observed[column] for each in names(value)})
-            raise IncompatibleSetupError(f"{key}: got {choice!r}, the programme has {known}")
+            known = {each for value in observed[column] for each in names(value)}
+            raise unknown_name(key, choice, known)
         observed = observed[keep]
     return observed
-
-
-def _same(first: str, second: str) -> bool:
-    """Whether two names differ only in case and separators."""
-    plain = ["".join(c for c in name.upper() if c.isalnum()) for name in (first, second)]
-    return plain[0] == plain[1]
 
 
 def _is_calints(row: Any, filter: str | None) -> bool:
     """Whether a product is a calints file; associations also list those of other filters."""
     filters = str(row["filters"]).split(";") if "filters" in row.colnames else []
     return str(row["productFilename"]).endswith("_calints.fits") and (
-        filter is None or not filters or any(_same(filter, each) for each in filters)
+        filter is None or not filters or any(same_name(filter, each) for each in filters)
     )
 
 

@@ -45,6 +45,13 @@ class Reduction:
         The search of the whole frames, if it was asked for.
     disk : Disk or None
         Extended light about the star, if it was asked for.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
+    >>> print(result.detection.table["separation", "contrast", "snr"])  # doctest: +SKIP
+    >>> result.write("products")  # doctest: +SKIP
     """
 
     sequence: Sequence
@@ -163,6 +170,12 @@ def reduce(
         sources.
     DiffrenderError
         If the target cannot be fitted. A reference star that cannot be is left out.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
+    >>> print(result)  # doctest: +SKIP
     """
     # Before the fits, which take minutes.
     require_bound(threshold, "threshold", "positive")

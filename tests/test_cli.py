@@ -346,6 +346,11 @@ def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
     assert both["search of point sources"] == 2 * alone["search of point sources"]
     one, two = alone["wavefront: 1 file of the target"], both["wavefront: 2 files of the target"]
     assert one < two < 2 * one
+    more = dict(steps_of(twice, 6, "off", disk=True))
+    assert more.items() > both.items()
+    assert more["extended light, and the wavefront without it"] > one
+    whole = dict(steps_of(twice, 6, "off", wide=True))
+    assert set(whole) - set(both) == {"search of the whole frames"}
 
 
 # -- a reduction, with a stub in the place of the fit --------------------------------------------

@@ -64,7 +64,7 @@ def test_the_demo_finds_the_planet_that_klip_loses(tmp_path: Path) -> None:
     assert abs(rows["initial"]["annulus SNR"]) < 4
     assert rows["refined"]["seconds"] == pytest.approx(result.fit.seconds)
 
-    # With the wavefront integrated out the planet is whole, and where it is.
+    # With the wavefront marginalised the planet is whole, and where it is.
     (found,) = result.detection.table
     assert found["snr"] > rows["refined"]["annulus SNR"]
     assert abs(found["contrast"] - 1e-6) < 3 * found["contrast_error"]

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 import torch
 from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.io import fits as astropy_fits
 from astropy.table import QTable
 from astropy.time import Time
 from astropy.units import Unit
+from astropy.wcs import WCS
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
@@ -25,6 +27,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Detection, search, small_sample_factor
 from pyklip_diffrender.detection.calibration import calibration_errors
 from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.headers import world_coordinates
 from pyklip_diffrender.detection.relinearise import with_companions
 from pyklip_diffrender.errors import (
     CorruptFileError,
@@ -660,14 +663,16 @@ def test_small_samples_need_higher_thresholds() -> None:
 def test_products_can_be_read_by_others(one: Detection, tmp_path: Path) -> None:
     paths = one.write(tmp_path / "products")
     assert [path.name for path in paths] == ["detection.fits", "candidates.ecsv", "contrast.ecsv"]
-    with astropy_fits.open(paths[0]) as hdus:
+    with astropy_fits.open(paths[0], checksum=True) as hdus:
         np.testing.assert_allclose(hdus["SNR"].data, one.snr, rtol=1e-6)
         assert hdus["OFFSET_X"].header["BUNIT"] == "arcsec"
         np.testing.assert_allclose(hdus["SUBTRACTED", 1].data, one.subtracted[0], rtol=1e-6)
         assert Unit(hdus["SUBTRACTED"].header["BUNIT"]) == Unit("photon")
         assert Unit(hdus["LEFT_OUT"].header["BUNIT"]) == Unit("photon")
-        assert hdus[0].header["status"] == "CONVERGED"
-        assert "pyklip_diffrender" in hdus[0].header["software"]
+        assert hdus[0].header["DRSTAT"] == "CONVERGED"
+        assert "pyklip_diffrender" in hdus[0].header["DRVERS"]
+        # astropy warns of checksums that do not hold, and warnings are errors.
+        assert all(hdu.verify_checksum() == hdu.verify_datasum() == 1 for hdu in hdus)
     table = QTable.read(paths[1], format="ascii.ecsv")
     assert table["separation"].unit == "arcsec"
     assert table.meta["scatter"] == one.scatter
@@ -680,9 +685,37 @@ def oriented(found: Detection) -> Detection:
     (fit,) = found.fits
     (frame,) = fit.frames
     known = {"position_angles": np.array([33.0]), "date": Time("2023-01-02T03:04:05.678")}
-    header = astropy_fits.Header({"TARGPROP": "HD 1"})
+    header = astropy_fits.Header({"TARGPROP": "HD 1", "CRVAL1": 311.3, "CRVAL2": -31.3})
     observation = replace(frame.observation, filter="F444W", header=header, **known)
     return replace(found, fits=(replace(fit, frames=(replace(frame, observation=observation),)),))
+
+
+def test_the_images_are_on_the_sky_where_the_table_says(one: Detection, tmp_path: Path) -> None:
+    found = oriented(one)
+    planet = found.table[0]
+    # The nearest pixel, and from there the rest of the way.
+    nearest = (np.hypot(found.grid[..., 0] - planet["x"].value,
+                        found.grid[..., 1] - planet["y"].value)).argmin()  # fmt: skip
+    row, column = np.unravel_index(nearest, found.snr.shape)
+    step = (np.array([planet["x"].value, planet["y"].value]) - found.grid[row, column]) / (
+        found.observation.pixelscale
+    )
+    pixel = np.array([column, row]) + step
+    with astropy_fits.open(found.write(tmp_path)[0]) as hdus:
+        assert hdus[0].header["OBJECT"] == "HD 1"
+        for name in ("SNR", "LEFT_OUT", "SUBTRACTED", "DATA"):
+            wcs = WCS(hdus[name].header)
+            place = wcs.pixel_to_world(*pixel)
+            east, north = SkyCoord(311.3, -31.3, unit="deg").spherical_offsets_to(place)
+            assert east.arcsec == pytest.approx(planet["delta_ra"].value, abs=2e-4)
+            assert north.arcsec == pytest.approx(planet["delta_dec"].value, abs=2e-4)
+
+
+def test_without_a_position_on_the_sky_the_coordinates_are_arcsec_from_the_star(
+    one: Detection,
+) -> None:
+    wcs = WCS(world_coordinates(one.grid, one.observation))
+    np.testing.assert_allclose(wcs.pixel_to_world_values(7, 3), one.grid[3, 7], atol=1e-9)
 
 
 def test_a_detection_survives_the_file(one: Detection, tmp_path: Path) -> None:
@@ -761,7 +794,7 @@ def test_a_file_without_a_part_is_no_detection(
                 hdus[name].data = hdus[name].data[1:]
             else:
                 del hdus[name]
-            hdus.writeto(path, overwrite=True)
+            hdus.writeto(path, overwrite=True, checksum=True)
     with pytest.raises(CorruptFileError, match=message):
         Detection.read(path)
 

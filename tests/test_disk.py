@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from astropy.io import fits as astropy_fits
+from astropy.wcs import WCS
 from matplotlib import pyplot
 from scipy.optimize import nnls
 
@@ -133,6 +134,9 @@ def test_products_and_refusals(tmp_path: Path) -> None:
         names = [hdu.name for hdu in hdus[1:]]
         assert names == ["IMAGE", "IMAGE_ERROR", "LIGHT", "OFFSET_X", "OFFSET_Y", "SOURCES"]
         assert hdus["IMAGE"].header["BUNIT"] == "ph"
+        np.testing.assert_allclose(
+            WCS(hdus["LIGHT"].header).wcs_pix2world(2, 9, 0), disk.grid[9, 2]
+        )
         np.testing.assert_array_equal(hdus["SOURCES"].data["contrast"], lit.contrasts)
     axes = lit.plot()
     pyplot.close(axes[0].figure)

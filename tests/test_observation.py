@@ -9,9 +9,11 @@ import pytest
 from astropy import units as u
 from astropy.io import fits
 
+import pyklip_diffrender as dr
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
+    IncompatibleSetupError,
     NoValidPixelsError,
     ShapeError,
     UnitError,
@@ -354,3 +356,11 @@ def test_the_real_frames_are_read(shared_data: Path) -> None:
     small = got.combined().cutout(41)
     y, x = np.unravel_index((small.data * small.valid)[0].argmax(), small.shape)
     assert np.hypot(*(np.array([x, y]) - small.center[0])) < 12
+
+
+def test_frames_of_another_instrument_are_refused_before_a_fit() -> None:
+    ones = np.ones((8, 8))
+    header = fits.Header({"INSTRUME": "MIRI"})
+    frame = Observation.from_arrays(ones, ones, pixelscale=0.11, filter="F444W", header=header)
+    with pytest.raises(IncompatibleSetupError, match="of MIRI, and only NIRCam"):
+        dr.model_for(frame)

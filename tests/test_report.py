@@ -308,14 +308,20 @@ def shown() -> dict[str, Any]:
     )
     detection = replace(whole.detection, fits=(fit,))
     again = replace(whole, sequence=sequence, fit=fit, detection=detection, systematics=known)
-    values = (evil, sequence, fit, detection, again, whole.fit.model, plan(), known)
+    wide = dr.WideField(
+        detection, 5.0, flat, flat, flat, flat, detection.error_factor, detection.table,
+        detection.contrast_curve,
+    )  # fmt: skip
+    disk = dr.Disk(fit, (), flat, flat, flat, np.ones((1, 2)), np.ones(1), 9.0)
+    values = (evil, sequence, fit, detection, again, whole.fit.model, plan(), known, fit.initial,
+              wide, disk)  # fmt: skip
     return {type(value).__name__: value for value in values}
 
 
 @pytest.mark.parametrize(
     "name",
     ["Observation", "Sequence", "Refinement", "Detection", "Reduction", "OpticalSystem", "Plan",
-     "Systematics"],
+     "Systematics", "OPDMap", "WideField", "Disk"],
 )  # fmt: skip
 def test_a_notebook_shows_a_small_escaped_summary(name: str) -> None:
     value = shown()[name]
@@ -382,12 +388,15 @@ def test_the_page_fits_the_screen(folder: Path, tmp_path: Path, width: int, dark
     done = subprocess.run(
         [
             str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+            "--enable-logging=stderr",
             f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000",
             f"--blink-settings=preferredColorScheme={0 if dark else 1}",
             f"--window-size={width + 100},1000", "--dump-dom", holder.as_uri(),
         ],
         capture_output=True, text=True, check=True, timeout=120,
     )  # fmt: skip
+    # Errors and warnings of the page.
+    assert ":CONSOLE" not in done.stderr
     (said,) = re.findall(r'<pre id="report">(.+?)</pre>', done.stdout)
     seen = json.loads(said)
     assert seen["width"] == width
@@ -414,5 +423,7 @@ def test_the_search_of_whole_frames_has_a_section_of_its_own(tmp_path: Path) -> 
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     (row,) = summary["wide_field"]["candidates"]
     assert row["fit_chi2"] == 1.3
+    assert summary["sentence"].endswith("Nothing was found farther from the star, in the whole "
+                                        "frames.")  # fmt: skip
     assert len(summary["wide_field"]["contrast_curve"]["contrast"]) == len(inner.contrast_curve)
     assert summarise(reduction())["wide_field"] is None

@@ -20,6 +20,7 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.io.names import same_name
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.reduction import reduce
 from pyklip_diffrender.refinement import (
@@ -163,9 +164,29 @@ def test_what_does_not_belong_is_left_out_with_a_reason(folder: Path) -> None:
         Sequence.from_files(folder)
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "same"),
+    [
+        ("V-AU-MIC", "au mic", True),
+        ("V* AU Mic", "V-AU-MIC", True),
+        ("V-AU-MIC", "AU_Mic", True),
+        ("* bet Pic", "BET-PIC", True),
+        ("V 1298 Tau", "V1298-TAU", True),
+        ("HIP-17695", "HIP 1769", False),
+        ("V1298 Tau", "1298 Tau", False),
+    ],
+)
+def test_names_are_the_same_in_any_spelling(first: str, second: str, same: bool) -> None:
+    assert same_name(first, second) is same_name(second, first) is same
+
+
 def test_a_target_that_cannot_be_decided_is_an_error(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(IncompatibleSetupError, match="VEGA"):
+    with pytest.raises(IncompatibleSetupError, match=r"'VEGA', expected one of 'AU MIC', 'HIP1'$"):
         Sequence.from_files(folder, target="VEGA")
+    with pytest.raises(IncompatibleSetupError, match=r"Did you mean 'AU MIC'\?"):
+        Sequence.from_files(folder, target="AU Microscopii")
+    with pytest.raises(IncompatibleSetupError, match=r"filter: got 'F445W'.* mean 'F444W'\?"):
+        Sequence.from_files(folder, filter="F445W")
     calints(folder / "g.fits", "HIP2", 20.0, "2022-10-03T08:00:00")
     with pytest.raises(IncompatibleSetupError, match="choose one with"):
         Sequence.from_files(folder)

@@ -20,6 +20,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.headers import world_coordinates
 from pyklip_diffrender.detection.orbits import write_astrometry
 from pyklip_diffrender.detection.sky import Positions, Sky, star_flux_density
 from pyklip_diffrender.detection.tables import candidate_table, measured_table
@@ -98,6 +99,11 @@ def test_the_sky_is_where_the_frames_own_wcs_has_it(
         place_on_sky.on_sky[0], [east.arcsec, north.arcsec], rtol=0, atol=4e-3 * distance
     )
     assert place_on_sky.separation[0] == pytest.approx(distance, rel=3e-3)
+    grid = np.stack(np.meshgrid(np.arange(3) * mask.siaf_pixelscale[0], np.arange(3.0)), -1)
+    grid[..., 1] *= mask.siaf_pixelscale[1]
+    grid[..., 1] += mask.siaf_shear * grid[..., 0]
+    ours = WCS(world_coordinates(grid, got)).pixel_to_world(*pixels)
+    assert ours.separation(place).arcsec < 4e-3 * distance
     away = star.position_angle(place).deg - place_on_sky.position_angle[0]
     assert (away + 180) % 360 - 180 == pytest.approx(0, abs=0.2)
 

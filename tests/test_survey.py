@@ -13,7 +13,8 @@ from datetime import date
 from html.parser import HTMLParser
 from math import inf
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -37,6 +38,8 @@ from pyklip_diffrender.surveys.jobs import Injection, Job, plan_jobs
 from pyklip_diffrender.surveys.tables import COLUMNS, table_of
 
 ROOT = Path(__file__).resolve().parents[1]
+
+CURVE = ("sigmas", "separation_arcsec", "contrast")
 
 PLANETS = {"contrasts": [1e-5, 3e-6], "separations": [0.5, 1.0], "angles": [0, 90.0]}
 
@@ -96,6 +99,17 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path: Path) -> None:
     assert set(run_survey(config, tmp_path / "out", stub)["status"]) == {"finished"}
 
 
+def test_whole_frames_and_disks_are_asked_for_by_sequence(tmp_path: Path) -> None:
+    config = inputs(tmp_path, 1)
+    plain = config["sequence"][0]
+    config["sequence"] += [{**plain, "name": n, n: True} for n in ("wide", "disk")]
+    keys = {job.key for job in planned(config)}
+    assert len(keys) == 3
+    assert planned({**config, "sequence": [plain]})[0].key in keys
+    config["options"] = {"disk": True}
+    assert [job.options.disk for job in planned({**config, "sequence": [plain]})] == [True]
+
+
 @pytest.mark.parametrize(
     ("where", "key", "value", "words"),
     [
@@ -111,6 +125,9 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path: Path) -> None:
         ((), "options", {"settings": {"free": [date(2022, 8, 1)]}}, ["settings", "a date"]),
         ((), "options", {"settings": {"robust": float("nan")}}, ["options: settings", "nan"]),
         ((), "options", {"settings": {"tolerance": []}}, ["options: settings", "wrong type"]),
+        ((), "options", {"disk": 1}, ["options: disk", "true or false"]),
+        ((1,), "wide", "yes", ["sequence 2: wide", "true or false"]),
+        ((), "options", {"disk": True, "wide": True}, ["options", "one of them"]),
         ((), "injections", {"contrasts": [1e-5]}, ["injections", "both"]),
         ((), "injections", {"angles": 3}, ["injections: angles", "a list"]),
         ((0,), "files", "nowhere.fits", ["sequence 1: files", "nowhere.fits", "exist"]),
@@ -629,6 +646,72 @@ def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for() -> None:
         assert light[core].max() == light.max()
         # The photon noise of the star under the planet is 3 % of the planet.
         assert light[core].sum() == pytest.approx((expected - star.data[0])[core].sum(), rel=0.1)
+
+
+def test_a_disk_and_the_whole_frames_are_part_of_the_job(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[dict[str, Any]] = []
+
+    class Part:
+        """Everything that a reduction has to write."""
+
+        def write(self, place: Path, **_: Any) -> Any:
+            return [place / "wide_field.fits"] if place.is_dir() else place
+
+    part = Part()
+
+    class Disk:
+        def write(self, folder: Path) -> Path:
+            return folder / "disk.fits"
+
+    def reduce(*_: Any, wide: bool, disk: bool, **__: Any) -> Any:
+        asked.append({"wide": wide, "disk": disk})
+        return SimpleNamespace(
+            detection=part, fit=part, systematics=None,
+            wide=part if wide else None, disk=Disk() if disk else None,
+        )  # fmt: skip
+
+    written: list[list[str]] = []
+    wide_field = {"candidates": [{"snr": 7.0}], "contrast_curve": {k: [] for k in CURVE}}
+    summary = {
+        **result(), "status": {"name": "CONVERGED"}, "fit": {"reduced_chi2": 1, "error_factor": 1},
+        "contrast_curve": {k: [1.0] for k in CURVE}, "frames": [], "wide_field": wide_field,
+    }  # fmt: skip
+    monkeypatch.setattr(work, "reduce", reduce)
+    monkeypatch.setattr(work.Sequence, "from_files", lambda *_, **__: None)
+    monkeypatch.setattr(work, "summarise", lambda _: summary)
+    monkeypatch.setattr(
+        work, "write_report", lambda *args: written.append([each.name for each in args[2]])
+    )
+    config = inputs(tmp_path, 1)
+    for name in ("wide", "disk"):
+        (job,) = planned({**config, "options": {name: True}})
+        record = work.reduce_job(job, tmp_path)
+        assert [each["false_alarm_probability"] for each in record["candidates"]] == [None]
+        assert record["curve"] == wide_field["contrast_curve"]
+    assert asked == [{"wide": True, "disk": False}, {"wide": False, "disk": True}]
+    assert [len(each) for each in written] == [3, 3]
+    assert "disk.fits" in written[1]
+
+
+def test_a_planet_is_injected_into_the_frames_with_their_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ones = np.ones((30, 30))
+    whole = dr.Observation.from_arrays(3 * ones, ones, pixelscale=0.063)
+    cut = whole.cutout(8)
+    frame = FrameFit(
+        cast(Any, None), replace(cut, data=cut.data - 2), {}, ones, ones, ones, {}, {}, ones
+    )
+    sequence = dr.Sequence("HD 1", (whole,))
+    monkeypatch.setattr(work.Sequence, "from_files", lambda *_, **__: sequence)
+    config = inputs(tmp_path, 1)
+    config["sequence"][0]["size"] = 8
+    for disk, value in ((False, 1.0), (True, 3.0)):
+        (job,) = planned({**config, "options": {"disk": disk}})
+        (with_disk,) = work._with_disk([frame], job)
+        assert (with_disk.observation.data == value).all()
 
 
 def test_what_is_recovered_is_the_candidate_at_the_place() -> None:

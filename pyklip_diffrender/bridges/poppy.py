@@ -262,6 +262,19 @@ def from_poppy(
     ------
     IncompatibleSetupError
         For a plane that is not supported, or a setting that does not fit.
+
+    Examples
+    --------
+    >>> import poppy
+    >>> import pyklip_diffrender as dr
+    >>> osys = poppy.OpticalSystem("coronagraph", npix=64, oversample=2)
+    >>> _ = osys.add_pupil(poppy.CircularAperture(radius=1.2))
+    >>> _ = osys.add_image(poppy.CircularOcculter(radius=0.25, name="spot"))
+    >>> _ = osys.add_pupil(poppy.CircularAperture(radius=1.0))
+    >>> detector = osys.add_detector(pixelscale=0.05, fov_pixels=24, oversample=1)
+    >>> model = dr.from_poppy(osys, wavelength=1.6e-6)
+    >>> model.propagation
+    {'spot': 'compact'}
     """
     recipe = {k: v for k, v in locals().items() if k != "osys"}
     check_supported(osys)

@@ -210,6 +210,15 @@ def from_webbpsf(
         For another instrument, a mask that is not supported, or a wavelength outside the channel.
     CorruptFileError
         If a file of stpsf's data is missing.
+
+    Examples
+    --------
+    >>> import stpsf  # doctest: +SKIP
+    >>> nircam = stpsf.NIRCam()  # doctest: +SKIP
+    >>> nircam.filter, nircam.image_mask, nircam.pupil_mask = (  # doctest: +SKIP
+    ...     "F335M", "MASK335R", "MASKRND"
+    ... )
+    >>> model = dr.from_webbpsf(nircam, nlambda=5, fov_pixels=80)  # doctest: +SKIP
     """
     if fov_arcsec is not None:
         fov_arcsec = to_number(fov_arcsec, u.arcsec, "fov_arcsec", "positive")

@@ -85,10 +85,11 @@ def demo(
     click.echo(
         f"\nA planet of contrast {contrast:g} at {separation:g} arcsec; the "
         f"wavefront map is {hours:g} h old.\nSNR: the paper's, in the planet's annulus. "
-        "Throughput: share of the planet's light kept.\nStar error: rms of what is left of the "
-        "star in that annulus, in units of the noise.\n"
+        "Throughput: fraction of the planet's light that is kept;\nit says nothing where much of "
+        "the star remains, as with the initial map. Star error: rms\nresidual of the star in that "
+        "annulus, in units of the noise.\n"
         f"Refinement: {result.fit.status.message}.\n\n"
-        "Point sources with the wavefront integrated out, which loses none of the planet:"
+        "Point sources with the wavefront marginalised, which loses none of the planet:"
     )
     for row in result.detection.table:
         click.echo(
@@ -114,7 +115,7 @@ Examples:
 )
 @click.argument("frames", type=file_type(), nargs=-1)
 @option("--target", metavar="STAR", section="Frames",
-        help="Name of the target; the other stars are references.")  # fmt: skip
+        help="Name of the target, in any spelling; the other stars are references.")  # fmt: skip
 @option("--filter", metavar="NAME", section="Frames", help="Which filter, if there are several.")
 @option(
     "--program",
@@ -314,7 +315,7 @@ def _reduction(
         if dry_run:
             from pyklip_diffrender.cli.estimate import describe_plan
 
-            click.echo(describe_plan(sequence, size, systematics))
+            click.echo(describe_plan(sequence, size, systematics, wide=wide, disk=disk))
             return
         from pyklip_diffrender.io.progress import stage
         from pyklip_diffrender.plotting import draw_detection, save

@@ -34,11 +34,14 @@ from scipy.optimize import minimize
 
 from pyklip_diffrender.detection.field import Image, separation_of
 from pyklip_diffrender.detection.groups import groups_of, has_only_reference_stars
+from pyklip_diffrender.detection.headers import primary_hdu, world_coordinates
 from pyklip_diffrender.detection.relinearise import without_light
+from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.storage import image_hdu
-from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.detection.templates import Templates, pixel_grid
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import write_fits
+from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.refinement import Refinement
@@ -91,6 +94,12 @@ class Disk:
         significant extended light; `light` is then 0.
     gain : float
         Decrease of chi-squared by the sources in the frames' first fit, with the star marginalised.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> result = dr.reduce("calints", "maps", disk=True)  # doctest: +SKIP
+    >>> result.disk.contrast, result.disk.orientation  # doctest: +SKIP
     """
 
     fit: Refinement
@@ -106,6 +115,18 @@ class Disk:
         return (
             f"<Disk: {len(self.contrasts)} sources, {self.contrast:.3g} of the star's light, "
             f"chi-squared lower by {self.gain:.4g}>"
+        )
+
+    def _repr_html_(self) -> str:
+        angle = self.orientation
+        return html_summary(
+            f"Disk about {self.fit.frames[0].observation.target}",
+            {
+                "Light": f"{self.contrast:.3g} of the star's",
+                "Sources": len(self.contrasts),
+                "Decrease of chi-squared": f"{self.gain:.4g}",
+                "Position angle of the long axis": None if angle is None else f"{angle:.1f} deg",
+            },
         )
 
     @property
@@ -158,16 +179,25 @@ class Disk:
         Its extensions are IMAGE, IMAGE_ERROR, LIGHT (one for every frame), OFFSET_X, OFFSET_Y and
         the table SOURCES.
         """
-        unit = self.fit.frames[0].observation.unit.to_string("fits")
+        first = self.fit.frames[0].observation
+        unit, wcs = first.unit.to_string("fits"), world_coordinates(self.grid, first)
+        shown = [each for each in self.fit.frames if not each.observation.reference]
+        frames = [
+            world_coordinates(pixel_grid(each.model, each.optical_values), each.observation)
+            for each in shown
+        ]
         sources = fits.BinTableHDU(self.table, name="SOURCES")
         hdus = fits.HDUList(
             [
-                fits.PrimaryHDU(),
-                image_hdu(self.image, "IMAGE", unit),
-                image_hdu(self.error, "IMAGE_ERROR", unit),
-                *(image_hdu(each, "LIGHT", unit, k) for k, each in enumerate(self.light, 1)),
-                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec"),
-                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec"),
+                primary_hdu(first, self.fit.summary(), Sky.of([self.fit]).mjd),
+                image_hdu(self.image, "IMAGE", unit, wcs),
+                image_hdu(self.error, "IMAGE_ERROR", unit, wcs),
+                *(
+                    image_hdu(each, "LIGHT", unit, cards, k)
+                    for k, (each, cards) in enumerate(zip(self.light, frames, strict=True), 1)
+                ),
+                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec", wcs),
+                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
                 sources,
             ]
         )

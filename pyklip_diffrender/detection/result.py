@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from astropy.io.fits import Header
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
@@ -20,6 +21,7 @@ from pyklip_diffrender.detection.contrast import described
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group
+from pyklip_diffrender.detection.headers import world_coordinates
 from pyklip_diffrender.detection.measurement import (
     contrasts_at,
     measured_shape,
@@ -35,8 +37,10 @@ from pyklip_diffrender.detection.storage import (
     hdus_of,
     maps_of,
     table_of,
+    wcs_of,
 )
 from pyklip_diffrender.detection.tables import candidate_table, in_words, measured_table
+from pyklip_diffrender.detection.templates import pixel_grid
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.files import replacing, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
@@ -87,6 +91,18 @@ class Detection:
         x, y of the pixels from the star, arcsec.
     path : Path or None
         File that the detection was read from.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> scene = dr.Scene(planets=(dr.Planet(1e-4, 0.5, 54.0),))
+    >>> frame = dr.simulate(model, scene, opd, seed=1)
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=4), plan="off")
+    >>> detection = dr.detect(fit)
+    >>> print(f"{detection.table['separation'][0]:.2f}, S/N above 5: {len(detection.table)}")
+    0.50 arcsec, S/N above 5: 1
     """
 
     fits: tuple[Refinement, ...]
@@ -245,6 +261,15 @@ class Detection:
         return subtracted_frames(self.fits, self.groups, self.candidates)
 
     @cached_property
+    def _wcs(self) -> tuple[Header, ...]:
+        """World coordinates of the frames, in the order of `subtracted`."""
+        return tuple(
+            world_coordinates(pixel_grid(f.model, f.optical_values), f.observation)
+            for fit in self.fits
+            for f in fit.frames
+        )
+
+    @cached_property
     def left_out(self) -> tuple[Image, Image]:
         """Residual of every 5 x 5 patch of the first frame for a fit without the patch.
 
@@ -377,6 +402,7 @@ class Detection:
             computed = {
                 "observation": observation_of(hdus, facts["observation"], 0),
                 "subtracted": tuple(image(hdus, "SUBTRACTED", k) for k in range(stars)),
+                "_wcs": tuple(wcs_of(hdus, "SUBTRACTED", k) for k in range(stars)),
                 "left_out": (image(hdus, "LEFT_OUT", 0), image(hdus, "LEFT_OUT_ERROR", 0)),
                 "_calibration_errors": np.array(facts["calibration_errors"], dtype=float),
                 "sky": Sky(**facts["sky"]),

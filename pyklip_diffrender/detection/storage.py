@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from astropy.table import QTable
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group, groups_of
+from pyklip_diffrender.detection.headers import primary_hdu, world_coordinates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.storage import image, observation_hdus, text_hdu
@@ -30,7 +32,10 @@ __all__ = [
     "maps_of",
     "table_facts",
     "table_of",
+    "wcs_of",
 ]
+
+_WCS = re.compile(r"WCSAXES|RADESYS|(CTYPE|CUNIT|CRPIX|CRVAL)[12]|CD[12]_[12]")
 
 MAPS = {
     "SNR": "snr",
@@ -42,21 +47,30 @@ MAPS = {
 """Attributes of a detection by the names of their extensions."""
 
 
-def image_hdu(array: Image, name: str, unit: str, version: int = 1) -> fits.ImageHDU:
+def image_hdu(
+    array: Image, name: str, unit: str, wcs: fits.Header | None = None, version: int = 1
+) -> fits.ImageHDU:
     """Make an extension of an image in double precision."""
     hdu = fits.ImageHDU(np.asarray(array, dtype=np.float64), name=name, ver=version)
     hdu.header["BUNIT"] = unit
+    hdu.header.update(wcs or {})
     return hdu
+
+
+def wcs_of(hdus: fits.HDUList, name: str, frame: int) -> fits.Header:
+    """Return the cards of an extension that `world_coordinates` made."""
+    header = hdus[name, frame + 1].header
+    cards = [each for each in header.cards if _WCS.fullmatch(each.keyword)]
+    return fits.Header(cards)
 
 
 def hdus_of(detection: Any) -> fits.HDUList:
     """The FITS extensions of a `Detection`, which it reads again."""
-    primary = fits.PrimaryHDU()
-    for key, value in detection._provenance.items():
-        text = ", ".join(value) if isinstance(value, list) else value
-        primary.header[f"HIERARCH {key}"] = text
     unit = detection.observation.unit.to_string("fits")
     about, data = observation_hdus(detection.observation, 0)
+    wcs = world_coordinates(detection.grid, detection.observation)
+    for hdu in data:
+        hdu.header.update(wcs)
     facts = {
         "error_factor": vars(detection.error_factor),
         "threshold": detection.threshold,
@@ -70,18 +84,20 @@ def hdus_of(detection: Any) -> fits.HDUList:
     }
     return fits.HDUList(
         [
-            primary,
+            primary_hdu(detection.observation, detection._provenance, detection.sky.mjd),
             *(
-                image_hdu(getattr(detection, attribute), name, "")
+                image_hdu(getattr(detection, attribute), name, "", wcs)
                 for name, attribute in MAPS.items()
             ),
-            image_hdu(detection.left_out[0], "LEFT_OUT", unit),
-            image_hdu(detection.left_out[1], "LEFT_OUT_ERROR", unit),
-            image_hdu(detection.grid[..., 0], "OFFSET_X", "arcsec"),
-            image_hdu(detection.grid[..., 1], "OFFSET_Y", "arcsec"),
+            image_hdu(detection.left_out[0], "LEFT_OUT", unit, wcs),
+            image_hdu(detection.left_out[1], "LEFT_OUT_ERROR", unit, wcs),
+            image_hdu(detection.grid[..., 0], "OFFSET_X", "arcsec", wcs),
+            image_hdu(detection.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
             *(
-                image_hdu(each, "SUBTRACTED", unit, k)
-                for k, each in enumerate(detection.subtracted, 1)
+                image_hdu(each, "SUBTRACTED", unit, cards, k)
+                for k, (each, cards) in enumerate(
+                    zip(detection.subtracted, detection._wcs, strict=True), 1
+                )
             ),
             *data,
             text_hdu("FACTS", facts),

@@ -19,12 +19,14 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor, scatter_profile
 from pyklip_diffrender.detection.field import Image, far_from, ring_pixels, separation_of
+from pyklip_diffrender.detection.headers import primary_hdu, world_coordinates
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.storage import image_hdu
 from pyklip_diffrender.detection.tables import candidate_table, in_words
 from pyklip_diffrender.detection.whole_frames import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing, write_fits
+from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement.companions import local_maxima
 from pyklip_diffrender.scene.observation import Observation
 
@@ -92,6 +94,12 @@ class WideField:
         See `contrast.contrast_table`.
     light : tuple of ndarray, (ny, nx)
         Light of the sources outside the fitted pixels in every frame, in the data's unit.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> result = dr.reduce("calints", "maps", wide=True)  # doctest: +SKIP
+    >>> print(result.wide)  # doctest: +SKIP
     """
 
     detection: Detection
@@ -112,6 +120,13 @@ class WideField:
     def __str__(self) -> str:
         """The candidates in words, at most 80 columns wide."""
         return in_words(self.table, self.threshold)
+
+    def _repr_html_(self) -> str:
+        ny, nx = self.snr.shape
+        facts = {"Star": self.observation.target, "Pixels": f"{nx} x {ny}"}
+        title = f"WideField: {len(self.table)} candidates above {self.threshold:g} sigma"
+        columns = ("separation", "position_angle", "contrast", "contrast_error", "snr", "fit_chi2")
+        return html_summary(title, facts, self.table, columns)
 
     @property
     def observation(self) -> Observation:
@@ -158,14 +173,16 @@ class WideField:
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables."""
         folder = Path(folder)
+        about = self.detection
+        wcs = world_coordinates(self.grid, self.observation)
         hdus = fits.HDUList(
             [
-                fits.PrimaryHDU(),
-                image_hdu(self.snr, "SNR", ""),
-                image_hdu(self.contrast, "CONTRAST", ""),
-                image_hdu(self.error, "CONTRAST_ERROR", ""),
-                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec"),
-                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec"),
+                primary_hdu(self.observation, about._provenance, about.sky.mjd),
+                image_hdu(self.snr, "SNR", "", wcs),
+                image_hdu(self.contrast, "CONTRAST", "", wcs),
+                image_hdu(self.error, "CONTRAST_ERROR", "", wcs),
+                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec", wcs),
+                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
             ]
         )
         written = [folder / "wide_field.fits"]
@@ -199,6 +216,13 @@ def wide_field(
     ------
     IncompatibleSetupError
         For observations that are not those of the fit, or a detection of several fits.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> frame = dr.Observation.from_fits("roll1_calints.fits")  # doctest: +SKIP
+    >>> fit = dr.refine(dr.model_for(frame, 80), frame.cutout(80), "opd.fits")  # doctest: +SKIP
+    >>> wide = dr.wide_field(dr.detect(fit), [frame])  # doctest: +SKIP
     """
     threshold = detection.threshold if threshold is None else threshold
     frames = _frames(detection, observations)

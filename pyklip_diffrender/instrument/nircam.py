@@ -167,6 +167,13 @@ def nircam_coronagraph(
     IncompatibleSetupError
         For an incompatible filter, mask or wavelength, or a field so wide that the image of a pupil
         of `npix` samples repeats inside it.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
+    >>> tuple(model().shape)
+    (24, 24)
     """
     if monochromatic is not None:
         monochromatic = to_number(monochromatic, u.m, "monochromatic", "positive")

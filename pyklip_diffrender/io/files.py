@@ -128,7 +128,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_fits(hdus: fits.HDUList, path: str | os.PathLike[str]) -> None:
-    """Write a FITS file in one step, so that it is never incomplete."""
+    """Write a FITS file with checksums in one step, so that it is never incomplete."""
+    hdus.update_extend()
+    for hdu in hdus:
+        # Without the time, which astropy would note: the same content is the same file.
+        hdu.add_checksum(when="checksum of the extension")
     with replacing(path) as temporary:
         hdus.writeto(temporary, overwrite=True)
 

@@ -102,6 +102,15 @@ def plan(
     -----
     DiffrenderWarning
         If the settings in `keep` exceed the budget.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
+    >>> scene = dr.Scene(star=dr.Star(w2_magnitude=11.0))
+    >>> plan = dr.plan(model, scene, dr.random_opd(1, npix=128))
+    >>> plan.choice.npix <= 128
+    True
     """
     if opd is None:
         raise MissingOPDError("plan needs the wavefront that the refinement will start from")

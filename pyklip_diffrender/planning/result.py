@@ -49,6 +49,15 @@ class Plan:
         `Refinement`.
     abandoned : bool
         Whether that was too large, so that the fit continued with the full model.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
+    >>> scene = dr.Scene(star=dr.Star(w2_magnitude=11.0))
+    >>> plan = dr.plan(model, scene, dr.random_opd(1, npix=128))
+    >>> plan.table.colnames
+    ['what', 'chosen', 'finest', 'error', 'worst', 'seconds', 'why']
     """
 
     model: OpticalSystem

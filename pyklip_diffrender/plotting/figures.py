@@ -42,7 +42,7 @@ def draw_demo(result: DemoResult) -> Figure:
     titles = {
         "initial": f"Star from the {result.table.meta['hours']:.0f} h old wavefront",
         "KLIP": "KLIP, nine dithered references",
-        "optimal": "True star (the best there is)",
+        "optimal": "The true star subtracted",
         "detected": "Star refined, the planet found in the model",
     }
     for row, column, name in places:
@@ -93,7 +93,7 @@ def _draw_candidates(ax: Axes, figure: Figure, result: DemoResult) -> None:
         )
     artist = draw_image(
         ax, detection.snr, scale, limits=(-6, 6), cmap="RdBu_r",
-        title=f"Wavefront integrated out:\n{facts}",
+        title=f"Wavefront marginalised:\n{facts}",
     )  # fmt: skip
     ax.plot(*planet.offset, "o", mfc="none", mec=INK, ms=13, mew=1.2)
     figure.colorbar(artist, ax=ax, label="S/N of a point source", shrink=0.85)

@@ -86,9 +86,23 @@ def advice(status: Status, *, patterned: bool, many: bool = False) -> str:
 
 def sentence(summary: Mapping[str, Any]) -> str:
     """The result in a few sentences."""
+    parts = [_compact(summary)]
     if summary["disk"] is not None:
-        return " ".join([_extended(summary), _compact(summary)])
-    return _compact(summary)
+        parts.insert(0, _extended(summary))
+    if summary["wide_field"] is not None:
+        parts.append(_outside(summary))
+    return " ".join(parts)
+
+
+def _outside(summary: Mapping[str, Any]) -> str:
+    """How many candidates there are beyond the fitted pixels."""
+    more = len(summary["wide_field"]["candidates"]) - len(summary["candidates"])
+    if more < 1:
+        return "Nothing was found farther from the star, in the whole frames."
+    return (
+        f"Farther from the star, in the whole frames, there {'is' if more == 1 else 'are'} {more} "
+        f"more candidate{'' if more == 1 else 's'}."
+    )
 
 
 def _extended(summary: Mapping[str, Any]) -> str:
@@ -157,8 +171,10 @@ def scientific(value: float, error: float | None = None) -> str:
     return f"({plus_minus(value / 10**power, error / 10**power)}) × {ten}"
 
 
-def probability(value: float) -> str:
-    """A probability of a false alarm."""
+def probability(value: float | None) -> str:
+    """A probability of a false alarm; "not known" for None."""
+    if value is None:
+        return number(None)
     if value < _TINY:
         return f"< {scientific(_TINY).replace('1.0 × ', '')}"
     return scientific(value) if value < 0.01 else f"{value:.2f}"

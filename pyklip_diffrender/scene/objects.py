@@ -66,6 +66,13 @@ class Star:
         Fraction of a point source's calibrated flux that falls on its brightest pixel. The paper
         does not state it. 0.0148002 follows from its other numbers, with its 1.0334e10 photons
         at contrast 1.
+
+    Examples
+    --------
+    >>> from astropy import units as u
+    >>> import pyklip_diffrender as dr
+    >>> dr.Star(w2_magnitude=5.5, exposure=2 * u.h).exposure
+    7200.0
     """
 
     w2_magnitude: float = BETA_PICTORIS_W2
@@ -176,6 +183,13 @@ class Scene:
         Photons per pixel, Gaussian.
     background : float
         Photons per pixel.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> scene = dr.Scene(planets=(dr.Planet(1e-6, separation=0.6, position_angle=54),))
+    >>> scene.star.exposure
+    7200.0
     """
 
     star: Star = field(default_factory=Star)

@@ -75,6 +75,16 @@ class Observation:
     name : str
     header : Header
         Primary and science headers of the file, merged.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pyklip_diffrender as dr
+    >>> ones = np.ones((2, 8, 8))
+    >>> dr.Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F444W")
+    <Observation 'observation': 2 frames of 8 x 8 pixels, F444W, ph, no date>
+
+    >>> frames = dr.Observation.from_fits("roll1_calints.fits")  # doctest: +SKIP
     """
 
     data: NDArray[np.float64]

@@ -46,12 +46,29 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
     Raises
     ------
     IncompatibleSetupError
-        If the filter is not known, or the coronagraph is not one that is modelled.
+        If the filter is not known, or the instrument or the coronagraph is not one that is
+        modelled.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pyklip_diffrender as dr
+    >>> ones = np.ones((24, 24))
+    >>> frame = dr.Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F444W")
+    >>> model = dr.model_for(frame, monochromatic=4.5e-6, npix=128)
+    >>> tuple(model().shape)
+    (24, 24)
     """
     if observation.filter is None:
         raise IncompatibleSetupError(
             f"{observation.name}: the filter of these frames is not known. Give the observation a "
             "filter, such as 'F444W', or make the model with nircam_coronagraph"
+        )
+    instrument = str(observation.header.get("INSTRUME", "NIRCAM")).strip()
+    if instrument.upper() != "NIRCAM":
+        raise IncompatibleSetupError(
+            f"{observation.name}: these frames are of {instrument}, and only NIRCam's coronagraph "
+            "is built in. Make the model of another one with from_poppy, and fit with refine"
         )
     arguments: dict[str, Any] = {
         "fov_pixels": observation.shape if size is None else size,

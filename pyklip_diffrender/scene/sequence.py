@@ -15,6 +15,7 @@ from astropy.time import Time
 
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.io.names import same_name, unknown_name
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["Sequence"]
@@ -39,6 +40,17 @@ class Sequence:
         Frames of other stars through the same coronagraph, in order of time.
     excluded : tuple of (str, str)
         Names of the files that were left out, and why.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pyklip_diffrender as dr
+    >>> ones = np.ones((8, 8))
+    >>> frame = dr.Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F444W")
+    >>> dr.Sequence("HD 1", (frame,))
+    <Sequence: HD 1 in F444W, 1 of the target, 0 of reference stars>
+
+    >>> dr.Sequence.from_files("calints", target="HD 1")  # doctest: +SKIP
     """
 
     target: str
@@ -81,8 +93,8 @@ class Sequence:
         files : path or sequence of path
             Stage-2 files (calints), spaceKLIP's aligned files, or a folder with either.
         target : str, optional
-            Name of the target (TARGPROP). Default the star that is not marked as a reference
-            (IS_PSF), if there is just one.
+            Name of the target (TARGPROP), in which case, spaces and dashes do not matter. Default
+            the star that is not marked as a reference (IS_PSF), if there is just one.
         filter : str, optional
             Filter to use. Default the one of all files, if there is just one.
 
@@ -110,23 +122,22 @@ class Sequence:
             reasons = "; ".join(f"{name}: {reason}" for name, reason in excluded)
             raise NoValidPixelsError(f"none of {len(paths)} files can be used: {reasons}")
         filter = _the_only("filter", filter, [each.filter for each in observations])
-        through = [each for each in observations if _same(each.filter, filter)]
+        through = [each for each in observations if same_name(each.filter, filter)]
         excluded += [
             (each.name, f"taken through {each.filter}, not {filter}")
             for each in observations
-            if not _same(each.filter, filter)
+            if not same_name(each.filter, filter)
         ]
         if target is None:
             unmarked = [each.target for each in through if not each.header.get("IS_PSF")]
             target = _the_only("target", None, unmarked or [each.target for each in through])
-        names = sorted({each.target for each in through})
-        if not any(_same(target, name) for name in names):
-            raise IncompatibleSetupError(f"target: got {target!r}, the files show {names}")
-        science = [each for each in through if _same(each.target, target)]
+        science = [each for each in through if same_name(each.target, target)]
+        if not science:
+            raise unknown_name("target", target, [each.target for each in through])
         setup = _setup(science[0])
         references = []
         for each in through:
-            if _same(each.target, target):
+            if same_name(each.target, target):
                 continue
             if _setup(each) == setup:
                 references.append(replace(each, reference=True))
@@ -203,8 +214,8 @@ def _the_only(key: str, choice: str | None, values: abc.Sequence[str | None]) ->
     """Return the requested value, or the only one in the files."""
     counts = Counter(str(value) for value in values)
     if choice is not None:
-        if not any(_same(choice, value) for value in counts):
-            raise IncompatibleSetupError(f"{key}: got {choice!r}, the files have {sorted(counts)}")
+        if not any(same_name(choice, value) for value in counts):
+            raise unknown_name(key, choice, counts)
         return choice
     if len(counts) > 1:
         raise IncompatibleSetupError(
@@ -212,15 +223,6 @@ def _the_only(key: str, choice: str | None, values: abc.Sequence[str | None]) ->
             f"one with {key}=..."
         )
     return next(iter(counts))
-
-
-def _same(first: str | None, second: str | None) -> bool:
-    """Whether two names differ only in case and separators."""
-    return _plain(first) == _plain(second)
-
-
-def _plain(name: str | None) -> str:
-    return "".join(c for c in str(name).upper() if c.isalnum())
 
 
 def _setup(observation: Observation) -> tuple[str, ...]:

@@ -61,6 +61,13 @@ def simulate(
     Observation
         In photons. The error is the observer's estimate, sqrt(counts + read noise^2), from
         the frame itself.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
+    >>> dr.simulate(model, dr.Scene(), dr.random_opd(1, npix=128), seed=1)
+    <Observation 'simulation(seed=1)': 1 frame of 24 x 24 pixels, F444W, ph, no date>
     """
     expected = expected_photons(model, scene, opd)
     generator = np.random.default_rng(seed)

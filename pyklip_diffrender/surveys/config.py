@@ -38,6 +38,8 @@ class Options:
     threshold : float
     systematics : str
         "auto", "references", "off", or the path of a file of `Systematics.write`.
+    wide, disk : bool
+        Search the whole frames as well, or fit extended light together with the star.
     settings : dict
         Arguments of `GaussNewton.nircam`; empty for the defaults of `reduce`.
     """
@@ -45,6 +47,8 @@ class Options:
     size: int = 80
     threshold: float = 5.0
     systematics: str = "auto"
+    wide: bool = False
+    disk: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -275,13 +279,20 @@ def _options(table: _Table, default: Options) -> Options:
         "systematics", default.systematics,
         "'auto', 'references', 'off' or a systematics.fits that exists", systematics,
     )  # fmt: skip
+    wide, disk = (
+        table.take(key, getattr(default, key), "true or false", _flag) for key in ("wide", "disk")
+    )
+    if wide and disk:
+        table.complain("", "wide = true and disk = true", "one of them")
+        disk = False
     own = table.take("settings", {}, "a table with arguments of GaussNewton", _mapping)
     # Those of a sequence come on top of the survey's.
     settings = {**default.settings, **own}
     wrong = _wrong_settings(settings) if own else []
     where = f"{table.place}: settings"
     table.problems += [f"{where}: {each}" for each in wrong]
-    return Options(size, threshold, pattern, default.settings if wrong else settings)
+    allowed = default.settings if wrong else settings
+    return Options(size, threshold, pattern, wide, disk, allowed)
 
 
 def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
@@ -340,6 +351,12 @@ def _positive(value: Any) -> float:
     if _number(value) <= 0:
         raise ValueError
     return float(value)
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError
+    return value
 
 
 def _count(value: Any) -> int:

@@ -77,6 +77,11 @@ def survey(
     -----
     Processes are started with the method "spawn", so a script that calls this needs the usual
     ``if __name__ == "__main__":``.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> table = dr.survey("survey.toml", "products")  # doctest: +SKIP
     """
     from pyklip_diffrender.surveys.work import reduce_job
 

@@ -135,6 +135,8 @@ def _jobs(
         "threshold": sequence.options.threshold,
         "systematics": inputs.get(pattern, pattern),
         "settings": dict(sequence.options.settings),
+        # Only where they are on, so that jobs of configurations without them keep their names.
+        **{name: True for name in ("wide", "disk") if getattr(sequence.options, name)},
     }
     plain = Job(
         _hash(facts),

@@ -32,11 +32,12 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
         "size": options.size,
         "threshold": options.threshold,
         "memory": memory,
+        "disk": options.disk,
         "settings": GaussNewton.nircam(**options.settings) if options.settings else None,
     }
     if job.injection is not None and job.base is not None:
         fit = Refinement.read(folder.parent / job.base / "fit.fits")
-        sequence = _with_planet(fit.frames, job.injection)
+        sequence = _with_planet(_with_disk(fit.frames, job), job.injection)
         reduction = reduce(sequence, job.opd, systematics=fit.systematics or "off", **common)
         extra = {"recovered": _recovered(reduction, job.injection)}
     else:
@@ -44,8 +45,15 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
         known: Any = options.systematics
         if known not in ("auto", "references", "off"):
             known = Systematics.read(known)
-        reduction, extra = reduce(sequence, job.opd, systematics=known, **common), {}
+        reduction, extra = (
+            reduce(sequence, job.opd, systematics=known, wide=options.wide, **common),
+            {},
+        )
     written = reduction.detection.write(folder)
+    if reduction.wide is not None:
+        written += reduction.wide.write(folder)
+    if reduction.disk is not None:
+        written.append(reduction.disk.write(folder))
     # The linear model takes twenty times the rest of the fit.
     written.append(reduction.fit.write(folder / "fit.fits", linear=False))
     if reduction.systematics is not None:
@@ -81,6 +89,18 @@ def planet_image(
     return frame.flux * np.asarray(image.double().cpu().numpy())
 
 
+def _with_disk(frames: abc.Sequence[FrameFit], job: Job) -> list[FrameFit]:
+    """The frames of a fit, with the extended light that was subtracted from them."""
+    if not job.options.disk:
+        return list(frames)
+    files = Sequence.from_files(job.files, target=job.target, filter=job.filter)
+    original = files.cutout(job.options.size).science
+    return [
+        replace(frame, observation=replace(frame.observation, data=each.combined().data))
+        for frame, each in zip(frames, original, strict=True)
+    ]
+
+
 def _with_planet(frames: abc.Sequence[FrameFit], planet: Injection) -> Sequence:
     """The frames of a fit with a planet added."""
     first = frames[0].observation
@@ -114,10 +134,12 @@ def _recovered(reduction: Reduction, planet: Injection) -> dict[str, Any]:
 
 def _result(summary: dict[str, Any]) -> dict[str, Any]:
     """What the tables and the page of a survey need of a reduction."""
-    keys = ("target", "filter", "sentence", "candidates", "limits", "threshold_snr", "left_out")
-    curve = summary["contrast_curve"]
+    keys = ("target", "filter", "sentence", "limits", "threshold_snr", "left_out")
+    search = summary["wide_field"] or summary
+    curve = search["contrast_curve"]
     return {
         **{key: summary[key] for key in keys},
+        "candidates": [{"false_alarm_probability": None, **each} for each in search["candidates"]],
         "fit_status": summary["status"]["name"],
         "reduced_chi2": summary["fit"]["reduced_chi2"],
         "error_factor": summary["fit"]["error_factor"],

@@ -188,6 +188,15 @@ def drift(before: Any, after: Any, hours: float, interval: float = 86.0) -> NDAr
     -------
     ndarray, (npix, npix)
         m.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pyklip_diffrender as dr
+    >>> before, after = dr.random_opd(1, npix=128), dr.random_opd(2, npix=128)
+    >>> halfway = dr.drift(before, after, hours=43)
+    >>> bool(np.allclose(halfway, (before.data + after.data) / 2))
+    True
     """
     first, second = to_metres(before, "before"), to_metres(after, "after")
     hours = to_number(hours, u.h, "hours")
@@ -212,6 +221,13 @@ def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
     Returns
     -------
     OPDMap
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> opd = dr.random_opd(1, npix=128, rms=50e-9)
+    >>> f"{1e9 * opd.data[opd.data != 0].std():.0f} nm"
+    '50 nm'
     """
     rms = to_number(rms, u.m, "rms", "not negative")
     return _random(seed, npix, rms, 0.24, "random_opd")

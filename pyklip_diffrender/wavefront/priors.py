@@ -67,6 +67,13 @@ class WavefrontPrior:
         amplitude by 0.14 %); 0 for a fixed amplitude.
     amplitude_slope : float
         Beyond the knee the amplitude's deviation falls as frequency to minus this power.
+
+    Examples
+    --------
+    >>> from astropy import units as u
+    >>> import pyklip_diffrender as dr
+    >>> dr.WavefrontPrior(scales={"segment": 2 * u.nm, "texture": 0.1}).scales
+    {'segment': 2.0, 'texture': 0.1}
     """
 
     scales: dict[str, float] = field(default_factory=lambda: {"segment": 4.0, "texture": 0.1})
@@ -172,6 +179,15 @@ def learn_prior(
     ------
     ShapeError
         For fewer than two maps, or maps of different shapes.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> from pyklip_diffrender.wavefront.bases import FourierModes
+    >>> maps = [dr.random_opd(seed, npix=128).data for seed in (1, 2, 3)]
+    >>> prior = dr.learn_prior(maps, FourierModes(4))
+    >>> list(prior.scales), prior.fit_scales
+    (['texture'], True)
     """
     stack = np.asarray([to_metres(opd, "maps") for opd in maps])
     diameter = to_number(diameter, u.m, "diameter", "positive")

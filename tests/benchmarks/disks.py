@@ -53,36 +53,41 @@ def rendered(base: dr.Reduction, disk: dr.Disk, shifts: list[Image]) -> list[Ima
 
 
 def draw(reduction: dr.Reduction, subtracted: Image, path: Path) -> None:
-    """The frame, KLIP and this package side by side."""
+    """The frame, KLIP and this package side by side, in type that a phone shows, too."""
+    import matplotlib
     from matplotlib.figure import Figure
 
-    from pyklip_diffrender.plotting.panels import (
-        draw_compass,
-        extent_of,
-        label_sky,
-        light_norm,
-        show,
-    )
+    from pyklip_diffrender.plotting.panels import draw_compass, extent_of, halo, light_norm
 
     disk = reduction.disk
     assert disk is not None
-    figure = Figure(figsize=(13.2, 4.2), layout="compressed")
-    axes = figure.subplots(1, 3)
     extent = extent_of(disk.grid[0, :, 0], disk.grid[:, 0, 1])
     frame = reduction.sequence.science[0].combined()
     data = np.where(frame.valid[0], frame.data[0], np.nan)
-    show(axes[0], data, extent, bar="MJy/sr", title="one roll", cmap="magma",
-         norm=light_norm(data, frame.error[0][frame.valid[0]]))  # fmt: skip
     limit = float(np.nanpercentile(disk.light[0], 99))
-    for ax, image, title in (
-        (axes[1], subtracted, "KLIP, with four reference frames"),
-        (axes[2], disk.image, "this package, without reference frames"),
-    ):
-        show(ax, image, extent, bar="MJy/sr", title=title, cmap="RdBu_r", vmin=-limit, vmax=limit)
-    for ax in axes:
-        label_sky(ax)
-        draw_compass(ax, frame.position_angle)
-    save(figure, path)
+    on_disk = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+    panels = [
+        ("one frame", data,
+         {"cmap": "magma", "norm": light_norm(data, frame.error[0][frame.valid[0]])}),
+        ("KLIP", subtracted, on_disk),
+        ("this package", disk.image, on_disk),
+    ]  # fmt: skip
+    with matplotlib.rc_context({"font.size": 11, "axes.titlesize": 13}):
+        figure = Figure(figsize=(6.6, 3.25), layout="compressed")
+        axes = figure.subplots(1, 3, sharey=True)
+        artists = []
+        for ax, (title, image, style) in zip(axes, panels, strict=True):
+            artists.append(ax.imshow(image, origin="lower", extent=extent, **style))
+            ax.set(title=title, facecolor="0.75", xticks=(-2, 0, 2), yticks=(-2, 0, 2))
+            ax.plot(0, 0, "+", color="black", ms=9, mew=1.6, path_effects=halo())
+        axes[0].set_ylabel("arcsec")
+        draw_compass(axes[0], frame.position_angle)
+        bar = {"orientation": "horizontal", "pad": 0.03, "aspect": 12}
+        figure.colorbar(artists[0], ax=axes[0], label="MJy/sr", ticks=(1, 100), extend="min",
+                        format="%g", **bar)  # fmt: skip
+        figure.colorbar(artists[2], ax=axes[1:], label="MJy/sr", ticks=(-10, 0, 10), extend="both",
+                        **{**bar, "aspect": 25})  # fmt: skip
+        save(figure, path, dpi=300)
 
 
 def main() -> None:

@@ -1,0 +1,118 @@
+"""FITS headers of products: what was observed, how it was reduced, and world coordinates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+
+from pyklip_diffrender.detection.field import Image
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["primary_hdu", "world_coordinates"]
+
+_OBSERVED = (
+    "TELESCOP", "INSTRUME", "DETECTOR", "CHANNEL", "FILTER", "PUPIL", "CORONMSK", "SUBARRAY",
+    "APERNAME", "EXP_TYPE", "PROGRAM", "TARGPROP", "TARGNAME", "TARG_RA", "TARG_DEC", "DATE-BEG",
+)  # fmt: skip
+"""Cards of the first frame that hold for its products."""
+
+_REDUCED = {
+    "software": ("DRVERS", "version of the software"),
+    "method": ("DRMETH", "refinement method"),
+    "status": ("DRSTAT", "how the refinement ended"),
+    "chi2_per_pixel": ("DRCHI2", "chi-squared per fitted pixel"),
+    "model_error": ("DRMODERR", "error of the model, fraction of the star"),
+    "frames": ("DRNFRAME", "number of fitted frames"),
+    "seed": ("DRSEED", "random seed"),
+    "opd": ("DROPD", "wavefront map at the start"),
+    "opd_sha256": ("DRSHA256", ""),
+    "systematics": ("DRSYST", "pattern of the model's error"),
+    "scatter": ("DRERRFAC", "median factor of the errors"),
+    "threshold": ("DRTHRESH", "smallest S/N of a candidate"),
+    "star_flux_density_jy": ("DRSTARJY", "flux density of the star, Jy"),
+}
+"""Keywords and comments of a detection's provenance."""
+
+
+def primary_hdu(
+    observation: Observation, provenance: Mapping[str, Any], mjd: float | None = None
+) -> fits.PrimaryHDU:
+    """Make a primary HDU without data.
+
+    Parameters
+    ----------
+    observation : Observation
+        The first frame.
+    provenance : mapping
+        Its known entries become DR keywords, its observations lines of HISTORY.
+    mjd : float, optional
+        Mean of the mid-exposures, UTC.
+    """
+    hdu = fits.PrimaryHDU()
+    header = hdu.header
+    for key in _OBSERVED:
+        if key in observation.header:
+            header[key] = (observation.header[key], observation.header.comments[key])
+    header["OBJECT"] = observation.target
+    if observation.filter is not None:
+        header["FILTER"] = observation.filter
+    if observation.date is not None:
+        header["DATE-BEG"] = observation.date.isot
+    if mjd is not None:
+        header["MJD-AVG"] = (mjd, "mean mid-exposure, UTC")
+    for name, (key, comment) in _REDUCED.items():
+        value = provenance.get(name)
+        if value is not None:
+            # FITS has no NaN in headers.
+            finite = not isinstance(value, float) or math.isfinite(value)
+            header[key] = (value if finite else str(value), comment)
+    for name in provenance.get("observations", ()):
+        header.add_history(f"frame {name}")
+    return hdu
+
+
+def world_coordinates(grid: Image, observation: Observation) -> fits.Header:
+    """Cards of a WCS for the pixels of a frame.
+
+    The star is at the reference coordinates of the frame (CRVAL), where the telescope pointed. If
+    these or the orientation are not known, the coordinates are x, y from the star in arcsec.
+
+    Parameters
+    ----------
+    grid : ndarray, (ny, nx, 2)
+        x, y of the pixels from the star, arcsec.
+    observation : Observation
+        Of that frame.
+    """
+    columns, rows = grid.shape[1] - 1, grid.shape[0] - 1
+    steps = np.diag(observation.pixelscale)
+    if columns and rows:
+        # Over the whole frame, because the difference of neighbours has more of rounding.
+        ends = np.stack([grid[0, -1], grid[-1, 0]], axis=1)
+        steps = (ends - grid[0, 0][:, None]) / (columns, rows)
+    star = 1 - np.linalg.solve(steps, grid[0, 0])
+    axes, unit, values = ("X", "Y"), "arcsec", (0.0, 0.0)
+    pointing = [observation.header.get(key) for key in ("CRVAL1", "CRVAL2")]
+    if observation.position_angles is not None and all(
+        isinstance(each, float) and math.isfinite(each) for each in pointing
+    ):
+        axes, unit, values = ("RA---TAN", "DEC--TAN"), "deg", (pointing[0], pointing[1])
+        angle = np.deg2rad(observation.position_angle)
+        sine, cosine = np.sin(angle), np.cos(angle)
+        steps = np.array([[-cosine, sine], [sine, cosine]]) @ steps / 3600
+    header = fits.Header()
+    header["WCSAXES"] = 2
+    for k, axis in enumerate(axes):
+        header[f"CTYPE{k + 1}"] = axis
+        header[f"CUNIT{k + 1}"] = unit
+        header[f"CRPIX{k + 1}"] = (float(star[k]), "the star")
+        header[f"CRVAL{k + 1}"] = values[k]
+        for j in range(2):
+            header[f"CD{k + 1}_{j + 1}"] = float(steps[k, j])
+    if unit == "deg":
+        header["RADESYS"] = str(observation.header.get("RADESYS", "ICRS"))
+    return header

@@ -1,0 +1,40 @@
+"""Names of stars and filters, which archives and observers spell differently."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+
+__all__ = ["same_name", "unknown_name"]
+
+_SIMBAD = re.compile(r"(V|NAME|\*+)?\*?[\s_-]+", re.IGNORECASE)
+"""What SIMBAD, and observers after it, write before names: V* AU Mic, V-AU-MIC, * bet Pic."""
+
+
+def same_name(first: str | None, second: str | None) -> bool:
+    """Whether two names differ only in case, separators and SIMBAD's marks before the name."""
+    names = [str(each) for each in (first, second)]
+    return _plain(names[0]) == _plain(names[1]) or _bare(names[0]) == _bare(names[1])
+
+
+def unknown_name(key: str, choice: str, names: Iterable[str | None]) -> IncompatibleSetupError:
+    """Error for a name that is not among those there are, with the nearest of them."""
+    known = sorted({str(name) for name in names})
+    by_plain = {_plain(name): name for name in known}
+    nearest = difflib.get_close_matches(_plain(choice), by_plain, n=1, cutoff=0.4)
+    hint = f". Did you mean {by_plain[nearest[0]]!r}?" if nearest else ""
+    return IncompatibleSetupError(
+        f"{key}: got {choice!r}, expected one of {', '.join(map(repr, known))}{hint}"
+    )
+
+
+def _plain(name: str) -> str:
+    return "".join(c for c in name.upper() if c.isalnum())
+
+
+def _bare(name: str) -> str:
+    mark = _SIMBAD.match(name)
+    return _plain(name[mark.end() :] if mark else name)

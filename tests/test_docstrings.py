@@ -1,0 +1,56 @@
+"""Every public name has an example in its docstring, and the examples give what they say."""
+
+from __future__ import annotations
+
+import doctest
+import inspect
+
+import pytest
+
+import pyklip_diffrender as dr
+
+NO_EXAMPLE = {
+    "Adam", "DiffrenderSettings", "LinearModel", "OpticalSystem", "Refinement", "Status",
+    "Systematics", "contrast_curve", "learn_systematics", "measure", "observation_from_dataset",
+    "unregister",
+}  # fmt: skip
+"""Those that have none yet; the set may only become smaller."""
+
+NAMES = sorted(
+    name
+    for name in dr.__all__
+    if not name.startswith("__")
+    and not (inspect.isclass(each := getattr(dr, name)) and issubclass(each, Warning | Exception))
+)
+
+
+def takes_long(name: str) -> bool:
+    """Whether the examples of a name fit or plan, which takes seconds."""
+    text = inspect.getdoc(getattr(dr, name)) or ""
+    return any(
+        call in line
+        for line in text.splitlines()
+        for call in ("dr.refine(", "dr.plan(")
+        if "SKIP" not in line
+    )
+
+
+def test_public_names_have_examples() -> None:
+    without = {name for name in NAMES if ">>>" not in (inspect.getdoc(getattr(dr, name)) or "")}
+    assert without == NO_EXAMPLE
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if takes_long(name) else name
+        for name in NAMES
+        if name not in NO_EXAMPLE
+    ],
+)
+def test_examples_give_what_they_say(name: str) -> None:
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    # Without the names of the module: a reader does not have them.
+    for each in doctest.DocTestFinder().find(getattr(dr, name), name, globs={}):
+        runner.run(each)
+    assert runner.summarize(verbose=False).failed == 0
