@@ -67,7 +67,17 @@ class FittedPointing:
         return box if box not in self.window and adjustable else self.window
 
     def star(self) -> Image:
-        """The star over all pixels that can be rendered, (ny, nx), NaN elsewhere."""
+        """The star over all pixels that can be rendered, (ny, nx), NaN elsewhere.
+
+        A fit ends where further steps gain less than the noise. How much of a faint planet it has
+        taken for star by then depends on where it stopped. So the last step of the linear model is
+        added, which is a small part of the noise, and after which every fit has taken as much as
+        the exact solution.
+        """
+        return self._fitted_star() + np.nan_to_num(self._last_step())
+
+    def _fitted_star(self) -> Image:
+        """The star as the fit has left it."""
         group, window, box = self.pointing.observation, self.window, self.box
         if box is not window:
             star = self._rendered(box, None)
@@ -101,13 +111,15 @@ class FittedPointing:
         change = torch.where(star, change, 0.0)
         return np.asarray(linear.frames[self.index].image(change[:, None])[0].numpy())
 
-    def last_step(self) -> Image:
-        """What the linear model's solution adds to the star, (Ny, Nx), NaN elsewhere.
+    def _last_step(self) -> Image:
+        """What the linear model's solution adds to the star, (Ny, Nx), NaN elsewhere."""
+        # Takes a second to import.
+        from pyklip_diffrender.refinement import Status
 
-        0 for a fit without a linear model.
-        """
-        linear = self.result.linear
-        change = np.zeros(self.window.shape) if linear is None else self.change_of_star(linear.step)
+        change = np.zeros(self.window.shape)
+        # Before a fit has converged, its linear model may not be good for so long a step.
+        if self.result.linear is not None and self.result.status is not Status.ITERATION_LIMIT:
+            change = self.change_of_star(self.result.linear.step)
         return self.paste(change, self.window)
 
     def source(self, offset: Image, box: Window) -> Image:

@@ -45,7 +45,7 @@ from pyklip_diffrender.pyklip_backend.references import (
     library_files,
 )
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
-from pyklip_diffrender.pyklip_backend.subtract import Subtraction, subtract_by_refinement
+from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.throughput import (
     on_product,
     throughput_map,
@@ -300,7 +300,7 @@ class Reduction:
             raise ShapeError(
                 f"star: got shape {subtraction.star.shape}, expected {frames.data.shape}"
             )
-        residuals = frames.data - self._star(subtraction)
+        residuals = frames.data - subtraction.star
         lost = ~np.any(np.isfinite(residuals) & observation.valid, axis=(1, 2))
         if lost.any():
             raise RefinementError(
@@ -313,10 +313,6 @@ class Reduction:
         if self._filter is not None:
             residuals = np.array([self._filter(residual) for residual in residuals])
         return residuals
-
-    def _star(self, subtraction: Subtraction) -> NDArray[np.float64]:
-        """What is subtracted from the frames, (m, ny, nx)."""
-        return subtraction.star
 
 
 def mark_filtered(dataset: Any) -> None:
