@@ -27,7 +27,12 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, subtract_by_refinement
+from pyklip_diffrender.pyklip_backend import (
+    DiffrenderSettings,
+    backend,
+    reduction,
+    subtract_by_refinement,
+)
 from pyklip_diffrender.pyklip_backend.references import ChosenPattern
 from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
@@ -254,6 +259,41 @@ def test_a_faint_planet_loses_what_the_throughput_map_says(
     assert 0.2 < kept < 0.9
     expected = map_coordinates(np.nan_to_num(throughput), [[y], [x]], order=1)[0]
     assert expected == pytest.approx(kept, rel=0.04)
+
+
+def test_copies_with_added_sources_are_not_fitted_again(
+    small: OpticalSystem,
+    frames: NDArray[np.float64],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A fit of flux and background is linear, so that a new fit would do exactly the same."""
+    monkeypatch.setattr(reduction, "throughput_map", lambda fit: np.ones((32, 32)))
+    made = dataset(frames, small, fit=ALIGNED, error=1e3, plan="off")
+    untouched = copy.deepcopy(made)
+    pixels = np.indices(frames.shape[1:])
+    light = 2e3 * np.exp(-((pixels - np.array([[[30]], [[26]]])) ** 2).sum(axis=0) / 4)
+    changes = []
+    with backend(opd=OLD):
+        before, _ = reduce(made, tmp_path)
+        for into in (None, made):
+            injected = copy.deepcopy(made)
+            injected.input[1] += padded(light[None])[0]
+            with backend(injected_into=into):
+                image, header = reduce(injected, tmp_path)
+            changes.append(image - before)
+    assert header["DRMETH"] == "gauss-newton, linear response"
+    alone = rotate(np.pad(light, PAD), ANGLES[1], made.centers[1]) / 2
+    # Outside the fitted square, changes of the star's flux are left out.
+    square = np.s_[PAD + 8 : PAD + 36, PAD + 6 : PAD + 34]
+    full, linear, alone = (image[square] for image in (*changes, alone))
+    np.testing.assert_allclose(linear, full, atol=1e-3)
+    assert np.nanmax(np.abs(full - alone)) > 2
+    other = copy.deepcopy(made)
+    other.input[:] = np.roll(other.input, 3, axis=2)
+    for dataset_, into in ((other, made), (injected, untouched)):
+        with backend(injected_into=into), pytest.raises(IncompatibleSetupError, match="injected_i"):
+            reduce(dataset_, tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from pyklip_diffrender.pyklip_backend.checks import (
     check_settings,
 )
 from pyklip_diffrender.pyklip_backend.frames import Frames, date_of_frames, frames_of
+from pyklip_diffrender.pyklip_backend.injections import subtract_from_copy
 from pyklip_diffrender.pyklip_backend.placement import (
     aligned_before,
     annuli_of,
@@ -97,7 +98,7 @@ class Reduction:
             For bad input and failed fits. pyKLIP's own errors pass through.
         """
         self._check()
-        opd = starting_opd(self.settings, date_of_frames(self.dataset))
+        opd = self._opd()
         folder = require_folder(self.arguments["outputdir"])
         before = dict(vars(self.dataset))
 
@@ -136,6 +137,26 @@ class Reduction:
                 "star cannot be fitted to filtered frames. Make the dataset again, or give each "
                 "call with highpass=True its own copy.deepcopy(dataset)"
             )
+
+        if self.settings.injected_into is not None:
+            count, expected = len(self._before_injection), len(np.unique(dataset.wvs))
+            if count != expected:
+                raise IncompatibleSetupError(
+                    f"injected_into: it was reduced at {count} wavelengths, and this dataset has "
+                    f"{expected}. Reduce it with algo='diffrender' before sources are added"
+                )
+
+    def _opd(self) -> OPDMap:
+        """The wavefront map to start from."""
+        before = self._before_injection
+        if before:
+            return before[0].opd
+        return starting_opd(self.settings, date_of_frames(self.dataset))
+
+    @property
+    def _before_injection(self) -> Sequence[ReductionRecord]:
+        """How the dataset was reduced of which this one is a copy with faint sources."""
+        return getattr(self.settings.injected_into, RESULTS, ())
 
     @property
     def _rdi(self) -> bool:
@@ -231,8 +252,10 @@ class Reduction:
     def _write_extras(self, stage: Path, cards: fits.Header) -> None:
         """Write what pyKLIP does not: the throughput map, with its median in all products.
 
-        Fits without a linear model have none.
+        Fits without a linear model have none, and copies with added sources that of the original.
         """
+        if self._before_injection:
+            return
         results = [fit.result for record in self.records for fit in record.subtraction.fits]
         linear = all(getattr(result, "linear", None) is not None for result in results)
         if not linear or len(results) != len(self.records):
@@ -280,7 +303,10 @@ class Reduction:
     ) -> NDArray[np.float64]:
         """Frames minus their star, (m, ny, nx), high-pass filtered if the call asks for it."""
         observation = frames.observation
-        if settings.subtractor is not None:
+        before = self._before_injection
+        if before:
+            subtraction = subtract_from_copy(before[len(self.records)], frames)
+        elif settings.subtractor is not None:
             subtraction = settings.subtractor(observation, opd, settings)
         else:
             files = self._reference_files()

@@ -95,6 +95,10 @@ class DiffrenderSettings:
     max_chi2 : float, optional
         Reduced chi-squared above which a fit is implausible and the reduction stops with a
         `RefinementError`; 100 by default, inf for no limit.
+    injected_into : pyklip.instruments.Instrument.Data, optional
+        A dataset that has been reduced. Those of the calls are copies of it to which faint sources
+        were added; the star is not fitted to them again, but what it takes of the sources follows
+        from the linear model of the fit. For contrast curves by injection.
     model_options : mapping, optional
         Further keywords of `nircam_coronagraph`, such as ``npix`` and ``nlambda``.
     subtractor : Subtractor, optional
@@ -116,6 +120,7 @@ class DiffrenderSettings:
     plan: Plan | str | None = None
     keep_detected: bool | None = None
     max_chi2: float | None = None
+    injected_into: Any = None
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
 
