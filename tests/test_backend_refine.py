@@ -180,6 +180,7 @@ def test_what_is_detected_keeps_its_light(small: OpticalSystem, tmp_path: Path) 
         found = reduced.diffrender_results[0].subtraction
         assert [len(fit.result.companions) for fit in found.fits] == [int(keep)]
         assert header["DRKEPT"] == int(keep)
+        assert (found.error_factor is not None) == keep
         taken = found.star[:, PAD:-PAD, PAD:-PAD] - star
         shares = [
             1 - (t * p / star).sum() / (p * p / star).sum()

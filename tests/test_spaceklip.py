@@ -165,7 +165,7 @@ def test_a_failure_is_reported_after_the_others(
     }
     database = StandIn(tmp_path, obs)
 
-    def reduced(key: str, table: Table, folder: Path, threshold: float, settings: Any) -> Any:
+    def reduced(key: str, table: Table, folder: Path, *others: Any) -> Any:
         if key == "bad":
             raise IncompatibleSetupError("no such filter")
         header = {name: good[name][0] for name in good.colnames if len(name) <= 8
@@ -236,7 +236,7 @@ def test_a_concatenation_from_frames_to_sources(
     database.obs[KEY] = concatenation(files)
     detections = spaceklip.run_obs(
         database, opd=OPD, model=model, systematics="off", plan="off",
-        fit=GaussNewton(free=("flux", "background"), wavefront=False),
+        fit=GaussNewton(free=("flux", "background"), wavefront=False), save_rolls=True,
     )  # fmt: skip
     assert list(detections) == list(database.red) == [KEY]
     (sources,) = database.src[KEY] if kind == "real" else database.src[KEY].values()
@@ -253,5 +253,11 @@ def test_a_concatenation_from_frames_to_sources(
     image = fits.getdata(product)[0]
     brightest = np.unravel_index(np.nanargmax(image), image.shape)
     np.testing.assert_allclose(brightest, (y, x), atol=1.0)
+    paths = [product.with_name(f"{product.stem}_roll{k}.fits") for k in (1, 2)]
+    rolls = np.array([fits.getdata(path)[0] for path in paths])
+    assert fits.getheader(paths[0])["NINTS"] == 1
+    seen = np.isfinite(rolls).all(axis=0)
+    np.testing.assert_allclose(rolls.mean(axis=0)[seen], image[seen], rtol=1e-5, atol=1e-3)
+    assert np.abs(rolls[0] - rolls[1])[seen].max() > 10
     assert (product.parent / f"{KEY}.dat").exists()
     assert Detection.read(product.parent / f"ADI_NANNU1_NSUBS1_{KEY}").table["snr"][0] > 5

@@ -128,7 +128,13 @@ class ForwardReduction(Reduction):
             if len(self.records) == 1:
                 first = next(part for part in record.subtraction.pointings if part.index == 0)
                 k = int(first.pointing.frames[0])
-                self._planet_cards = planet_cards(first, planets[k], parangs[frames[k]], flipx)
+                self._planet_cards = planet_cards(
+                    first,
+                    planets[k],
+                    parangs[frames[k]],
+                    flipx,
+                    record.subtraction.error_factor,
+                )
             for k, planet in planets.items():
                 fill(planet.left, record.frames.observation.valid[k])
                 image = planet.left if self._filter is None else self._filter(planet.left)
