@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from astropy.io import fits
 from astropy.time import Time
 
@@ -160,7 +161,26 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
             if plan is not None:
                 facts = ", ".join(f"{k[5:]} {v}" for k, v in plan.summary().items())
                 header.add_history(f"diffrender: planned: {facts}")
+        for line in _fitted(subtraction):
+            header.add_history(f"diffrender: {line}")
     return header
+
+
+def _fitted(subtraction: Subtraction) -> Iterator[str]:
+    """The settings of the fits, their companions, and the star of every pointing, in words."""
+    for result in dict.fromkeys(part.result for part in subtraction.pointings):
+        settings = result.settings
+        numbers = (f"{name} {getattr(settings, name, None)}" for name in ("cycles", "tolerance"))
+        yield f"fit: free {', '.join(getattr(settings, 'free', ()))}, {', '.join(numbers)}"
+        for contrast, x, y in result.companions:
+            yield f"companion: contrast {contrast:.3g} at x {x:.4f}, y {y:.4f} arcsec from the star"
+    for part in subtraction.pointings:
+        x, y = -part.from_star(np.zeros(2))
+        yield (
+            f"frames {', '.join(map(str, part.pointing.frames))}: star at x {x:+.4f}, y {y:+.4f} "
+            f"arcsec from its place in the file, flux {part.frame.flux:.6g}, background "
+            f"{float(part.frame.values['background'][0]):.4g}"
+        )
 
 
 def stamp(folder: Path, cards: fits.Header) -> None:

@@ -8,7 +8,9 @@ interface, and `high_pass_filter_imgs` by one that keeps the unfiltered frames f
 from __future__ import annotations
 
 import dataclasses
+import io
 import logging
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -45,7 +47,11 @@ from pyklip_diffrender.pyklip_backend.references import (
     files_of_setup,
     library_files,
 )
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
+from pyklip_diffrender.pyklip_backend.settings import (
+    DiffrenderSettings,
+    starting_opd,
+    thread_limit,
+)
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.throughput import (
     on_product,
@@ -111,14 +117,15 @@ class Reduction:
             high_pass_filter_imgs=self._high_pass,
         )
         try:
-            with staging(folder) as stage:
+            with staging(folder) as stage, thread_limit(self.settings.threads):
                 reduce(**{**self.arguments, "outputdir": str(stage)})
                 cards = provenance(self.records)
                 self._write_extras(stage, cards)
                 stamp(stage, cards)
-        except BaseException:
+        except BaseException as error:
             vars(self.dataset).clear()
             vars(self.dataset).update(before)
+            _say_on_screen(error)
             raise
         setattr(self.dataset, RESULTS, tuple(self.records))
         logger.info("products of %r are in %s", self.arguments["fileprefix"], folder)
@@ -339,6 +346,15 @@ class Reduction:
         if self._filter is not None:
             residuals = np.array([self._filter(residual) for residual in residuals])
         return residuals
+
+
+def _say_on_screen(error: BaseException) -> None:
+    """Print an error while stderr goes to memory.
+
+    spaceKLIP does that while it injects sources, so that nobody would see what ended the program.
+    """
+    if isinstance(sys.stderr, io.StringIO) and sys.__stderr__ is not None:
+        print(f"diffrender: {type(error).__name__}: {error}", file=sys.__stderr__)
 
 
 def mark_filtered(dataset: Any) -> None:
