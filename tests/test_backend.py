@@ -644,6 +644,7 @@ def test_threads_and_errors_while_the_console_is_silenced(
 
     def fails(observation: Any, opd: Any, settings: Any) -> Subtraction:
         seen.append(torch.get_num_threads())
+        assert not list(tmp_path.iterdir())  # Or a process that is killed would leave a folder.
         raise RefinementError("diverged", None)
 
     before = torch.get_num_threads()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -69,12 +69,13 @@ def require_folder(folder: str | os.PathLike[str]) -> Path:
 
 @contextmanager
 def staging(folder: Path) -> Iterator[Path]:
-    """Temporary folder whose files are moved to `folder` if the block succeeds.
+    """Path of a temporary folder whose files are moved to `folder` if the block succeeds.
 
     It is inside `folder`, so that each move is one step on the same file system. If the block
-    raises, the files are deleted and `folder` is unchanged.
+    raises, the files are deleted and `folder` is unchanged. The block makes the folder when it has
+    something to write: a process that is killed during a long fit then leaves nothing behind.
     """
-    stage = Path(tempfile.mkdtemp(prefix=".diffrender-", dir=folder))
+    stage = folder / f".diffrender-{secrets.token_hex(6)}"
     try:
         yield stage
         for path in sorted(p for p in stage.rglob("*") if p.is_file()):
@@ -82,7 +83,8 @@ def staging(folder: Path) -> Iterator[Path]:
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(path, target)
     finally:
-        shutil.rmtree(stage)
+        if stage.exists():
+            shutil.rmtree(stage)
 
 
 def provenance(records: Sequence[ReductionRecord]) -> fits.Header:

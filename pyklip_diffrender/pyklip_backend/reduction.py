@@ -107,17 +107,19 @@ class Reduction:
         opd = self._opd()
         folder = require_folder(self.arguments["outputdir"])
         before = dict(vars(self.dataset))
-
-        def subtract(*args: Any, **kwargs: Any) -> tuple[Any, ...]:
-            return self._in_place_of_klip(opd, *args, **kwargs)
-
-        reduce = klip_dataset(
-            klip_parallelized=subtract,
-            klip_parallelized_lite=subtract,
-            high_pass_filter_imgs=self._high_pass,
-        )
         try:
             with staging(folder) as stage, thread_limit(self.settings.threads):
+
+                def subtract(*args: Any, **kwargs: Any) -> tuple[Any, ...]:
+                    subtracted = self._in_place_of_klip(opd, *args, **kwargs)
+                    stage.mkdir(exist_ok=True)
+                    return subtracted
+
+                reduce = klip_dataset(
+                    klip_parallelized=subtract,
+                    klip_parallelized_lite=subtract,
+                    high_pass_filter_imgs=self._high_pass,
+                )
                 reduce(**{**self.arguments, "outputdir": str(stage)})
                 cards = provenance(self.records)
                 self._write_extras(stage, cards)
