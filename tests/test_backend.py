@@ -5,12 +5,15 @@ from __future__ import annotations
 import copy
 import ctypes
 import inspect
+import io
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from astropy import units as u
 from astropy.io import fits
 from backend_scene import (
@@ -632,6 +635,28 @@ def test_a_failure_raises_and_leaves_everything_as_it_was(
     left = {p.name: fits.getdata(p).tobytes() for p in tmp_path.iterdir()}
     assert left == kept
     assert same(before, spied(monkeypatch))
+
+
+def test_threads_and_errors_while_the_console_is_silenced(
+    imgs: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, screen = [], io.StringIO()
+
+    def fails(observation: Any, opd: Any, settings: Any) -> Subtraction:
+        seen.append(torch.get_num_threads())
+        assert not list(tmp_path.iterdir())  # Or a process that is killed would leave a folder.
+        raise RefinementError("diverged", None)
+
+    before = torch.get_num_threads()
+    monkeypatch.setattr(sys, "stderr", io.StringIO())  # As spaceKLIP does.
+    monkeypatch.setattr(sys, "__stderr__", screen)
+    with backend(opd=OPD, subtractor=fails, threads=before + 1), pytest.raises(RefinementError):
+        reduce(generic(imgs, ANGLES), tmp_path)
+    assert seen == [before + 1]
+    assert torch.get_num_threads() == before
+    assert screen.getvalue().startswith("diffrender: RefinementError: diverged")
+    with backend(opd=OPD, threads=0), pytest.raises(IncompatibleSetupError, match="threads"):
+        reduce(generic(imgs, ANGLES), tmp_path)
 
 
 @pytest.mark.usefixtures("registered")

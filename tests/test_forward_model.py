@@ -20,10 +20,17 @@ from pyklip.klip import rotate
 from pyklip.parallelized import klip_dataset
 
 from pyklip_diffrender.detection import measure
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.pyklip_backend import DiffrenderSettings, backend, register, unregister
+from pyklip_diffrender.pyklip_backend import (
+    DiffrenderSettings,
+    backend,
+    register,
+    subtract,
+    unregister,
+)
 from pyklip_diffrender.refinement import Adam, GaussNewton
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.wavefront.bases import default_basis
@@ -212,6 +219,25 @@ def test_the_products_say_what_the_fit_knows_of_the_planet(
         assert header["DRFMFLUX"] / header["DRFMFERR"] == pytest.approx(snr, rel=0.1)
         assert 1 / snr < header["DRFMRAER"] < 3 / snr
         assert 1 / snr < header["DRFMDEER"] < 3 / snr
+
+
+@pytest.mark.usefixtures("registered")
+def test_errors_include_the_scatter_of_the_search(
+    model: OpticalSystem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three times the errors where the S/N of the search scatters by three."""
+    star, planet = shots(model, OLD.data)
+    factor = ErrorFactor(np.array([0.0, 2 * PIXEL * SEPARATION]), np.array([2.0, 4.0]))
+    headers = []
+    for keep, found in ((False, None), (True, factor)):
+        monkeypatch.setattr(subtract, "_with_companions", lambda fits, tell, f=found: (fits, f))
+        made = dataset(star + planet, model, np.sqrt(star), keep_detected=keep)
+        modelled(made, planet_psf(OLD.data, made), tmp_path, algo="diffrender")
+        headers.append(fits.getheader(tmp_path / "x-klipped-KLmodes-all.fits"))
+    assert [each["DRFMFACT"] for each in headers] == pytest.approx([1.0, 3.0], rel=0.02)
+    for name in ("DRFMFERR", "DRFMRAER", "DRFMDEER"):
+        assert headers[1][name] == pytest.approx(3 * headers[0][name], rel=0.02)
+    assert headers[1]["DRFMFLUX"] == headers[0]["DRFMFLUX"]
 
 
 @pytest.mark.usefixtures("registered")

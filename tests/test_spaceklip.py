@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +13,9 @@ import numpy as np
 import pytest
 import torch
 from astropy.io import fits
-from astropy.table import QTable, Table
+from astropy.table import QTable, Table, vstack
 from pyklip.instruments import JWST
+from pyklip.parallelized import klip_dataset
 
 from pyklip_diffrender import spaceklip
 from pyklip_diffrender.detection import Candidates, Detection
@@ -22,6 +24,8 @@ from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.tables import candidate_table
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.pyklip_backend import backend, reduction
 from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.spaceklip import run
 from pyklip_diffrender.spaceklip.products import complete_header, write_contrast, write_database
@@ -35,6 +39,7 @@ KEY = "JWST_NIRCAM_NRCALONG_F444W_MASKRND_MASK335R_SUB320A335R"
 FLUX, CONTRAST = 1e10, 2e-5
 SKY_ANGLES = (63.0, 73.0)
 OPD = random_opd(1, npix=128)
+ALIGNED = GaussNewton(free=("flux", "background"), wavefront=False)
 
 
 class StandIn:
@@ -68,7 +73,9 @@ def frame(path: Path, data: Any, roll: float) -> str:
     science = {
         "BUNIT": "MJy/sr", "PIXAR_A2": PIXEL**2, "STARCENX": center, "STARCENY": center,
         "CRPIX1": center, "CRPIX2": center, "CRVAL1": 201.0, "CRVAL2": -51.0, "ROLL_REF": roll,
-        "V3I_YANG": 0.0, "VPARITY": -1,
+        "V3I_YANG": 0.0, "VPARITY": -1, "WCSAXES": 2, "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN",
+        "CUNIT1": "deg", "CUNIT2": "deg", "CD1_1": -PIXEL / 3600, "CD1_2": 0.0, "CD2_1": 0.0,
+        "CD2_2": PIXEL / 3600,
     }  # fmt: skip
     hdus = [
         fits.PrimaryHDU(header=fits.Header(primary)),
@@ -165,7 +172,7 @@ def test_a_failure_is_reported_after_the_others(
     }
     database = StandIn(tmp_path, obs)
 
-    def reduced(key: str, table: Table, folder: Path, threshold: float, settings: Any) -> Any:
+    def reduced(key: str, table: Table, folder: Path, *others: Any) -> Any:
         if key == "bad":
             raise IncompatibleSetupError("no such filter")
         header = {name: good[name][0] for name in good.colnames if len(name) <= 8
@@ -207,37 +214,44 @@ def real_database(tmp_path: Path) -> Any:
     return made
 
 
+def two_rolls(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[OpticalSystem, list[str]]:
+    """Files of a star with a planet 0.8 arcsec from it at 120 degrees."""
+
+    def offline(**kw: Any) -> None:
+        raise OSError("offline")
+
+    monkeypatch.setattr(JWST.SvoFps, "get_filter_list", offline)
+    model = nircam_coronagraph(
+        "F444W", fov_pixels=SIDE, npix=128, occulter_sampling=2.0, monochromatic=4.44e-6
+    )
+    rng = np.random.default_rng(1)
+    files = []
+    for k, roll in enumerate(SKY_ANGLES):
+        turned = np.radians(120.0 - roll)
+        planet = 0.8 * np.array([-np.sin(turned), np.cos(turned)])
+        with torch.no_grad():
+            image = model(OPD.data) + CONTRAST * model(OPD.data, star_offset=planet)
+        photons = rng.poisson(FLUX * image.numpy() + 100.0).astype(float)
+        files.append(frame(folder / f"jw0{k}_calints.fits", photons, roll))
+    return model, files
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["stand-in", "real"])
 def test_a_concatenation_from_frames_to_sources(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest,
     caplog: Any,
 ) -> None:  # fmt: skip
-    def offline(**kw: Any) -> None:
-        raise OSError("offline")
-
-    monkeypatch.setattr(JWST.SvoFps, "get_filter_list", offline)
     caplog.set_level(logging.INFO)
-    model = nircam_coronagraph(
-        "F444W", fov_pixels=SIDE, npix=128, occulter_sampling=2.0, monochromatic=4.44e-6
-    )
-    rng = np.random.default_rng(1)
-    files, sky = [], np.radians(120.0)
-    for k, roll in enumerate(SKY_ANGLES):
-        turned = sky - np.radians(roll)
-        planet = 0.8 * np.array([-np.sin(turned), np.cos(turned)])
-        with torch.no_grad():
-            image = model(OPD.data) + CONTRAST * model(OPD.data, star_offset=planet)
-        photons = rng.poisson(FLUX * image.numpy() + 100.0).astype(float)
-        files.append(frame(tmp_path / f"jw0{k}_calints.fits", photons, roll))
+    model, files = two_rolls(tmp_path, monkeypatch)
+    sky = np.radians(120.0)
     database = StandIn(tmp_path, {}) if kind == "stand-in" else request.getfixturevalue(
         "real_database"
     )  # fmt: skip
     database.obs[KEY] = concatenation(files)
     detections = spaceklip.run_obs(
-        database, opd=OPD, model=model, systematics="off", plan="off",
-        fit=GaussNewton(free=("flux", "background"), wavefront=False),
-    )  # fmt: skip
+        database, opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED, save_rolls=True
+    )
     assert list(detections) == list(database.red) == [KEY]
     (sources,) = database.src[KEY] if kind == "real" else database.src[KEY].values()
     assert len(sources) == 1
@@ -253,5 +267,63 @@ def test_a_concatenation_from_frames_to_sources(
     image = fits.getdata(product)[0]
     brightest = np.unravel_index(np.nanargmax(image), image.shape)
     np.testing.assert_allclose(brightest, (y, x), atol=1.0)
+    paths = [product.with_name(f"{product.stem}_roll{k}.fits") for k in (1, 2)]
+    rolls = np.array([fits.getdata(path)[0] for path in paths])
+    assert fits.getheader(paths[0])["NINTS"] == 1
+    seen = np.isfinite(rolls).all(axis=0)
+    np.testing.assert_allclose(rolls.mean(axis=0)[seen], image[seen], rtol=1e-5, atol=1e-3)
+    assert np.abs(rolls[0] - rolls[1])[seen].max() > 10
     assert (product.parent / f"{KEY}.dat").exists()
     assert Detection.read(product.parent / f"ADI_NANNU1_NSUBS1_{KEY}").table["snr"][0] > 5
+
+
+@pytest.mark.slow
+def test_spaceklips_own_subtraction(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real_database: Any
+) -> None:
+    """`pyklippipeline.run_obs` with another algorithm; it does not run without references."""
+    pipeline = pytest.importorskip("spaceKLIP.pyklippipeline", exc_type=ImportError)
+    model, files = two_rolls(tmp_path, monkeypatch)
+    table = concatenation(files)
+    reference = concatenation(
+        [frame(tmp_path / "jw09_calints.fits", fits.getdata(files[0], "SCI")[0], 0.0)]
+    )
+    reference["TYPE"] = "REF"
+    table["ROLL_REF"], reference["ROLL_REF"] = SKY_ANGLES, [0.0]
+    real_database.obs[KEY] = vstack([table, reference])
+    monkeypatch.setattr(pipeline, "get_transmission", lambda *args: None, raising=False)
+    with backend(opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED):
+        pipeline.run_obs(
+            real_database,
+            kwargs={"mode": ["ADI+RDI"], "annuli": [1], "subsections": [1], "numbasis": [1],
+                    "algo": "diffrender", "save_rolls": True},
+            subdir="own",
+        )  # fmt: skip
+    (product,) = (tmp_path / "own").glob("*-KLmodes-all.fits")
+    assert fits.getheader(product)["DRALGO"] == "diffrender"
+    assert len(list((tmp_path / "own").glob("*_roll*.fits"))) == 2
+
+
+@pytest.mark.slow
+def test_spaceklips_own_injections_need_one_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tools = pytest.importorskip("spaceKLIP.analysistools", exc_type=ImportError)
+    model, files = two_rolls(tmp_path, monkeypatch)
+    options = {
+        "mode": "ADI", "annuli": 1, "subsections": 1, "numbasis": [1], "movement": 1,
+        "calibrate_flux": False, "highpass": False, "verbose": False, "outputdir": f"{tmp_path}/",
+    }  # fmt: skip
+    with backend(opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED):
+        dataset = JWST.JWSTData(files, None, highpass=False)
+        before = copy.deepcopy(dataset)
+        klip_dataset(dataset, fileprefix="once", **options)
+    monkeypatch.setattr(reduction, "subtract_by_refinement", None)
+    y, x = np.indices((25, 25)) - 12
+    peak = 1e-3 * FLUX * float(model(OPD.data, star_offset=(0.8, 0.0)).max())
+    with backend(injected_into=dataset):
+        _, _, injected, retrieved = tools.inject_and_recover(
+            before, np.exp(-(x**2 + y**2) / 2), np.array([8.0, 13.0]), np.array([20.0, 250.0]),
+            None, np.full(2, peak), {**options, "algo": "klip"}, 2.35,
+        )  # fmt: skip
+    np.testing.assert_allclose(retrieved[:, 0] / injected, 1.0, atol=0.1)

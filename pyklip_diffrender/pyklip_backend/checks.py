@@ -73,6 +73,8 @@ def check_arguments(arguments: Mapping[str, Any], references: tuple[Path, ...]) 
 
 def check_settings(settings: DiffrenderSettings) -> None:
     """Raise for settings of the default subtractor that it could not use."""
+    if settings.threads is not None and settings.threads < 1:
+        raise IncompatibleSetupError(f"threads: got {settings.threads}, expected 1 or more")
     if settings.subtractor is not None:
         return
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph

@@ -67,7 +67,17 @@ class FittedPointing:
         return box if box not in self.window and adjustable else self.window
 
     def star(self) -> Image:
-        """The star over all pixels that can be rendered, (ny, nx), NaN elsewhere."""
+        """The star over all pixels that can be rendered, (ny, nx), NaN elsewhere.
+
+        A fit ends where further steps gain less than the noise. How much of a faint planet it has
+        taken for star by then depends on where it stopped. So the last step of the linear model is
+        added, which is a small part of the noise, and after which every fit has taken as much as
+        the exact solution.
+        """
+        return self._fitted_star() + self._last_step()
+
+    def _fitted_star(self) -> Image:
+        """The star as the fit has left it."""
         group, window, box = self.pointing.observation, self.window, self.box
         if box is not window:
             star = self._rendered(box, None)
@@ -101,14 +111,26 @@ class FittedPointing:
         change = torch.where(star, change, 0.0)
         return np.asarray(linear.frames[self.index].image(change[:, None])[0].numpy())
 
-    def last_step(self) -> Image:
-        """What the linear model's solution adds to the star, (Ny, Nx), NaN elsewhere.
+    def change_in_frames(self, change: Tensor) -> Image:
+        """The same on the pixels of the frames, (Ny, Nx); only background outside the square."""
+        assert self.result.linear is not None
+        background = sum(
+            float(value)
+            for unknown, value in zip(self.result.linear.unknowns, change, strict=True)
+            if unknown.name == "background" and unknown.frame in (-1, self.index)
+        )
+        star = self.paste(self.change_of_star(change), self.window)
+        return np.where(np.isnan(star), background, star)
 
-        0 for a fit without a linear model.
-        """
-        linear = self.result.linear
-        change = np.zeros(self.window.shape) if linear is None else self.change_of_star(linear.step)
-        return self.paste(change, self.window)
+    def _last_step(self) -> Image:
+        """What the linear model's solution adds to the star, (Ny, Nx)."""
+        # Takes a second to import.
+        from pyklip_diffrender.refinement import Status
+
+        # Before a fit has converged, its linear model may not be good for so long a step.
+        if self.result.linear is None or self.result.status is Status.ITERATION_LIMIT:
+            return np.zeros(self.pointing.observation.shape)
+        return self.change_in_frames(self.result.linear.step)
 
     def source(self, offset: Image, box: Window) -> Image:
         """A source with the light of the star, on the pixels of a box as they were fitted.
@@ -153,6 +175,13 @@ class FittedPointing:
         return self.frame.render(
             fov_pixels=box.shape, center=(x, y), background=False, source=source
         )
+
+    def cut(self, image: Image) -> Image:
+        """Cut the fitted square out of a frame, as it was fitted: (ny, nx)."""
+        cut = self.window.cut(image[np.newaxis], 0.0)
+        if np.abs(self.away).max() > 0:
+            cut = shift_frames(cut, self.away[np.newaxis])
+        return np.asarray(cut[0])
 
     def paste(self, image: Image, box: Window) -> Image:
         """Move an image of a box back to where the frames have it: (Ny, Nx), NaN elsewhere."""

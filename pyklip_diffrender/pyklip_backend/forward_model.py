@@ -84,6 +84,11 @@ def check_forward_model(fm_class: Any, settings: DiffrenderSettings) -> None:
             "from itself. For KLIP, call pyklip.fm.klip_dataset outside the backend block, without "
             "algo='diffrender' and without register(replace=True)"
         )
+    if settings.injected_into is not None:
+        raise IncompatibleSetupError(
+            "injected_into: a planet is measured in a fit to the frames that show it. Call "
+            "pyklip.fm.klip_dataset outside the block with injected_into"
+        )
     if settings.subtractor is not None or isinstance(settings.fit, Adam):
         raise IncompatibleSetupError(
             "fm_class: the forward model of a planet needs the linear model of a fit by "

@@ -23,7 +23,6 @@ from pyklip_diffrender.pyklip_backend.placement import fill
 from pyklip_diffrender.pyklip_backend.planet_fit import planet_cards
 from pyklip_diffrender.pyklip_backend.reduction import Reduction
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
-from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["ForwardReduction"]
@@ -48,17 +47,6 @@ class ForwardReduction(Reduction):
     def _write_extras(self, stage: Path, cards: fits.Header) -> None:
         """Add what the fit says of the planet; the forward model says how much is left of it."""
         cards.extend(self._planet_cards)
-
-    def _star(self, subtraction: Subtraction) -> NDArray[np.float64]:
-        """The star of the linear model's solution.
-
-        A fit ends where further steps gain less than the noise. The forward model is that of the
-        exact solution, from which the fit may differ by as much as a faint planet changes it.
-        """
-        star = subtraction.star.copy()
-        for part in subtraction.pointings:
-            star[part.pointing.frames] += np.nan_to_num(part.last_step())
-        return star
 
     def _in_place_of_klip(
         self,
@@ -140,7 +128,13 @@ class ForwardReduction(Reduction):
             if len(self.records) == 1:
                 first = next(part for part in record.subtraction.pointings if part.index == 0)
                 k = int(first.pointing.frames[0])
-                self._planet_cards = planet_cards(first, planets[k], parangs[frames[k]], flipx)
+                self._planet_cards = planet_cards(
+                    first,
+                    planets[k],
+                    parangs[frames[k]],
+                    flipx,
+                    record.subtraction.error_factor,
+                )
             for k, planet in planets.items():
                 fill(planet.left, record.frames.observation.valid[k])
                 image = planet.left if self._filter is None else self._filter(planet.left)

@@ -16,6 +16,7 @@ from astropy.io import fits
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 
 if TYPE_CHECKING:
+    from pyklip_diffrender.detection.error_factor import ErrorFactor
     from pyklip_diffrender.pyklip_backend.forward_model import PlanetInFrame
 
 __all__ = ["planet_cards"]
@@ -24,7 +25,11 @@ logger = logging.getLogger(__name__)
 
 
 def planet_cards(
-    part: FittedPointing, planet: PlanetInFrame, angle: float, flipx: bool
+    part: FittedPointing,
+    planet: PlanetInFrame,
+    angle: float,
+    flipx: bool,
+    error_factor: ErrorFactor | None = None,
 ) -> fits.Header:
     """Flux and position of a planet with their errors, as cards for the products.
 
@@ -38,6 +43,8 @@ def planet_cards(
         Degrees counter-clockwise by which pyKLIP turns the pointing.
     flipx : bool
         See `pyklip.klip.rotate`.
+    error_factor : ErrorFactor, optional
+        By how much the errors are too small, by separation; 1 by default.
 
     Returns
     -------
@@ -66,6 +73,8 @@ def planet_cards(
         return cards
     covariance = sources.covariance.numpy().reshape(3, len(sources), 3, len(sources))[:, -1, :, -1]
     factor = error_inflation([part.result], groups, sources.offsets)
+    if error_factor is not None:
+        factor = max(factor, float(error_factor.of(sources.offsets[-1:])[0]))
     error = factor * np.sqrt(covariance[0, 0])
     snr = sources.contrasts[-1:] / error
     calibration = factor * float(calibration_errors(groups, sources.offsets[-1:], snr)[1, 0])
@@ -84,6 +93,7 @@ def planet_cards(
         float(np.hypot(error / planet.contrast, flux * calibration)),
         "standard deviation of DRFMFLUX",
     )
+    cards["DRFMFACT"] = (factor, "included factor for errors that are too small")
     for axis, name, value, deviation in zip(
         ("RA", "DE"), ("east", "north"), place, deviations, strict=True
     ):

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from astropy.io import fits
 from astropy.time import Time
 
@@ -68,12 +69,13 @@ def require_folder(folder: str | os.PathLike[str]) -> Path:
 
 @contextmanager
 def staging(folder: Path) -> Iterator[Path]:
-    """Temporary folder whose files are moved to `folder` if the block succeeds.
+    """Path of a temporary folder whose files are moved to `folder` if the block succeeds.
 
     It is inside `folder`, so that each move is one step on the same file system. If the block
-    raises, the files are deleted and `folder` is unchanged.
+    raises, the files are deleted and `folder` is unchanged. The block makes the folder when it has
+    something to write: a process that is killed during a long fit then leaves nothing behind.
     """
-    stage = Path(tempfile.mkdtemp(prefix=".diffrender-", dir=folder))
+    stage = folder / f".diffrender-{secrets.token_hex(6)}"
     try:
         yield stage
         for path in sorted(p for p in stage.rglob("*") if p.is_file()):
@@ -81,7 +83,8 @@ def staging(folder: Path) -> Iterator[Path]:
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(path, target)
     finally:
-        shutil.rmtree(stage)
+        if stage.exists():
+            shutil.rmtree(stage)
 
 
 def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
@@ -160,7 +163,26 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
             if plan is not None:
                 facts = ", ".join(f"{k[5:]} {v}" for k, v in plan.summary().items())
                 header.add_history(f"diffrender: planned: {facts}")
+        for line in _fitted(subtraction):
+            header.add_history(f"diffrender: {line}")
     return header
+
+
+def _fitted(subtraction: Subtraction) -> Iterator[str]:
+    """The settings of the fits, their companions, and the star of every pointing, in words."""
+    for result in dict.fromkeys(part.result for part in subtraction.pointings):
+        settings = result.settings
+        numbers = (f"{name} {getattr(settings, name, None)}" for name in ("cycles", "tolerance"))
+        yield f"fit: free {', '.join(getattr(settings, 'free', ()))}, {', '.join(numbers)}"
+        for contrast, x, y in result.companions:
+            yield f"companion: contrast {contrast:.3g} at x {x:.4f}, y {y:.4f} arcsec from the star"
+    for part in subtraction.pointings:
+        x, y = -part.from_star(np.zeros(2))
+        yield (
+            f"frames {', '.join(map(str, part.pointing.frames))}: star at x {x:+.4f}, y {y:+.4f} "
+            f"arcsec from its place in the file, flux {part.frame.flux:.6g}, background "
+            f"{float(part.frame.values['background'][0]):.4g}"
+        )
 
 
 def stamp(folder: Path, cards: fits.Header) -> None:

@@ -8,8 +8,10 @@ interface, and `high_pass_filter_imgs` by one that keeps the unfiltered frames f
 from __future__ import annotations
 
 import dataclasses
+import io
 import logging
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from pyklip_diffrender.pyklip_backend.checks import (
     check_settings,
 )
 from pyklip_diffrender.pyklip_backend.frames import Frames, date_of_frames, frames_of
+from pyklip_diffrender.pyklip_backend.injections import subtract_from_copy
 from pyklip_diffrender.pyklip_backend.placement import (
     aligned_before,
     annuli_of,
@@ -44,8 +47,12 @@ from pyklip_diffrender.pyklip_backend.references import (
     files_of_setup,
     library_files,
 )
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
-from pyklip_diffrender.pyklip_backend.subtract import Subtraction, subtract_by_refinement
+from pyklip_diffrender.pyklip_backend.settings import (
+    DiffrenderSettings,
+    starting_opd,
+    thread_limit,
+)
+from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.throughput import (
     on_product,
     throughput_map,
@@ -97,27 +104,30 @@ class Reduction:
             For bad input and failed fits. pyKLIP's own errors pass through.
         """
         self._check()
-        opd = starting_opd(self.settings, date_of_frames(self.dataset))
+        opd = self._opd()
         folder = require_folder(self.arguments["outputdir"])
         before = dict(vars(self.dataset))
-
-        def subtract(*args: Any, **kwargs: Any) -> tuple[Any, ...]:
-            return self._in_place_of_klip(opd, *args, **kwargs)
-
-        reduce = klip_dataset(
-            klip_parallelized=subtract,
-            klip_parallelized_lite=subtract,
-            high_pass_filter_imgs=self._high_pass,
-        )
         try:
-            with staging(folder) as stage:
+            with staging(folder) as stage, thread_limit(self.settings.threads):
+
+                def subtract(*args: Any, **kwargs: Any) -> tuple[Any, ...]:
+                    subtracted = self._in_place_of_klip(opd, *args, **kwargs)
+                    stage.mkdir(exist_ok=True)
+                    return subtracted
+
+                reduce = klip_dataset(
+                    klip_parallelized=subtract,
+                    klip_parallelized_lite=subtract,
+                    high_pass_filter_imgs=self._high_pass,
+                )
                 reduce(**{**self.arguments, "outputdir": str(stage)})
                 cards = provenance(self.records)
                 self._write_extras(stage, cards)
                 stamp(stage, cards)
-        except BaseException:
+        except BaseException as error:
             vars(self.dataset).clear()
             vars(self.dataset).update(before)
+            _say_on_screen(error)
             raise
         setattr(self.dataset, RESULTS, tuple(self.records))
         logger.info("products of %r are in %s", self.arguments["fileprefix"], folder)
@@ -136,6 +146,26 @@ class Reduction:
                 "star cannot be fitted to filtered frames. Make the dataset again, or give each "
                 "call with highpass=True its own copy.deepcopy(dataset)"
             )
+
+        if self.settings.injected_into is not None:
+            count, expected = len(self._before_injection), len(np.unique(dataset.wvs))
+            if count != expected:
+                raise IncompatibleSetupError(
+                    f"injected_into: it was reduced at {count} wavelengths, and this dataset has "
+                    f"{expected}. Reduce it with algo='diffrender' before sources are added"
+                )
+
+    def _opd(self) -> OPDMap:
+        """The wavefront map to start from."""
+        before = self._before_injection
+        if before:
+            return before[0].opd
+        return starting_opd(self.settings, date_of_frames(self.dataset))
+
+    @property
+    def _before_injection(self) -> Sequence[ReductionRecord]:
+        """How the dataset was reduced of which this one is a copy with faint sources."""
+        return getattr(self.settings.injected_into, RESULTS, ())
 
     @property
     def _rdi(self) -> bool:
@@ -231,8 +261,10 @@ class Reduction:
     def _write_extras(self, stage: Path, cards: fits.Header) -> None:
         """Write what pyKLIP does not: the throughput map, with its median in all products.
 
-        Fits without a linear model have none.
+        Fits without a linear model have none, and copies with added sources that of the original.
         """
+        if self._before_injection:
+            return
         results = [fit.result for record in self.records for fit in record.subtraction.fits]
         linear = all(getattr(result, "linear", None) is not None for result in results)
         if not linear or len(results) != len(self.records):
@@ -280,7 +312,10 @@ class Reduction:
     ) -> NDArray[np.float64]:
         """Frames minus their star, (m, ny, nx), high-pass filtered if the call asks for it."""
         observation = frames.observation
-        if settings.subtractor is not None:
+        before = self._before_injection
+        if before:
+            subtraction = subtract_from_copy(before[len(self.records)], frames)
+        elif settings.subtractor is not None:
             subtraction = settings.subtractor(observation, opd, settings)
         else:
             files = self._reference_files()
@@ -300,7 +335,7 @@ class Reduction:
             raise ShapeError(
                 f"star: got shape {subtraction.star.shape}, expected {frames.data.shape}"
             )
-        residuals = frames.data - self._star(subtraction)
+        residuals = frames.data - subtraction.star
         lost = ~np.any(np.isfinite(residuals) & observation.valid, axis=(1, 2))
         if lost.any():
             raise RefinementError(
@@ -314,9 +349,14 @@ class Reduction:
             residuals = np.array([self._filter(residual) for residual in residuals])
         return residuals
 
-    def _star(self, subtraction: Subtraction) -> NDArray[np.float64]:
-        """What is subtracted from the frames, (m, ny, nx)."""
-        return subtraction.star
+
+def _say_on_screen(error: BaseException) -> None:
+    """Print an error while stderr goes to memory.
+
+    spaceKLIP does that while it injects sources, so that nobody would see what ended the program.
+    """
+    if isinstance(sys.stderr, io.StringIO) and sys.__stderr__ is not None:
+        print(f"diffrender: {type(error).__name__}: {error}", file=sys.__stderr__)
 
 
 def mark_filtered(dataset: Any) -> None:

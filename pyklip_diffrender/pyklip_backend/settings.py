@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -31,7 +32,14 @@ if TYPE_CHECKING:
     from pyklip_diffrender.planning import Plan
     from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
 
-__all__ = ["ATTRIBUTE", "DiffrenderSettings", "OPDLike", "settings_of", "starting_opd"]
+__all__ = [
+    "ATTRIBUTE",
+    "DiffrenderSettings",
+    "OPDLike",
+    "settings_of",
+    "starting_opd",
+    "thread_limit",
+]
 
 OPDLike: TypeAlias = "str | os.PathLike[str] | NDArray[np.floating[Any]] | u.Quantity | OPDMap"
 """A wavefront map: a FITS file, an array in metres, a Quantity, or what `read_opd` returns."""
@@ -95,6 +103,12 @@ class DiffrenderSettings:
     max_chi2 : float, optional
         Reduced chi-squared above which a fit is implausible and the reduction stops with a
         `RefinementError`; 100 by default, inf for no limit.
+    injected_into : pyklip.instruments.Instrument.Data, optional
+        A dataset that has been reduced. Those of the calls are copies of it to which faint sources
+        were added; the star is not fitted to them again, but what it takes of the sources follows
+        from the linear model of the fit. For contrast curves by injection.
+    threads : int, optional
+        Number of threads of a reduction; PyTorch's choice by default. 1 is best on a busy machine.
     model_options : mapping, optional
         Further keywords of `nircam_coronagraph`, such as ``npix`` and ``nlambda``.
     subtractor : Subtractor, optional
@@ -116,6 +130,8 @@ class DiffrenderSettings:
     plan: Plan | str | None = None
     keep_detected: bool | None = None
     max_chi2: float | None = None
+    injected_into: Any = None
+    threads: int | None = None
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
 
@@ -150,6 +166,23 @@ def settings_of(dataset: Any) -> DiffrenderSettings:
             f"Set dataset.{ATTRIBUTE} = DiffrenderSettings(opd=...)"
         )
     return own
+
+
+@contextmanager
+def thread_limit(count: int | None) -> Iterator[None]:
+    """Limit PyTorch to a number of threads within a block; None for its own choice."""
+    if count is None:
+        yield
+        return
+    # Takes a second to import.
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:

@@ -26,6 +26,7 @@ from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:
+    from pyklip_diffrender.detection.error_factor import ErrorFactor
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.refinement import Refinement
 
@@ -82,6 +83,8 @@ class Subtraction:
         Number of frames of reference stars that were used.
     pointings : tuple of FittedPointing
         The parts of the fits, one for each pointing; empty for other subtractors.
+    error_factor : ErrorFactor, optional
+        By how much the S/N scatters more than it should, if companions were searched.
     """
 
     star: NDArray[np.float64]
@@ -91,6 +94,7 @@ class Subtraction:
     systematics: str = "none"
     references: int = 0
     pointings: tuple[FittedPointing, ...] = ()
+    error_factor: ErrorFactor | None = None
 
     @property
     def worst(self) -> Fit:
@@ -196,9 +200,9 @@ def subtract_by_refinement(
         require_plausible(name, result, settings.max_chi2)
         tell(f"{_described(result)}, {result.seconds:.0f} s")
         results.append(result)
-    keep = settings.keep_detected
+    keep, error_factor = settings.keep_detected, None
     if (observation.is_nircam and not adam) if keep is None else keep:
-        results = _with_companions(results, tell)
+        results, error_factor = _with_companions(results, tell)
     star = np.full(observation.data.shape, np.nan)
     fits, fitted = [], []
     for chosen, result in zip(together, results, strict=True):
@@ -220,6 +224,7 @@ def subtract_by_refinement(
         pattern.label,
         pattern.reference_frames,
         tuple(fitted),
+        error_factor,
     )
 
 
@@ -232,8 +237,13 @@ def _counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def _with_companions(results: list[Refinement], tell: Callable[[str], None]) -> list[Refinement]:
-    """Refine again with the companions that are detected in all fits together."""
+def _with_companions(
+    results: list[Refinement], tell: Callable[[str], None]
+) -> tuple[list[Refinement], ErrorFactor]:
+    """Refine again with the companions that are detected in all fits together.
+
+    Also by how much the errors of the search are too small.
+    """
     from pyklip_diffrender.detection import detect
     from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
 
@@ -244,11 +254,11 @@ def _with_companions(results: list[Refinement], tell: Callable[[str], None]) -> 
     number = _counted(len(detection.candidates), "companion")
     if not lacks_candidates(results, detection.candidates):
         tell(f"{number} detected, as many as the fit has")
-        return results
+        return results, detection.error_factor
     tell(f"{number} detected, {len(results[0].companions)} in the fit: the star is fitted again")
     results = with_companions(results, detection.candidates)
     tell(_described(results[0]))
-    return results
+    return results, detection.error_factor
 
 
 def model_of(observation: Observation, settings: DiffrenderSettings) -> OpticalSystem:

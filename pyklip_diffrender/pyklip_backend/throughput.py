@@ -3,23 +3,33 @@
 A source adds its image p to the data. Most of it is unlike anything that the wavefront can do to
 the star, but some is fitted as starlight, and subtracted. To first order the unknowns of the fit
 change by H^-1 G p, where G is the whitened Jacobian and H the curvature of the penalised
-chi-squared (see `linear.model`), and the star by the image of that change. What is left, measured
-as a fit of p to the subtracted frame does, is 1 - p . change / p . p.
+chi-squared (see `linear.model`), and the star by the image of that change.
+
+The star takes more of a source's wings than of its core, so that the fraction that is left depends
+on how the source is measured. Here it is the fraction of the peak: 1 - g . change / g . p with a
+Gaussian g of half the width of the source. `pyklip.fakes.gaussfit2d`, by which pyKLIP and spaceKLIP
+measure injected sources, adapts its Gaussian to the narrower core that is left, and agrees with
+this within 2 % (1 sigma) on NIRCam frames; a fit of the whole image would have about 18 % less.
 """
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from astropy.io import fits
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
 
+from pyklip_diffrender.io.units import ARCSEC
+
 if TYPE_CHECKING:
+    from pyklip_diffrender.detection.templates import Templates
+    from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["on_product", "throughput_map", "write_throughput"]
@@ -31,11 +41,17 @@ interpolated."""
 _DENSE = 5
 """Pixels about a companion of the fit within which every pixel is computed."""
 
+_INNER = 15
+"""The same about the star, where interpolation would err by up to 15 %."""
+
+_CORE = 0.5
+"""FWHM in lambda/D of the Gaussian with which a source's peak is measured."""
+
 _BATCH = 256
 
 
 def throughput_map(fit: Refinement, spacing: int = SPACING) -> NDArray[np.float64]:
-    """Fraction of a faint source's light that is left, on the pixels of the fit's first frame.
+    """Fraction of a faint source's peak that is left, on the pixels of the fit's first frame.
 
     Companions of the fit are part of its model, so that no light at their places becomes star.
 
@@ -44,7 +60,8 @@ def throughput_map(fit: Refinement, spacing: int = SPACING) -> NDArray[np.float6
     fit : Refinement
         With a linear model.
     spacing : int
-        Pixels between the computed positions.
+        Pixels between the computed positions; next to the star and to companions every pixel is
+        computed.
 
     Returns
     -------
@@ -60,16 +77,16 @@ def throughput_map(fit: Refinement, spacing: int = SPACING) -> NDArray[np.float6
     coarse = _at(fit, templates, y.ravel(), x.ravel()).reshape(y.shape)
     every = np.moveaxis(np.indices((ny, nx)), 0, -1)
     filled = np.asarray(RegularGridInterpolator((rows, columns), coarse)(every))
+    pixel = math.sqrt(math.prod(fit.model.detector.pixelscale))
+    dense = np.hypot(*templates.grid.transpose(2, 0, 1)) <= _INNER * pixel
     for _, *offset in fit.companions:
-        distance = np.hypot(*(templates.grid - offset).transpose(2, 0, 1))
-        pixel = math.sqrt(math.prod(fit.model.detector.pixelscale))
-        near = np.nonzero(distance <= _DENSE * pixel)
-        filled[near] = _at(fit, templates, *near)
+        dense |= np.hypot(*(templates.grid - offset).transpose(2, 0, 1)) <= _DENSE * pixel
+    filled[dense] = _at(fit, templates, *np.nonzero(dense))
     return filled
 
 
 def _at(
-    fit: Refinement, templates: Any, rows: NDArray[np.int64], columns: NDArray[np.int64]
+    fit: Refinement, templates: Templates, rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """The throughput of sources at pixels of the first frame."""
     assert fit.linear is not None
@@ -78,20 +95,32 @@ def _at(
     for start in range(0, len(rows), _BATCH):
         part = slice(start, start + _BATCH)
         images = templates.at_pixels(rows[part], columns[part])
+        offsets = torch.from_numpy(templates.grid[rows[part], columns[part]])
         change = fit.linear.response(images)
         change[~star] = 0.0
-        taken, total = np.zeros(len(rows[part])), 0.0
+        taken, total = np.zeros(len(offsets)), 0.0
         for k, image in images.items():
-            frame = fit.linear.frames[k]
-            seen = image.double() * (frame.weight > 0)
-            # Where a frame does not show the source, nothing of it is taken.
-            whole = (seen**2).sum(dim=(1, 2)).clamp(min=1e-300)
-            share = (seen * frame.image(change)).sum(dim=(1, 2)) / whole
+            core = _cores(fit.frames[k].model, templates.pixels_of(k, offsets))
+            peak = np.einsum("kyx,kyx->k", core, image.numpy())
+            share = np.einsum("kyx,kyx->k", core, fit.linear.frames[k].image(change).numpy())
             count = len(fit.frames[k].observation)
-            taken += count * np.where(whole.numpy() > 1e-300, share.numpy(), 0.0)
+            # Where a frame does not show the source, nothing of it is taken.
+            taken += count * np.divide(share, peak, out=np.zeros_like(share), where=peak > 0)
             total += count
         left[part] = 1 - taken / total
     return left
+
+
+def _cores(model: OpticalSystem, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gaussians narrower than an image of a source, about rows and columns (2, k): (k, ny, nx)."""
+    detector = model.detector
+    pixel = math.sqrt(math.prod(detector.pixelscale))
+    fwhm = _CORE * model.bandpass.mean_wavelength / model.diameter / ARCSEC / pixel
+    y, x = (
+        np.exp(-4 * math.log(2) * ((np.arange(count) - place[:, None]) / fwhm) ** 2)
+        for count, place in zip(detector.shape, places, strict=True)
+    )
+    return np.asarray(y[:, :, None] * x[:, None, :])
 
 
 def on_product(
@@ -129,14 +158,14 @@ def write_throughput(path: Path, maps: NDArray[np.float64], center: NDArray[np.f
     """Write maps (wavelengths, ny, nx), on the pixels of the products, to a FITS file."""
     cube = maps[0] if len(maps) == 1 else maps
     hdu = fits.PrimaryHDU(cube.astype(np.float32))
-    hdu.header["BUNIT"] = ("", "fraction of a faint point source's light")
+    hdu.header["BUNIT"] = ("", "fraction of a faint point source's peak")
     hdu.header["PSFCENTX"], hdu.header["PSFCENTY"] = center
     hdu.header["STARCENX"], hdu.header["STARCENY"] = center[0] + 1, center[1] + 1
     hdu.header["DRTHSTEP"] = (SPACING, "pixels between computed positions")
     hdu.header.add_comment(
-        "Fraction of a faint point source's light that the subtraction leaves, to first order in "
+        "Fraction of a faint point source's peak that the subtraction leaves, to first order in "
         "its light, before any high-pass filter. Computed at every DRTHSTEP pixels and next to "
-        "companions of the fit, interpolated elsewhere; 1 outside the fitted square. Detected "
-        "companions that are in the model (DRKEPT) keep their light."
+        "the star and companions of the fit, interpolated elsewhere; 1 outside the fitted square. "
+        "Detected companions that are in the model (DRKEPT) keep their light."
     )
     hdu.writeto(path)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import warnings
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -12,7 +16,14 @@ from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.pyklip_backend.throughput import on_product
 
-__all__ = ["complete_header", "write_contrast", "write_database", "write_mask", "write_snr"]
+__all__ = [
+    "complete_header",
+    "write_contrast",
+    "write_database",
+    "write_mask",
+    "write_rolls",
+    "write_snr",
+]
 
 _COLUMNS = (
     "TELESCOP", "TARGPROP", "TARG_RA", "TARG_DEC", "INSTRUME", "DETECTOR", "FILTER", "CWAVEL",
@@ -54,6 +65,31 @@ def complete_header(product: Path, table: Table, mode: str) -> None:
             header[f"CRVAL{axis}"] = frame[f"CRVAL{axis}"]
             for other in (1, 2):
                 header[f"CD{axis}_{other}"] = sign * degrees if other == axis else 0.0
+
+
+def write_rolls(product: Path, dataset: Any, files: Iterable[str | os.PathLike[str]]) -> None:
+    """Write the subtracted frames of every file, their median, beside the product of all.
+
+    Parameters
+    ----------
+    product : path
+        Its header is that of the rolls, too.
+    dataset : JWSTData
+        The reduced dataset.
+    files : iterable of path
+        Of the target; all frames of one have the same roll.
+    """
+    header = fits.getheader(product)
+    names = [Path(str(name)).name for name in dataset.filenames]
+    for number, file in enumerate(files, 1):
+        own = [k for k, name in enumerate(names) if name.startswith(Path(file).name)]
+        header["NINTS"] = len(own)
+        with warnings.catch_warnings():
+            # Pixels without a value in any frame.
+            warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
+            images = np.nanmedian(dataset.output[:, own], axis=(1, 2))
+        path = product.with_name(f"{product.stem}_roll{number}.fits")
+        write_fits(fits.HDUList([fits.PrimaryHDU(images.astype(np.float32), header)]), path)
 
 
 def write_snr(path: Path, detection: Detection, product: Path) -> None:

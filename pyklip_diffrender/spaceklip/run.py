@@ -20,6 +20,7 @@ from pyklip_diffrender.spaceklip.products import (
     write_contrast,
     write_database,
     write_mask,
+    write_rolls,
     write_snr,
 )
 from pyklip_diffrender.spaceklip.sources import source_table
@@ -57,6 +58,7 @@ def run_obs(
     restrict_to: str | None = None,
     subdir: str = "diffrender",
     threshold: float = 5.0,
+    save_rolls: bool = False,
     verbose: bool = False,
     **settings: Any,
 ) -> dict[str, Detection]:
@@ -80,6 +82,8 @@ def run_obs(
         Folder of the products in ``database.output_dir``.
     threshold : float
         S/N of a candidate.
+    save_rolls : bool
+        Also write the subtracted image of each file, with `_roll1` and so on after its name.
     verbose : bool
         Print what is being done.
     **settings
@@ -121,8 +125,9 @@ def run_obs(
         logger.info("concatenation %s", key)
         try:
             products[key], detections[key] = _reduced(
-                key, table, folder, threshold, {"opd": opd, "verbose": verbose, **settings}
-            )
+                key, table, folder, threshold, save_rolls,
+                {"opd": opd, "verbose": verbose, **settings},
+            )  # fmt: skip
         except Exception as error:  # Reported after the other concatenations.
             logger.exception("concatenation %s failed", key)
             error.add_note(f"concatenation {key}")
@@ -154,7 +159,12 @@ def why_unsupported(table: Table) -> str | None:
 
 
 def _reduced(
-    key: str, table: Table, folder: Path, threshold: float, settings: dict[str, Any]
+    key: str,
+    table: Table,
+    folder: Path,
+    threshold: float,
+    save_rolls: bool,
+    settings: dict[str, Any],
 ) -> tuple[Path, Detection]:
     """Reduce one concatenation and write its files; the path of the product."""
     kinds = np.array(table["TYPE"], dtype=str)
@@ -168,6 +178,8 @@ def _reduced(
     detection = detect(fits, threshold=threshold)
     product = folder / f"{prefix}-KLmodes-all.fits"
     complete_header(product, table, mode)
+    if save_rolls:
+        write_rolls(product, dataset, files[kinds == "SCI"])
     write_snr(folder / f"{prefix}-snr.fits", detection, product)
     write_contrast(product, detection)
     detection.write(folder / prefix)
