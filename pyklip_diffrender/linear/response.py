@@ -289,6 +289,11 @@ class Responses:
         they are needed, the oldest first, about the same wavefront.
     progress : bool
         Show progress bars.
+
+    Attributes
+    ----------
+    farthest : float
+        Largest change of the field at which a response was used; set it to 0 to begin anew.
     """
 
     def __init__(
@@ -310,6 +315,7 @@ class Responses:
         self._slopes: tuple[Tensor, dict[str, Tensor], dict[str, list[Tensor]]] | None = None
         self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
         self._coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
+        self.farthest = 0.0
 
     def parameters(
         self,
@@ -344,7 +350,9 @@ class Responses:
         """Return the stored response for nearly the same field, or compute it."""
         inside = opd[self.model.entrance.lit]
         for opd_then, values_then, response in reversed(self._kept):
-            if self._change(inside - opd_then, values, values_then) <= self.relinearise:
+            change = self._change(inside - opd_then, values, values_then)
+            if change <= self.relinearise:
+                self.farthest = max(self.farthest, change)
                 return response
             del response  # Or its memory could not be freed.
         # Memory is freed first, because the new response is as large as the old one.

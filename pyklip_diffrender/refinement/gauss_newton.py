@@ -34,6 +34,11 @@ _TRIES = 7
 _RESPONSES = 4e9
 """Largest number of bytes of stored derivatives."""
 
+_ACCURATE = 0.05
+"""Value of `GaussNewton.relinearise` with which a step is repeated if it fails or is the last. With
+derivatives from farther away, fits of bright stars stopped at a chi-squared that was up to a fifth
+too large."""
+
 _IMPROBABLE = 1.5
 """Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
 
@@ -82,7 +87,7 @@ class Solver:
             )
         jacobians = 4.0 * len(problems) * (len(basis) + settings.prior.amplitude_modes(basis))
         jacobians *= math.prod(problems[0].observation.shape)
-        responses = Responses(
+        self._responses = responses = Responses(
             problems[0].model,
             basis,
             npix=settings.response_npix,
@@ -180,9 +185,21 @@ class Solver:
         gain : float
             Decrease, or expected decrease, of the penalised chi-squared per pixel.
         """
+        taken = self._try_step(state, kappa, modes)
+        if taken is None:
+            allowed, self._responses.relinearise = self._responses.relinearise, _ACCURATE
+            taken = self._try_step(state, kappa, modes)
+            self._responses.relinearise = allowed
+        assert taken is not None
+        return taken
+
+    def _try_step(self, state: State, kappa: float, modes: int) -> tuple[State, float] | None:
+        """Take a step; None if it fails, or is the last, with derivatives from too far away."""
         layout, objective = state.joint, self.objective
         self._equations = None  # The next ones are as large.
+        self._responses.farthest = 0.0
         equations = self._equations = linearise(objective, state, kappa, modes, objective.robust)
+        far = self._responses.farthest > _ACCURATE
         weights = objective.weights(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else self.damping
@@ -190,6 +207,8 @@ class Solver:
         self.scales = update.scales
         expected = self._predicted_gain(layout, equations, update.step)
         if expected < self.settings.tolerance * objective.pixels:
+            if far:
+                return None
             # The gain is too small for another linearisation.
             return state, expected / objective.pixels
         before = self._cost(state, weights)
@@ -205,6 +224,8 @@ class Solver:
             if after < before:
                 self._relax((before - after) / expected)
                 return trial, (before - after) / objective.pixels
+            if far:
+                return None
             self.damping = max(6 * self.damping, 0.05)
         return state, 0.0
 
