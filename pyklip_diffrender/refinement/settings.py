@@ -75,7 +75,8 @@ class GaussNewton:
         pixel. It is added in quadrature to the noise.
     relinearise : float
         Relative change of the pupil field (rms; radians for a phase) beyond which the response to
-        the wavefront is recomputed, see `pyklip_diffrender.linear.response.Responses`.
+        the wavefront is recomputed, see `pyklip_diffrender.linear.response.Responses`. A step that
+        fails, or is the last, is repeated with a response from within 0.05.
     robust : float
         Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain
         least squares.
