@@ -39,6 +39,10 @@ _ACCURATE = 0.05
 derivatives from farther away, fits of bright stars stopped at a chi-squared that was up to a fifth
 too large."""
 
+_WORTHWHILE = 0.005
+"""Gain in chi-squared per pixel of a repeated step below which, with this model error, no further
+step is repeated. Where the model cannot explain the data, steps gain little for many iterations."""
+
 _IMPROBABLE = 1.5
 """Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
 
@@ -117,6 +121,7 @@ class Solver:
             scales += [own_prior.scales[name] for name in basis.groups]
         self.scales = torch.tensor(scales, dtype=torch.float64)
         self.damping = 0.0
+        self._exhausted = math.nan
         self._equations: NormalEquations | None = None
 
     def first_layout(self) -> JointLayout:
@@ -185,21 +190,28 @@ class Solver:
         gain : float
             Decrease, or expected decrease, of the penalised chi-squared per pixel.
         """
-        taken = self._try_step(state, kappa, modes)
+        taken = self._try_step(state, kappa, modes, repeats=kappa != self._exhausted)
         if taken is None:
             allowed, self._responses.relinearise = self._responses.relinearise, _ACCURATE
-            taken = self._try_step(state, kappa, modes)
+            taken = self._try_step(state, kappa, modes, repeats=False)
             self._responses.relinearise = allowed
-        assert taken is not None
+            assert taken is not None
+            if taken[1] < _WORTHWHILE:
+                self._exhausted = kappa
         return taken
 
-    def _try_step(self, state: State, kappa: float, modes: int) -> tuple[State, float] | None:
-        """Take a step; None if it fails, or is the last, with derivatives from too far away."""
+    def _try_step(
+        self, state: State, kappa: float, modes: int, repeats: bool
+    ) -> tuple[State, float] | None:
+        """Take a step.
+
+        None if it fails, or is the last, with derivatives from far away, and may be repeated.
+        """
         layout, objective = state.joint, self.objective
         self._equations = None  # The next ones are as large.
         self._responses.farthest = 0.0
         equations = self._equations = linearise(objective, state, kappa, modes, objective.robust)
-        far = self._responses.farthest > _ACCURATE
+        far = repeats and self._responses.farthest > _ACCURATE
         weights = objective.weights(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else self.damping
