@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -225,6 +226,20 @@ def test_the_summary_holds_what_provenance_needs(bright: Case, fit: Refinement) 
     assert summary["seconds"] > 0
     assert "CONVERGED, 1 frame, chi2/pixel" in repr(fit)
     assert "test star" in repr(fit.frames[0])
+
+
+def test_a_pickled_fit_is_the_same_fit(plain: Refinement) -> None:
+    assert plain.linear is not None
+    written = pickle.dumps(plain)
+    again = pickle.loads(written)
+    np.testing.assert_array_equal(again.frames[0].star, plain.frames[0].star)
+    images = [
+        each.model(each.wavefront, **each.frames[0].optical_values) for each in (again, plain)
+    ]
+    assert torch.equal(*images)
+    assert torch.equal(again.linear.covariance, plain.linear.covariance)
+    # What these calls have cached is not written.
+    assert len(pickle.dumps(plain)) < 1.01 * len(written) < 25e6
 
 
 def test_a_wavefront_in_nanometres_is_the_same_start(tiny: Case) -> None:

@@ -24,9 +24,9 @@ with the weights W c. The frames' `common` is c.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -90,6 +90,10 @@ class LinearModel:
         return (
             f"<LinearModel: {len(self.unknowns)} unknowns, {len(self.frames)} x {ny} x {nx} pixels>"
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Without what is cached, which can be computed again and is larger than the rest.
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
     def shares_pattern(self) -> bool:
