@@ -217,6 +217,19 @@ def test_the_parameter_table_has_values_errors_and_units(fit: Refinement) -> Non
     assert "arcsec" not in str(rows["flux"]["unit"])
 
 
+def test_the_parameters_are_readable_on_80_columns(
+    fit: Refinement, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    table = fit.parameters
+    header, _, *lines = str(table).splitlines()
+    assert header.split() == list(table.colnames)
+    assert max(map(len, lines)) <= 80
+    for row, line in zip(table, lines, strict=True):
+        assert line.split()[1:4] == [row["name"], f"{row['value']:.5g}", f"{row['error']:.5g}"]
+    assert max(map(len, table["description"])) > 70
+
+
 def test_the_summary_holds_what_provenance_needs(bright: Case, fit: Refinement) -> None:
     summary = fit.summary()
     assert summary["method"] == "gauss-newton"

@@ -200,7 +200,10 @@ class Refinement:
 
     @property
     def parameters(self) -> QTable:
-        """All parameters but the wavefront: frame, name, value, error, unit and description."""
+        """All parameters but the wavefront: frame, name, value, error, unit and description.
+
+        Only the beginning of a description is printed; the column has all of it.
+        """
         rows = []
         for k, frame in enumerate(self.frames):
             for name, value in frame.values.items():
@@ -215,6 +218,8 @@ class Refinement:
         )
         for name in ("value", "error"):
             table[name].info.format = ".5g"
+        # Whole ones leave no room for the values in a terminal of 80 columns.
+        table["description"].info.format = "26.26s"
         return table
 
     def write(self, path: str | os.PathLike[str], *, linear: bool = True) -> Path:
@@ -244,7 +249,9 @@ class Refinement:
             primary.header[f"HIERARCH {key.upper()}"] = (
                 value if not isinstance(value, float) or math.isfinite(value) else str(value)
             )
-        hdus = fits.HDUList([primary, fits.BinTableHDU(self.parameters, name="PARAMETERS")])
+        parameters = self.parameters
+        parameters["description"].info.format = None  # FITS has no such format.
+        hdus = fits.HDUList([primary, fits.BinTableHDU(parameters, name="PARAMETERS")])
         parts = [frame.to_hdus(k) for k, frame in enumerate(self.frames)]
         for _, extensions in parts:
             hdus.extend(extensions)
