@@ -76,6 +76,18 @@ class LinearModel:
         Mean and standard deviation of the priors; inf for no prior.
     curvature : Tensor, (unknowns, unknowns)
         G G^T over all frames (J C^-1 J^T where they share a pattern), float64.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> fit.linear
+    <LinearModel: 173 unknowns, 1 x 32 x 32 pixels>
+    >>> fit.linear.covariance.shape
+    torch.Size([173, 173])
     """
 
     unknowns: tuple[Unknown, ...]

@@ -101,6 +101,20 @@ class Refinement:
         One entry for each iteration.
     seconds : float
     seed : int
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> fit.status.usable
+    True
+    >>> fit.frames[0].star.shape
+    (32, 32)
+    >>> path = fit.write("fit.fits")  # doctest: +SKIP
+    >>> fit = dr.Refinement.read(path)  # doctest: +SKIP
     """
 
     frames: tuple[FrameFit, ...]
