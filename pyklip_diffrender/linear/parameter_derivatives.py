@@ -47,8 +47,9 @@ def field_derivatives(
         return {}
     # Constants are not kept within a transform, so the model makes them here.
     with torch.no_grad():
+        at = model.values(values)
         for wavelength in model.bandpass.wavelengths:
-            model.propagate(model.pupil_field(opd, wavelength, values), values)
+            model.propagate(model.pupil_field(model.opd(opd), wavelength, at), at)
 
     def fields(varied: dict[str, Tensor]) -> list[Tensor]:
         # Complex outputs of jacfwd would need complex inputs.
