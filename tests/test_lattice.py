@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from functools import partial
 from typing import Any
 
@@ -351,6 +352,15 @@ def test_every_kind_of_derivative_is_that_of_the_planes(opd: torch.Tensor) -> No
 
     for mine, truth in zip(found(fast), found(planes), strict=True):
         assert float((mine - truth).abs().max() / truth.abs().max()) < 1e-6
+
+
+def test_a_model_keeps_nothing_of_a_transform(opd: torch.Tensor) -> None:
+    model = system()
+    image = model(opd)
+    torch.func.jvp(model, (opd,), (opd,))
+    assert torch.equal(model(opd), image)
+    # What a transform has wrapped cannot be pickled.
+    assert torch.equal(pickle.loads(pickle.dumps(model))(opd), image)
 
 
 def test_single_precision_by_convolution(opd: torch.Tensor) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -221,6 +222,19 @@ def test_the_parameter_table_has_values_errors_and_units(fit: Refinement) -> Non
     assert "arcsec" not in str(rows["flux"]["unit"])
 
 
+def test_the_parameters_are_readable_on_80_columns(
+    fit: Refinement, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    table = fit.parameters
+    header, _, *lines = str(table).splitlines()
+    assert header.split() == list(table.colnames)
+    assert max(map(len, lines)) <= 80
+    for row, line in zip(table, lines, strict=True):
+        assert line.split()[1:4] == [row["name"], f"{row['value']:.5g}", f"{row['error']:.5g}"]
+    assert max(map(len, table["description"])) > 70
+
+
 def test_the_summary_holds_what_provenance_needs(bright: Case, fit: Refinement) -> None:
     summary = fit.summary()
     assert summary["method"] == "gauss-newton"
@@ -230,6 +244,20 @@ def test_the_summary_holds_what_provenance_needs(bright: Case, fit: Refinement) 
     assert summary["seconds"] > 0
     assert "CONVERGED, 1 frame, chi2/pixel" in repr(fit)
     assert "test star" in repr(fit.frames[0])
+
+
+def test_a_pickled_fit_is_the_same_fit(plain: Refinement) -> None:
+    assert plain.linear is not None
+    written = pickle.dumps(plain)
+    again = pickle.loads(written)
+    np.testing.assert_array_equal(again.frames[0].star, plain.frames[0].star)
+    images = [
+        each.model(each.wavefront, **each.frames[0].optical_values) for each in (again, plain)
+    ]
+    assert torch.equal(*images)
+    assert torch.equal(again.linear.covariance, plain.linear.covariance)
+    # What these calls have cached is not written.
+    assert len(pickle.dumps(plain)) < 1.01 * len(written) < 25e6
 
 
 def test_a_wavefront_in_nanometres_is_the_same_start(tiny: Case) -> None:

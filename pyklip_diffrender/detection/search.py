@@ -192,6 +192,18 @@ def measure(
     IncompatibleSetupError
         See `detect`; also for a position outside the field.
     NonFiniteError, ShapeError, UnitError
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> scene = dr.Scene(planets=(dr.Planet.from_offset(1e-4, 0.3, -0.5),))
+    >>> frame = dr.simulate(model, scene, opd, seed=3)
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> table = dr.measure(fit, [[0.3, -0.5]])
+    >>> print(f"{table['contrast'][0]:.1e}")
+    1.0e-04
     """
     fits = _checked(fits)
     _require_positive(scatter=scatter, sigmas=sigmas)
@@ -255,6 +267,17 @@ def contrast_curve(
     ------
     IncompatibleSetupError
         See `detect`; also if no pixel is at any of the separations.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> curve = dr.contrast_curve(fit, [0.4, 0.8])
+    >>> bool(curve["contrast"][0] > curve["contrast"][1])
+    True
     """
     fits = _checked(fits)
     _require_positive(scatter=scatter)

@@ -24,9 +24,9 @@ with the weights W c. The frames' `common` is c.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -76,6 +76,18 @@ class LinearModel:
         Mean and standard deviation of the priors; inf for no prior.
     curvature : Tensor, (unknowns, unknowns)
         G G^T over all frames (J C^-1 J^T where they share a pattern), float64.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> fit.linear
+    <LinearModel: 173 unknowns, 1 x 32 x 32 pixels>
+    >>> fit.linear.covariance.shape
+    torch.Size([173, 173])
     """
 
     unknowns: tuple[Unknown, ...]
@@ -90,6 +102,10 @@ class LinearModel:
         return (
             f"<LinearModel: {len(self.unknowns)} unknowns, {len(self.frames)} x {ny} x {nx} pixels>"
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Without what is cached, which can be computed again and is larger than the rest.
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
     def shares_pattern(self) -> bool:

@@ -42,12 +42,14 @@ def field_derivatives(
     dict of str to list of Tensor
         For every wavelength (components, ny, nx), per unit of the parameter table.
     """
-    # The first call caches constants, which must not happen inside a transform.
-    with torch.no_grad():
-        model(opd, **values)
     moved = {name: values[name] for name in names if name not in _IMAGE_PARAMETERS}
     if not moved:
         return {}
+    # Constants are not kept within a transform, so the model makes them here.
+    with torch.no_grad():
+        at = model.values(values)
+        for wavelength in model.bandpass.wavelengths:
+            model.propagate(model.pupil_field(model.opd(opd), wavelength, at), at)
 
     def fields(varied: dict[str, Tensor]) -> list[Tensor]:
         # Complex outputs of jacfwd would need complex inputs.

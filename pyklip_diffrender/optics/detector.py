@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.differentiation import Cache
 from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import Values, Wavefront
@@ -45,8 +46,8 @@ class Detector:
     centre: tuple[float, float] = (0.0, 0.0)
     parameters: tuple[str, ...] = ("detector_shift", "blur")
     # Not copied by `dataclasses.replace`, because a changed detector has other transforms.
-    _transforms: dict[tuple[float, PupilGrid], MatrixFourier] = field(
-        default_factory=dict, init=False, repr=False, compare=False
+    _transforms: Cache[tuple[float, PupilGrid], MatrixFourier] = field(
+        default_factory=Cache, init=False, repr=False, compare=False
     )
 
     def axes(self, values: Values) -> tuple[Tensor, Tensor]:
@@ -64,10 +65,9 @@ class Detector:
 
     def field(self, wavefront: Wavefront, values: Values) -> Tensor:
         """Field on the samples, (..., oversample ny, oversample nx), |field|^2 per sample."""
-        key = (wavefront.wavelength, wavefront.grid)
-        transform = None if "detector_shift" in values else self._transforms.get(key)
-        if transform is None:
-            transform = MatrixFourier(
+
+        def make() -> MatrixFourier:
+            return MatrixFourier(
                 wavefront.grid,
                 *self.axes(values),
                 wavefront.wavelength,
@@ -75,8 +75,10 @@ class Detector:
                 self.shear,
                 fold="detector_shift" not in values,
             )
-            if "detector_shift" not in values:
-                self._transforms[key] = transform
+
+        key = (wavefront.wavelength, wavefront.grid)
+        moved = "detector_shift" in values
+        transform = make() if moved else self._transforms.kept(key, make)
         return self.per_sample * transform.forward(wavefront.field)
 
     @property

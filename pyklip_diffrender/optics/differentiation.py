@@ -9,13 +9,35 @@ import torch
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
-__all__ = ["Position", "cached", "has_memory", "is_plain", "position_of"]
+__all__ = ["Cache", "Position", "cached", "has_memory", "is_plain", "position_of"]
 
 Key = TypeVar("Key", bound=Hashable)
 Made = TypeVar("Made")
 
 Position = tuple[tuple[str, float], ...]
 """Named values as plain numbers, as a key for results computed from them."""
+
+
+class Cache(dict[Key, Made]):
+    """Constants by key, each made once. Copies by `pickle` and `copy.deepcopy` are empty.
+
+    Nothing is stored within a transform of `torch.func`, which wraps all results: wrapped tensors
+    cannot be copied or written after it has ended.
+    """
+
+    def kept(self, key: Key, make: Callable[[], Made]) -> Made:
+        """The constant for a key, which `make` makes if there is none yet."""
+        made = self.get(key)
+        if made is None:
+            self[key] = made = make()
+        return made
+
+    def __setitem__(self, key: Key, made: Made) -> None:
+        if has_memory(torch.zeros(()) + 0):
+            super().__setitem__(key, made)
+
+    def __reduce__(self) -> tuple[type[Cache[Key, Made]], tuple[()]]:
+        return type(self), ()
 
 
 def has_memory(tensor: Tensor) -> bool:
@@ -49,7 +71,7 @@ def position_of(values: Mapping[str, Tensor], names: Iterable[str]) -> Position 
 
 
 def cached(
-    store: dict[Key, tuple[Position, Made]],
+    store: Cache[Key, tuple[Position, Made]],
     key: Key,
     position: Position | None,
     make: Callable[[], Made],
@@ -57,13 +79,11 @@ def cached(
     """The stored result for a key if it was made at the same position, else a new one.
 
     Only the latest result for each key is stored. Nothing is stored while differentiating
-    (position None), nor within a transform of `torch.func`, which wraps all results: wrapped
-    tensors cannot be copied after it has ended.
+    (position None), nor within a transform of `torch.func`, see `Cache`.
 
     Parameters
     ----------
-    store : dict
-        Results by key.
+    store : Cache
     key : hashable
     position : Position or None
         See `position_of`.
@@ -72,9 +92,7 @@ def cached(
     """
     if position is None:
         return make()
-    latest = store.get(key)
+    latest = store.get(key)  # Read only once: another thread may replace it at any moment.
     if latest is None or latest[0] != position:
-        latest = (position, make())
-        if has_memory(torch.zeros(()) + 0):
-            store[key] = latest
+        store[key] = latest = (position, make())
     return latest[1]

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.differentiation import Cache, Position, cached
 from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import CompactOcculter, Values, Wavefront
@@ -60,31 +61,32 @@ class BoxPart:
 
     def __init__(self, complement: Callable[[Tensor, Tensor, float], Tensor], box: Box) -> None:
         self.complement, self.box = complement, box
-        self._cells: dict[tuple[float, float, float], tuple[Tensor, Tensor, Tensor]] = {}
-        self._transforms: dict[tuple[float, float, PupilGrid, torch.dtype], MatrixFourier] = {}
+        self._cells: Cache[tuple[float, float, float], tuple[Tensor, Tensor, Tensor]] = Cache()
+        self._transforms: Cache[tuple[float, float, PupilGrid, torch.dtype], MatrixFourier] = (
+            Cache()
+        )
 
     def cells(self, wavefront: Wavefront, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
         """Positions x (columns,), y (rows,) in radians, and ``1 - t`` (rows, columns)."""
         wavelength = wavefront.wavelength
         limit = wavelength / (2 * wavefront.grid.spacing)
-        key = (wavelength, spacing, limit)
-        if key not in self._cells:
+
+        def make() -> tuple[Tensor, Tensor, Tensor]:
             left, right, bottom, top = (edge * ARCSEC for edge in self.box)
             x = _lattice(left, right, spacing, limit)
             y = _lattice(bottom, top, spacing, limit)
-            blocked = self.complement(x[None, :] / ARCSEC, y[:, None] / ARCSEC, wavelength)
-            self._cells[key] = (x, y, blocked)
-        return self._cells[key]
+            return x, y, self.complement(x[None, :] / ARCSEC, y[:, None] / ARCSEC, wavelength)
+
+        return self._cells.kept((wavelength, spacing, limit), make)
 
     def _transform(self, wavefront: Wavefront, spacing: float, grid: PupilGrid) -> MatrixFourier:
         device, dtype = wavefront.field.device, wavefront.field.dtype
-        key = (wavefront.wavelength, spacing, grid, dtype)
-        if key not in self._transforms:
+
+        def make() -> MatrixFourier:
             x, y, _ = self.cells(wavefront, spacing)
-            self._transforms[key] = MatrixFourier(
-                grid, x.to(device), y.to(device), wavefront.wavelength, dtype
-            )
-        return self._transforms[key]
+            return MatrixFourier(grid, x.to(device), y.to(device), wavefront.wavelength, dtype)
+
+        return self._transforms.kept((wavefront.wavelength, spacing, grid, dtype), make)
 
     def focal_field(self, wavefront: Wavefront, spacing: float) -> Tensor:
         """Field in front of the mask on the cells of the box."""
@@ -116,12 +118,12 @@ class SeparablePart:
         sampling: float,
     ) -> None:
         self.along_x, self.along_y, self.sampling = along_x, along_y, sampling
-        self._spectra: dict[tuple[str, float, PupilGrid, PupilGrid, torch.dtype], Tensor] = {}
+        self._spectra: Cache[tuple[str, float, PupilGrid, PupilGrid, torch.dtype], Tensor] = Cache()
 
     def _spectrum(self, axis: str, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
         """Transform of the kernel from the window in front to the one behind, along one axis."""
-        key = (axis, wavefront.wavelength, wavefront.grid, onto, wavefront.field.dtype)
-        if key not in self._spectra:
+
+        def make() -> Tensor:
             grid = wavefront.grid
             factor = self.along_x if axis == "x" else self.along_y
             assert factor is not None
@@ -136,8 +138,10 @@ class SeparablePart:
             before, behind = (w.columns if axis == "x" else w.rows for w in (grid, onto))
             distance = torch.arange(behind[0] - before[1] + 1, behind[1] - before[0])
             spectrum = torch.fft.fft(coefficients[distance % count], next_fast_len(len(distance)))
-            self._spectra[key] = spectrum.to(wavefront.field.device, wavefront.field.dtype)
-        return self._spectra[key]
+            return spectrum.to(wavefront.field.device, wavefront.field.dtype)
+
+        key = (axis, wavefront.wavelength, wavefront.grid, onto, wavefront.field.dtype)
+        return self._spectra.kept(key, make)
 
     def _convolved(
         self, field: Tensor, axis: str, wavefront: Wavefront, spacing: float, onto: PupilGrid
@@ -264,22 +268,20 @@ class FourierMask:
         first = -((npix * (padding - 1)) // 2)
         limits = (first, first + npix * padding)
         self.grid = PupilGrid(npix, diameter, limits, limits)
-        self._latest: tuple[float, torch.dtype, Tensor] | None = None
+        self._latest: Cache[torch.dtype, tuple[Position, Tensor]] = Cache()
 
     def window(self, values: Values) -> PupilGrid:
         """The padded pupil, because light outside the pupil reaches the next mask."""
         return self.grid
 
     def _lattice_transmission(self, wavefront: Wavefront) -> Tensor:
-        # One wavelength at a time: at eight points per lambda/D one is a gigabyte. Read only once,
-        # because another thread may replace it at any moment.
-        latest = self._latest
-        key = (wavefront.wavelength, wavefront.field.dtype)
-        if latest is None or latest[:2] != key:
+        def make() -> Tensor:
             lattice = torch.fft.ifftshift(self.transmission(wavefront.wavelength))
-            latest = (*key, lattice.to(wavefront.field))
-            self._latest = latest
-        return latest[2]
+            return lattice.to(wavefront.field)
+
+        # One wavelength at a time: at eight points per lambda/D one is a gigabyte.
+        position = (("wavelength", wavefront.wavelength),)
+        return cached(self._latest, wavefront.field.dtype, position, make)
 
     def focal_sample(self, wavefront: Wavefront) -> tuple[Tensor, float]:
         """The field behind the mask on the whole lattice, and its spacing (radians)."""

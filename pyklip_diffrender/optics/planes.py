@@ -36,7 +36,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.differentiation import Position, cached, position_of
+from pyklip_diffrender.optics.differentiation import Cache, Position, cached, position_of
 from pyklip_diffrender.optics.fourier import MatrixFourier, centred, tilt_phases
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, transform_polygons
 from pyklip_diffrender.optics.zernike import zernike_basis
@@ -199,7 +199,7 @@ class LyotStop:
         # because other results are cached for each window.
         self._tight = centred(full.around(polygon_coverage(openings, full)))
         self._wide = self._tight.widened(self.margin * diameter)
-        self._latest: dict[PupilGrid, tuple[Position, Tensor]] = {}
+        self._latest: Cache[PupilGrid, tuple[Position, Tensor]] = Cache()
 
     def window(self, values: Values) -> PupilGrid:
         return self._tight if set(self.parameters).isdisjoint(values) else self._wide
@@ -249,17 +249,18 @@ class InternalAberration:
         self.diameter = diameter
         self.dtype = dtype
         self.chromatic = chromatic
-        self._bases: dict[PupilGrid, Tensor] = {}
-        self._phasors: dict[tuple[PupilGrid, float], Tensor] = {}
+        self._bases: Cache[PupilGrid, Tensor] = Cache()
+        self._phasors: Cache[tuple[PupilGrid, float], Tensor] = Cache()
 
     def window(self, values: Values) -> None:
         return None
 
     def _basis(self, grid: PupilGrid) -> Tensor:
-        if grid not in self._bases:
+        def make() -> Tensor:
             basis = zernike_basis(len(self.coefficients), grid.x, grid.y, self.diameter / 2)
-            self._bases[grid] = basis.to(self.coefficients.device)
-        return self._bases[grid]
+            return basis.to(self.coefficients.device)
+
+        return self._bases.kept(grid, make)
 
     def opd(self, wavelength: float, grid: PupilGrid, values: Values) -> Tensor:
         """OPD on the window, (rows, columns), m, float64."""
@@ -274,13 +275,12 @@ class InternalAberration:
         return torch.tensordot(coefficients, self._basis(grid), dims=1)
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
-        key = (wavefront.grid, wavefront.wavelength)
-        phasor = self._phasors.get(key)
-        if phasor is None or "si_zernikes" in values:
+        def make() -> Tensor:
             opd = self.opd(wavefront.wavelength, wavefront.grid, values)
-            phasor = phase_factor(opd, wavefront.wavelength, self.dtype)
-            if "si_zernikes" not in values:
-                self._phasors[key] = phasor
+            return phase_factor(opd, wavefront.wavelength, self.dtype)
+
+        key = (wavefront.grid, wavefront.wavelength)
+        phasor = make() if "si_zernikes" in values else self._phasors.kept(key, make)
         return replace(wavefront, field=wavefront.field * phasor)
 
 
@@ -322,31 +322,31 @@ class CompactOcculter:
         self.complement, self.radius, self.sampling = complement, radius, sampling
         self.diameter = diameter
         self.dtype, self.device = dtype, device
-        self._cells: dict[float, tuple[Tensor, Tensor]] = {}
-        self._transforms: dict[tuple[float, PupilGrid], MatrixFourier] = {}
+        self._cells: Cache[float, tuple[Tensor, Tensor]] = Cache()
+        self._transforms: Cache[tuple[float, PupilGrid], MatrixFourier] = Cache()
 
     def window(self, values: Values) -> None:
         return None
 
     def cells(self, wavelength: float) -> tuple[Tensor, Tensor]:
         """Cell positions along one axis (radians) and 1 - t on the cells."""
-        if wavelength not in self._cells:
+
+        def make() -> tuple[Tensor, Tensor]:
             spacing = wavelength / self.diameter / (self.sampling or 4.0)
             half = math.ceil(self.radius * ARCSEC / spacing)
             axis = torch.arange(-half, half + 1, dtype=torch.float64) * spacing
             angle = axis / ARCSEC
             complement = self.complement(angle[None, :], angle[:, None])
-            self._cells[wavelength] = (axis, complement.to(self.device, self.dtype))
-        return self._cells[wavelength]
+            return axis, complement.to(self.device, self.dtype)
+
+        return self._cells.kept(wavelength, make)
 
     def _transform(self, wavelength: float, grid: PupilGrid) -> MatrixFourier:
-        key = (wavelength, grid)
-        if key not in self._transforms:
+        def make() -> MatrixFourier:
             axis = self.cells(wavelength)[0].to(self.device)
-            self._transforms[key] = MatrixFourier(
-                grid, axis, axis, wavelength, self.dtype.to_complex()
-            )
-        return self._transforms[key]
+            return MatrixFourier(grid, axis, axis, wavelength, self.dtype.to_complex())
+
+        return self._transforms.kept((wavelength, grid), make)
 
     def focal_field(self, wavefront: Wavefront) -> Tensor:
         """The field in front of the mask, on the cells of the disc."""

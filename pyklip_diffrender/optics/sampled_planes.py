@@ -14,7 +14,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.optics.differentiation import Position, cached, position_of
+from pyklip_diffrender.optics.differentiation import Cache, Position, cached, position_of
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.orientation import Orientation
 from pyklip_diffrender.optics.planes import EntrancePupil, Values, Wavefront, phase_factor
@@ -180,8 +180,8 @@ class MovableStop(PupilOptic):
     """Room for shifts and rotations, as a fraction of the diameter."""
 
     @cached_property
-    def _latest(self) -> dict[tuple[int, PupilGrid], tuple[Position, Tensor]]:
-        return {}
+    def _latest(self) -> Cache[tuple[int, PupilGrid], tuple[Position, Tensor]]:
+        return Cache()
 
     def _moves(self, values: Values) -> bool:
         return any(name in values for name in self.parameters)
@@ -265,6 +265,9 @@ class AberrationOptic(PupilOptic):
     parameters = ("si_zernikes",)
 
     @cached_property
+    def _bases(self) -> Cache[PupilGrid, Tensor]:
+        return Cache()
+
     def _zernikes(self) -> Tensor:
         count = parameter("si_zernikes").size
         basis = zernike_basis(count, self.grid.x, self.grid.y, self.grid.diameter / 2)
@@ -275,7 +278,9 @@ class AberrationOptic(PupilOptic):
         wavefront = super().apply(wavefront, values, onto)
         if "si_zernikes" not in values:
             return wavefront
-        opd = torch.tensordot(values["si_zernikes"], self._zernikes, dims=1)
+        opd = torch.tensordot(
+            values["si_zernikes"], self._bases.kept(self.grid, self._zernikes), dims=1
+        )
         factor = phase_factor(opd, wavefront.wavelength, self._dtype)
         return replace(wavefront, field=wavefront.field * factor)
 

@@ -63,6 +63,17 @@ class OpticalSystem(Propagation):
         ``star_offset``.
     TypeError, ShapeError, UnitError
         For defaults that `values` refuses.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> model.parameters[:2]
+    ('star_offset', 'lyot_shift')
+    >>> star = model(opd.data, star_offset=(0.01, 0.0))
+    >>> star.shape
+    torch.Size([32, 32])
     """
 
     _replaced: ClassVar[dict[str, tuple[str, ...]]] = {

@@ -98,6 +98,18 @@ def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> O
         If there is no frame, or no valid pixel.
     IncompatibleSetupError
         If the dataset has several wavelengths and none was chosen.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pyklip.instruments.Instrument import GenericData
+    >>> import pyklip_diffrender as dr
+    >>> images = np.random.default_rng(1).normal(size=(2, 16, 16))
+    >>> dataset = GenericData(images, np.full((2, 2), 7.5), filenames=["roll 1", "roll 2"])
+    >>> dataset.diffrender = dr.DiffrenderSettings(pixelscale=0.063)
+    >>> observation = dr.observation_from_dataset(dataset)
+    >>> len(observation), observation.shape
+    (2, (16, 16))
     """
     require_frames(dataset)
     wavelengths = np.unique(dataset.wvs)

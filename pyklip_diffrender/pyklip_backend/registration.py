@@ -166,6 +166,12 @@ def unregister() -> None:
     """Restore pyKLIP exactly and forget the settings given to `register`.
 
     Inside a `backend` block, pyKLIP is restored when the block ends.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> dr.register(seed=1)
+    >>> dr.unregister()
     """
     with _registry.lock:
         _registry.defaults = DiffrenderSettings()

@@ -113,6 +113,12 @@ class DiffrenderSettings:
         Further keywords of `nircam_coronagraph`, such as ``npix`` and ``nlambda``.
     subtractor : Subtractor, optional
         Function that renders the star; `subtract_by_refinement` by default.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> settings = dr.DiffrenderSettings(opd="opd.fits", fit_pixels=80, seed=1)
+    >>> dataset.diffrender = settings  # doctest: +SKIP
     """
 
     opd: OPDLike | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -101,6 +101,20 @@ class Refinement:
         One entry for each iteration.
     seconds : float
     seed : int
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> fit.status.usable
+    True
+    >>> fit.frames[0].star.shape
+    (32, 32)
+    >>> path = fit.write("fit.fits")  # doctest: +SKIP
+    >>> fit = dr.Refinement.read(path)  # doctest: +SKIP
     """
 
     frames: tuple[FrameFit, ...]
@@ -128,6 +142,10 @@ class Refinement:
             f"<Refinement: {self.status.name}, {count} frame{'s' if count > 1 else ''}, "
             f"chi2/pixel {self.chi2_per_pixel:.3g}, {self.seconds:.1f} s>"
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Without what is cached, which can be computed again and is larger than the rest.
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def _repr_html_(self) -> str:
         return html_summary(
@@ -196,7 +214,10 @@ class Refinement:
 
     @property
     def parameters(self) -> QTable:
-        """All parameters but the wavefront: frame, name, value, error, unit and description."""
+        """All parameters but the wavefront: frame, name, value, error, unit and description.
+
+        Only the beginning of a description is printed; the column has all of it.
+        """
         rows = []
         for k, frame in enumerate(self.frames):
             for name, value in frame.values.items():
@@ -211,6 +232,8 @@ class Refinement:
         )
         for name in ("value", "error"):
             table[name].info.format = ".5g"
+        # Whole ones leave no room for the values in a terminal of 80 columns.
+        table["description"].info.format = "26.26s"
         return table
 
     def write(self, path: str | os.PathLike[str], *, linear: bool = True) -> Path:
@@ -240,7 +263,9 @@ class Refinement:
             primary.header[f"HIERARCH {key.upper()}"] = (
                 value if not isinstance(value, float) or math.isfinite(value) else str(value)
             )
-        hdus = fits.HDUList([primary, fits.BinTableHDU(self.parameters, name="PARAMETERS")])
+        parameters = self.parameters
+        parameters["description"].info.format = None  # FITS has no such format.
+        hdus = fits.HDUList([primary, fits.BinTableHDU(parameters, name="PARAMETERS")])
         parts = [frame.to_hdus(k) for k, frame in enumerate(self.frames)]
         for _, extensions in parts:
             hdus.extend(extensions)

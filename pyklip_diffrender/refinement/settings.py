@@ -255,6 +255,13 @@ class Adam:
     iterations : int
     learning_rate : float or Quantity
         m.
+
+    Examples
+    --------
+    >>> from astropy import units as u
+    >>> from pyklip_diffrender import Adam
+    >>> Adam(iterations=200, learning_rate=20 * u.pm)
+    Adam(iterations=200, learning_rate=2e-11)
     """
 
     iterations: int = 1000

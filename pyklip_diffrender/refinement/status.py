@@ -8,7 +8,16 @@ __all__ = ["Status"]
 
 
 class Status(Enum):
-    """How a refinement ended; the values are the messages."""
+    """How a refinement ended; the values are the messages.
+
+    Examples
+    --------
+    >>> from pyklip_diffrender import Status
+    >>> [status.name for status in Status if not status.usable]
+    ['DIVERGED']
+    >>> Status.CONVERGED.calibrated
+    True
+    """
 
     CONVERGED = "converged, and the model explains the data within their noise"
     MODEL_MISMATCH = (

@@ -57,6 +57,14 @@ class Systematics:
         Short label for headers.
     provenance : dict
         Frames it was learned from, and how.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pyklip_diffrender as dr
+    >>> flat = np.full((8, 8), 0.002)
+    >>> dr.Systematics(flat, flat / 4, center=(3.5, 3.5), unknown=0.005, name="flat field")
+    <Systematics 'flat field': None, 8 x 8 pixels>
     """
 
     pattern: NDArray[np.float64]

@@ -15,6 +15,7 @@ from hard_cases import DTYPES, NPIX, small, system, wavefront, worst
 from stability_fits import error_of, fitted, noise, observed, star
 
 from pyklip_diffrender.io.files import open_fits, write_fits
+from pyklip_diffrender.optics.differentiation import Cache, Position
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
 from pyklip_diffrender.optics.masks import FourierMask
 from pyklip_diffrender.optics.planes import Wavefront
@@ -96,10 +97,10 @@ def test_two_callers_of_a_padded_mask_at_two_wavelengths() -> None:
     other_is_done, first_has_stored = threading.Event(), threading.Event()
     short, long = 4.0e-6, 5.0e-6
 
-    class Interrupted(FourierMask):
-        def __setattr__(self, name: str, value: object) -> None:
-            super().__setattr__(name, value)
-            if name == "_latest" and isinstance(value, tuple) and value[0] == short:
+    class Interrupted(Cache[torch.dtype, tuple[Position, torch.Tensor]]):
+        def __setitem__(self, key: torch.dtype, made: tuple[Position, torch.Tensor]) -> None:
+            super().__setitem__(key, made)
+            if made[0] == (("wavelength", short),):
                 first_has_stored.set()
                 other_is_done.wait(5)
 
@@ -108,7 +109,8 @@ def test_two_callers_of_a_padded_mask_at_two_wavelengths() -> None:
 
     grid = PupilGrid.full(8, JWST_DIAMETER)
     field = torch.ones(8, 8, dtype=torch.complex128)
-    mask = Interrupted(transmission, 2, 8, JWST_DIAMETER, "padded")
+    mask = FourierMask(transmission, 2, 8, JWST_DIAMETER, "padded")
+    mask._latest = Interrupted()
 
     def call(wavelength: float) -> torch.Tensor:
         return mask.apply(Wavefront(field, wavelength, grid), {}, grid).field

@@ -28,6 +28,7 @@ from torch.nn.functional import pad
 
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.differentiation import Cache
 from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.planes import CompactOcculter, Wavefront
 
@@ -181,17 +182,17 @@ class OcculterLattice:
         mask = self.y.band_limiting() @ mask @ self.x.band_limiting().T
         scale = self.x.spacing * self.y.spacing / wavelength * detector.per_sample
         self.blocked = (scale * mask).to(detector.device, detector.dtype)
-        self._transforms: dict[tuple[Any, ...], MatrixFourier] = {}
+        self._transforms: Cache[tuple[Any, ...], MatrixFourier] = Cache()
 
     def _transform(self, wavefront: Wavefront, x: Tensor, y: Tensor) -> MatrixFourier:
-        key = (wavefront.grid, float(x[0]), len(x), float(y[0]), len(y))
-        if key not in self._transforms:
-            x, y = x.to(wavefront.field.device), y.to(wavefront.field.device)
-            dtype = wavefront.field.dtype
-            self._transforms[key] = MatrixFourier(
-                wavefront.grid, x, y, self.wavelength, dtype, self.shear
+        def make() -> MatrixFourier:
+            device, dtype = wavefront.field.device, wavefront.field.dtype
+            return MatrixFourier(
+                wavefront.grid, x.to(device), y.to(device), self.wavelength, dtype, self.shear
             )
-        return self._transforms[key]
+
+        key = (wavefront.grid, float(x[0]), len(x), float(y[0]), len(y))
+        return self._transforms.kept(key, make)
 
     def focus(self, wavefront: Wavefront) -> Tensor:
         """Field in front of the mask, on the cells, (..., cells in y, cells in x)."""

@@ -16,6 +16,7 @@ from torch import Tensor
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.differentiation import (
+    Cache,
     Position,
     cached,
     has_memory,
@@ -68,12 +69,12 @@ class LatticeRoute:
         (self._place,) = (k for k, p in enumerate(planes) if isinstance(p, CompactOcculter))
         behind = planes[self._place + 1 :]
         self._moving = {name for plane in behind for name in plane.parameters} | {"detector_shift"}
-        self._lattices: dict[float, OcculterLattice] = {}
+        self._lattices: Cache[float, OcculterLattice] = Cache()
         # The most recent result at each wavelength, with the parameters that it depends on.
-        self._stops: dict[float, tuple[Position, Wavefront]] = {}
-        self._kernels: dict[float, tuple[Position, Tensor]] = {}
-        self._stars: dict[float, tuple[Position, _StreamedStar]] = {}
-        self._stream: PupilStream | None = None
+        self._stops: Cache[float, tuple[Position, Wavefront]] = Cache()
+        self._kernels: Cache[float, tuple[Position, Tensor]] = Cache()
+        self._stars: Cache[float, tuple[Position, _StreamedStar]] = Cache()
+        self._streams: Cache[PupilGrid, PupilStream] = Cache()
 
     @staticmethod
     def serves(planes: Sequence[Plane]) -> bool:
@@ -103,11 +104,10 @@ class LatticeRoute:
 
     def lattice(self, wavelength: float) -> OcculterLattice:
         """The cells at a wavelength."""
-        if wavelength not in self._lattices:
-            self._lattices[wavelength] = OcculterLattice(
-                self.occulter, self.detector, wavelength, self.sampling
-            )
-        return self._lattices[wavelength]
+        return self._lattices.kept(
+            wavelength,
+            lambda: OcculterLattice(self.occulter, self.detector, wavelength, self.sampling),
+        )
 
     def _stop(self, onto: Sequence[PupilGrid], wavelength: float, values: Values) -> Wavefront:
         """The product of all planes behind the occulter.
@@ -223,8 +223,9 @@ class LatticeRoute:
         values: Values,
         onto: Sequence[PupilGrid],
     ) -> _StreamedStar:
-        if self._stream is None:
-            self._stream = PupilStream(entrance.amplitude, entrance.grid)
+        stream = self._streams.kept(
+            entrance.grid, lambda: PupilStream(entrance.amplitude, entrance.grid)
+        )
         lattice = self.lattice(wavelength)
         stop = self._stop(onto, wavelength, values)
         cells = lattice.x.positions, lattice.y.positions
@@ -236,7 +237,7 @@ class LatticeRoute:
             )
         ]
         return _StreamedStar(
-            self._stream, branches, lattice, self._kernel(stop, values), self.detector.per_sample
+            stream, branches, lattice, self._kernel(stop, values), self.detector.per_sample
         )
 
 
