@@ -264,6 +264,43 @@ def test_a_header_cannot_write_into_the_page(tmp_path: Path) -> None:
     assert json.loads(data.read_text(encoding="utf-8"))["target"] == HOSTILE
 
 
+@pytest.fixture
+def _few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw the S/N map and the contrast curve alone."""
+    for name in ("star_pictures", "wavefront_pictures"):
+        monkeypatch.setattr(f"pyklip_diffrender.report.write.{name}", lambda *_: [])
+
+
+@pytest.mark.usefixtures("_few_pictures")
+def test_with_reference_frames_klip_is_shown_beside(tmp_path: Path) -> None:
+    whole = reduction()
+    star = replace(whole.sequence.science[0], reference=True)
+    noise = star.error * np.random.default_rng(1).standard_normal(star.data.shape)
+    sequence = replace(whole.sequence, references=(replace(star, data=star.data + noise),))
+    html, data = write_report(replace(whole, sequence=sequence), tmp_path)
+    curve = json.loads(data.read_text(encoding="utf-8"))["klip_curve"]
+    assert set(curve) == {"sigmas", "separation_arcsec", "contrast", "modes", "throughput"}
+    # Farther out than that there is something left of a planet.
+    assert min(curve["contrast"][4:]) > 0
+    assert "Squares: KLIP (ADI and RDI)" in html.read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("_few_pictures")
+def test_a_failure_of_klip_does_not_break_the_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(_: dr.Reduction) -> QTable:
+        raise ValueError("singular")
+
+    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.klip_curve.klip_curve", broken)
+    monkeypatch.setattr("pyklip_diffrender.report.write.search_pictures", lambda *_: [])
+    whole = reduction()
+    sequence = replace(whole.sequence, references=whole.sequence.science)
+    _, data = write_report(replace(whole, sequence=sequence), tmp_path)
+    assert "singular" in caplog.text
+    assert json.loads(data.read_text(encoding="utf-8"))["klip_curve"] is None
+
+
 def test_a_report_that_fails_leaves_the_old_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

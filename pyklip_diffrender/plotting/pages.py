@@ -21,6 +21,7 @@ from pyklip_diffrender.plotting.panels import (
 from pyklip_diffrender.plotting.results import plot_detection, plot_disk
 
 if TYPE_CHECKING:
+    from astropy.table import QTable
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -38,10 +39,10 @@ _LIMIT = 5.0
 """Of the scale for residuals, standard deviations."""
 
 
-def draw_search(detection: Detection | WideField) -> list[Figure]:
-    """The S/N map with the candidates, and the contrast curve."""
+def draw_search(detection: Detection | WideField, klip: QTable | None = None) -> list[Figure]:
+    """The S/N map with the candidates, and the contrast curve, perhaps with that of KLIP."""
     figures, axes = _panels(2)
-    plot_detection(detection, axes)
+    plot_detection(detection, axes, klip)
     return figures
 
 

@@ -27,6 +27,7 @@ from pyklip_diffrender.plotting.panels import (
 )
 
 if TYPE_CHECKING:
+    from astropy.table import QTable
     from matplotlib.axes import Axes
 
     from pyklip_diffrender.detection import Detection, Disk, WideField
@@ -51,6 +52,9 @@ _LIMIT = 5.0
 
 _LABELLED = 4
 """Largest number of candidates that are labelled: the labels of more would overlap."""
+
+_KLIP = "#b3541e"
+"""A brown, lighter than the green of the curve that it is drawn beside."""
 
 _SNR_TICKS = (-100, -50, -20, -10, -5, 0, 5, 10, 20, 50, 100)
 
@@ -144,8 +148,10 @@ def plot_refinement(fit: Refinement, ax: Any = None, *, frame: int = 0) -> NDArr
     return np.array([data_axes, middle, right])
 
 
-def plot_detection(detection: Detection | WideField, ax: Any = None) -> NDArray[Any]:
-    """See `Detection.plot`."""
+def plot_detection(
+    detection: Detection | WideField, ax: Any = None, klip: QTable | None = None
+) -> NDArray[Any]:
+    """See `Detection.plot`; `klip` is the contrast curve of KLIP."""
     snr_axes, right = axes_for(ax, 2)
     extent, table = extent_of(detection.grid[0, :, 0], detection.grid[:, 0, 1]), detection.table
     plural = "" if len(table) == 1 else "s"
@@ -173,6 +179,10 @@ def plot_detection(detection: Detection | WideField, ax: Any = None) -> NDArray[
             separation, curve["small_sample"], ":", color=ACCENT, label="median, few samples"
         )
     right.semilogy(separation, curve["known_star"], "--", color=INK, label="star known exactly")
+    if klip is not None:
+        right.semilogy(
+            klip["separation"].value, klip["contrast"], "s-", color=_KLIP, ms=3.5, label="KLIP"
+        )
     if len(table):
         right.errorbar(
             table["separation"].value, table["contrast"], table["contrast_error"],

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from astropy.table import QTable
+
 from pyklip_diffrender.detection import Disk, WideField
 from pyklip_diffrender.plotting import draw_disk, draw_search, draw_star, draw_wavefronts, to_png
 from pyklip_diffrender.plotting.panels import unit_label
@@ -44,8 +46,10 @@ class Picture:
     caption: str
 
 
-def search_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Picture]:
-    """The S/N map and the contrast curve."""
+def search_pictures(
+    reduction: Reduction, summary: Mapping[str, Any], klip: QTable | None = None
+) -> list[Picture]:
+    """The S/N map and the contrast curve, with that of KLIP if it is known."""
     detection = reduction.detection
     count, threshold = len(detection.table), detection.threshold
     candidates = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {threshold:g}"
@@ -78,8 +82,15 @@ def search_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Pi
         if detection.error_factor.is_needed
         else ""
     )
+    beside = (
+        ""
+        if klip is None
+        else " Squares: KLIP (ADI and RDI) on the same frames, in units of the same star, with the "
+        "small-sample correction and the best number of modes at every separation; its noise is "
+        "the scatter in a ring, its throughput that of injected planets."
+    )
     return _pictures(
-        draw_search(detection),
+        draw_search(detection, klip),
         (
             f"Map of the signal-to-noise ratio of a point source, {candidates}"
             f"{': ' if places else ''}{places}.",
@@ -91,7 +102,7 @@ def search_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Pi
             f"{': ' if limits else ''}{limits}.",
             f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "
             "median of all position angles and their range. Dashed: the same if the image of the "
-            f"star were known exactly.{small_sample}",
+            f"star were known exactly.{small_sample}{beside}",
         ),
     )
 

@@ -30,12 +30,14 @@ _LIMITS = (0.5, 1.0, 1.5, 2.0)
 _LIBRARIES = ("torch", "numpy", "scipy", "astropy", "photutils", "matplotlib")
 
 
-def summarise(reduction: Reduction) -> dict[str, Any]:
+def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any]:
     """Return what a reduction shows as nested dicts and lists of plain values.
 
     Parameters
     ----------
     reduction : Reduction
+    klip : QTable, optional
+        Contrast curve of KLIP for the same frames.
 
     Returns
     -------
@@ -83,6 +85,7 @@ def summarise(reduction: Reduction) -> dict[str, Any]:
         "disk": None if reduction.disk is None else _disk(reduction.disk),
         "limits": _limits(detection),
         "contrast_curve": _curve(detection.contrast_curve),
+        "klip_curve": None if klip is None else _curve(klip),
         "frames": [
             *(_frame(each, "target") for each in sequence.science),
             *(_frame(each, "reference") for each in sequence.references),

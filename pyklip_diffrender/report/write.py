@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Iterable
 from pathlib import Path
+
+from astropy.table import QTable
 
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.reduction import Reduction
@@ -21,6 +24,8 @@ from pyklip_diffrender.report.pictures import (
 from pyklip_diffrender.report.summary import summarise
 
 __all__ = ["write_report"]
+
+_log = logging.getLogger(__name__)
 
 
 def write_report(
@@ -41,11 +46,12 @@ def write_report(
     list of Path
     """
     html, data = (Path(folder) / name for name in ("report.html", "summary.json"))
-    summary = summarise(reduction)
+    klip = _klip_curve(reduction)
+    summary = summarise(reduction, klip)
     frames = range(min(len(reduction.detection.fits[0].frames), MOST_FRAMES))
     text = page(
         summary,
-        search_pictures(reduction, summary),
+        search_pictures(reduction, summary, klip),
         [star_pictures(reduction, frame) for frame in frames],
         wavefront_pictures(reduction, summary),
         [] if reduction.wide is None else wide_pictures(reduction.wide),
@@ -57,3 +63,17 @@ def write_report(
         with replacing(path) as temporary:
             temporary.write_text(content, encoding="utf-8")
     return list(written)
+
+
+def _klip_curve(reduction: Reduction) -> QTable | None:
+    """KLIP's contrast curve; None where KLIP has no references or fails."""
+    if not reduction.sequence.references and len(reduction.sequence.science) < 2:
+        return None
+    try:
+        # pyKLIP is loaded only if it is needed.
+        from pyklip_diffrender.pyklip_backend.klip_curve import klip_curve
+
+        return klip_curve(reduction)
+    except Exception as error:  # An addition to the report, which is complete without it.
+        _log.warning("the report has no contrast curve of KLIP: %s", error)
+        return None

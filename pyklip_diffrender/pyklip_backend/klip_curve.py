@@ -1,0 +1,238 @@
+"""The contrast curve of KLIP (ADI and RDI) for the frames of a reduction.
+
+It is what an observer would get without a model of the telescope. The same planets that the fit
+would search for, in units of the same star, are added to the frames to measure how much of them
+KLIP leaves.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from astropy import units as u
+from astropy.table import QTable
+from numpy.typing import NDArray
+from pyklip.klip import klip_math, rotate
+from scipy.ndimage import gaussian_filter
+from scipy.signal import fftconvolve
+
+from pyklip_diffrender.detection.contrast import small_sample_factor
+from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.units import to_arcsec
+from pyklip_diffrender.scene.detector_pixels import shift_frames
+
+if TYPE_CHECKING:
+    from pyklip_diffrender.reduction import Reduction
+    from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["klip_curve"]
+
+Image = NDArray[np.float64]
+
+_SIGMAS = 5.0
+
+_MODES = 5
+"""Largest number of KL modes."""
+
+_INNER = 1.4
+"""Radius in lambda/D within which KLIP does not subtract the star."""
+
+_FIRST = 2
+"""Smallest of the default separations, lambda/D."""
+
+_COUNT = 12
+"""Number of the default separations."""
+
+_TRIALS = 4
+"""Position angles at which planets are injected at every separation."""
+
+_GOLDEN = 137.5
+"""Degrees from the planets at one separation to those at the next."""
+
+_TURN = 1.0
+"""Degrees between rolls that are references of each other."""
+
+_HALF = 10
+"""Pixels from the middle of the matched filter to its edge."""
+
+_CLOSE = 1.5
+"""Pixels about the position of an injected planet in which its peak is sought."""
+
+
+def klip_curve(reduction: Reduction, separations: Any = None) -> QTable:
+    """Compute the 5-sigma contrast curve of KLIP for the frames that were fitted.
+
+    Every roll is projected onto the Karhunen-Loeve modes of the other rolls and all frames of
+    reference stars. The residuals are turned to the orientation of the first roll, averaged and
+    smoothed with the image of a planet. The noise is the standard deviation in a ring of width
+    lambda/D, the throughput that of injected planets, and the number of modes at every separation
+    that with the best limit. Companions that are part of the fit are subtracted first.
+
+    Parameters
+    ----------
+    reduction : Reduction
+        Frames are aligned by the fitted positions of the star, those of reference stars by the
+        recorded ones.
+    separations : array or Quantity, optional
+        arcsec; by default twelve from 2 lambda/D to the edge of the frames. Those beyond the edge
+        are left out.
+
+    Returns
+    -------
+    QTable
+        Separation, contrast with the small-sample correction (NaN where no light of a planet is
+        left), number of modes, and throughput, the fraction of a planet's image behind the mask
+        that is left.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If a roll has no references, or no separation is in the frames.
+    """
+    detection = reduction.detection
+    templates = Templates(detection.fits[0], detection.fits[0].frames[0])
+    resolution = detection.contrast_curve.meta["resolution_arcsec"]
+    klip = _Klip(templates, reduction.sequence.references, resolution)
+    # The corners' smaller coordinates.
+    edge = np.abs(klip.grid[[0, -1], [0, -1]]).min() - resolution / 2
+    if separations is None:
+        separations = np.geomspace(_FIRST * resolution, max(edge, _FIRST * resolution), _COUNT)
+    separations = np.atleast_1d(to_arcsec(separations, "separations"))
+    separations = separations[separations <= edge]
+    if not len(separations):
+        raise IncompatibleSetupError(
+            f"separations: got none within {edge:.3g} arcsec, where rings are complete"
+        )
+    plain = klip.images(klip.science)
+    rings = [np.abs(klip.distance - each) < resolution / 2 for each in separations]
+    noise = np.array([[image[ring].std() for ring in rings] for image in plain])
+    # So faint that the modes hardly change.
+    contrasts = _SIGMAS * noise.min(axis=0) / klip.norm
+    response, alone = np.zeros_like(noise), np.zeros(len(separations))
+    for s, separation in enumerate(separations):
+        angles = np.radians(_GOLDEN * s + 360 / _TRIALS * np.arange(_TRIALS))
+        wanted = separation * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        rows, columns = np.array([klip.pixel(each) for each in wanted]).T
+        light = templates.at_pixels(rows, columns)
+        alone[s] = light[0].double().square().sum(dim=(1, 2)).sqrt().mean()
+        # One by one: near the mask the wings of planets farther out are as bright as what is left.
+        for n, place in enumerate(templates.grid[rows, columns]):
+            planets = contrasts[s] * np.array([each[n].double().numpy() for each in light.values()])
+            added = klip.science + shift_frames(planets, klip.shifts)
+            changes = klip.images(added) - plain
+            close = np.hypot(*np.moveaxis(klip.grid - place, -1, 0)) < _CLOSE * klip.pixelscale
+            response[:, s] += changes[:, close].max(axis=1) / _TRIALS
+    # No noise, no planet: a ring inside KLIP's mask.
+    response = np.divide(response, contrasts, out=np.zeros_like(response), where=contrasts > 0)
+    useful = (response > 0) & (noise > 0)
+    limits = np.divide(_SIGMAS * noise, response, out=np.full_like(noise, np.inf), where=useful)
+    best = limits.argmin(axis=0), np.arange(len(separations))
+    corrected = limits[best] * small_sample_factor(separations, resolution, _SIGMAS)
+    table = QTable(
+        {
+            "separation": separations * u.arcsec,
+            "contrast": np.where(np.isfinite(corrected), corrected, np.nan),
+            "modes": best[0] + 1,
+            "throughput": response[best] / alone,
+        },
+        meta={"sigmas": _SIGMAS, "resolution_arcsec": resolution},
+    )
+    for name, form in (("separation", ".3f"), ("contrast", ".2e"), ("throughput", ".2f")):
+        table[name].info.format = form
+    return table
+
+
+class _Klip:
+    """Aligned frames, and their subtraction.
+
+    Parameters
+    ----------
+    templates : Templates
+        Of the fit.
+    references : sequence of Observation
+    resolution : float
+        lambda/D, arcsec.
+    """
+
+    def __init__(
+        self, templates: Templates, references: tuple[Observation, ...], resolution: float
+    ) -> None:
+        frames = templates.frames
+        self.rolls = list(templates.rolls.values())
+        star = torch.zeros(1, 2, dtype=torch.float64)
+        places = np.array([templates.pixels_of(k, star)[::-1, 0] for k in frames])
+        recorded = np.array([each.observation.center.mean(axis=0) for each in frames.values()])
+        # The fit knows by how much the recorded positions are off; those of the references, which
+        # were recorded in the same way, are taken to be off by as much.
+        others = [
+            each.center.mean(axis=0) + (places - recorded).mean(axis=0) for each in references
+        ]
+        self.center = np.round(places[0])
+        self.shifts = self.center - places
+        images = [_filled(frame.observation) - frame.companion_image for frame in frames.values()]
+        self.science = shift_frames(np.array(images), self.shifts)
+        self.references = [
+            shift_frames(_filled(each)[None], (self.center - place)[None])[0]
+            for each, place in zip(references, others, strict=True)
+        ]
+        self._templates = templates
+        scales = templates.origin.observation.pixelscale
+        self.pixelscale = float(np.sqrt(scales[0] * scales[1]))
+        y, x = np.indices(self.science[0].shape)
+        self.grid = (np.stack([x, y], axis=-1) - self.center) * scales
+        self.distance = np.hypot(self.grid[..., 0], self.grid[..., 1])
+        self._zone = self.distance > _INNER * resolution
+        self._library = [
+            [j for j, other in enumerate(self.rolls) if abs(other - roll) > _TURN]
+            for roll in self.rolls
+        ]
+        fewest = min(map(len, self._library)) + len(self.references)
+        if not fewest:
+            raise IncompatibleSetupError(
+                "klip_curve: got a roll without references, expected frames of reference stars or "
+                f"rolls that differ by more than {_TURN:g} degree"
+            )
+        self._modes = np.arange(1, min(_MODES, fewest) + 1)
+        # Halfway to the edge the mask does not matter.
+        row, column = self.pixel(np.array([self.grid[0, -1, 0] / 2, 0.0]))
+        image = templates.at_pixels(np.array([row]), np.array([column]))[0][0].double().numpy()
+        side = 2 * _HALF + 1
+        kernel = np.pad(image, _HALF)[row : row + side, column : column + side]
+        self.norm = float(np.sqrt((kernel**2).sum()))
+        """Of a planet of contrast 1 in a smoothed image of which nothing was subtracted."""
+        self._kernel = kernel[::-1, ::-1] / self.norm
+
+    def pixel(self, place: Image) -> tuple[int, int]:
+        """Row and column of the pixel of the first frame next to x, y in arcsec."""
+        away = np.hypot(*np.moveaxis(self._templates.grid - place, -1, 0))
+        row, column = np.unravel_index(int(away.argmin()), away.shape)
+        return int(row), int(column)
+
+    def images(self, science: Image) -> Image:
+        """Subtracted, turned, averaged and smoothed frames, one for each number of modes."""
+        total = np.zeros((len(self._modes), *self.distance.shape))
+        for frame, roll, others in zip(science, self.rolls, self._library, strict=True):
+            frames = [*(science[j] for j in others), *self.references]
+            library = np.array([each[self._zone] for each in frames])
+            # numpy gives the covariance of a single reference as a number.
+            covariance = np.atleast_2d(np.cov(library))
+            residual = np.zeros_like(total)
+            residual[:, self._zone] = klip_math(
+                frame[self._zone], library, self._modes, covar_psfs=covariance
+            ).T
+            turned = [rotate(each, -roll, self.center) for each in residual]
+            total += np.nan_to_num(turned) / len(science)
+        return np.array([fftconvolve(each, self._kernel, mode="same") for each in total])
+
+
+def _filled(observation: Observation) -> Image:
+    """The mean of the frames, masked pixels interpolated between their neighbours."""
+    mean = observation.combined()
+    valid = mean.valid[0].astype(float)
+    weight = gaussian_filter(valid, 1.0)
+    nearby = gaussian_filter(mean.data[0], 1.0)
+    filled = np.divide(nearby, weight, out=np.zeros_like(nearby), where=weight > 1e-3)
+    return np.where(mean.valid[0], mean.data[0], filled)

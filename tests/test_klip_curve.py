@@ -1,0 +1,173 @@
+"""KLIP's contrast curve for the frames of a reduction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+from numpy.typing import NDArray
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.pyklip_backend.klip_curve import klip_curve
+from pyklip_diffrender.refinement import FrameFit
+
+NPIX, SIZE = 64, 32
+RESOLUTION = 0.14
+SEPARATIONS = np.array([0.5, 0.8])
+FLUX = 1e9
+
+
+@cache
+def model() -> OpticalSystem:
+    return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE)
+
+
+@cache
+def opd(seed: int) -> NDArray[np.float64]:
+    return np.asarray(dr.random_opd(seed, npix=NPIX).data)
+
+
+def frame(
+    seed: int, angle: float, speckles: float = 0.0, shift: tuple[float, float] = (0.0, 0.0)
+) -> FrameFit:
+    """A frame whose star is `shift` arcsec off the middle, and its perfect fit.
+
+    Parameters
+    ----------
+    seed : int
+        Of the noise and of the wavefront that no other frame has.
+    angle : float
+        Position angle.
+    speckles : float
+        Size of that wavefront over that of the common one.
+    shift : tuple of float
+    """
+    wavefront = opd(1) + speckles * opd(seed) if speckles else opd(1)
+    moved = torch.tensor(shift, dtype=torch.float64)
+    with torch.no_grad():
+        star = FLUX * model()(wavefront, detector_shift=moved).double().numpy()
+    noise = np.sqrt(star + 100.0)
+    data = star + noise * np.random.default_rng(seed).standard_normal(star.shape)
+    scale = model().detector.pixelscale[0]
+    observation = dr.Observation.from_arrays(
+        data,
+        noise,
+        pixelscale=scale,
+        center=(SIZE - 1) / 2 + np.array(shift) / scale,
+        position_angles=angle,
+    )
+    values = {"flux": np.array([FLUX]), "detector_shift": np.array(shift)}
+    return FrameFit(
+        model(), observation, {}, wavefront, star, np.zeros_like(star), values, {},
+        np.ones_like(star),
+    )  # fmt: skip
+
+
+def reduction(
+    science: list[FrameFit], references: list[FrameFit] | tuple[FrameFit, ...] = ()
+) -> Any:
+    """What `klip_curve` uses of a reduction."""
+    curve = SimpleNamespace(meta={"resolution_arcsec": RESOLUTION})
+    return SimpleNamespace(
+        sequence=SimpleNamespace(references=tuple(each.observation for each in references)),
+        detection=SimpleNamespace(
+            fits=(SimpleNamespace(frames=tuple(science)),), contrast_curve=curve
+        ),
+    )
+
+
+def rolls(speckles: float = 0.0) -> list[FrameFit]:
+    return [frame(2, 0.0, speckles), frame(3, 20.0, speckles, (0.02, -0.03))]
+
+
+@cache
+def frames() -> tuple[list[FrameFit], list[FrameFit]]:
+    return rolls(), [frame(4, 0.0, shift=(-0.03, 0.0)), frame(5, 0.0)]
+
+
+@cache
+def quiet() -> NDArray[np.float64]:
+    return np.asarray(klip_curve(reduction(*frames()), SEPARATIONS)["contrast"])
+
+
+def photon_limits(science: list[FrameFit]) -> NDArray[np.float64]:
+    """5-sigma limits for a known star, at one position angle."""
+    templates = Templates(SimpleNamespace(frames=science), science[0])  # type: ignore[arg-type]
+    places = torch.tensor(np.stack([SEPARATIONS, 0 * SEPARATIONS], axis=-1))
+    information = sum(
+        (image.numpy() ** 2 / science[k].observation.error ** 2).sum(axis=(1, 2))
+        for k, image in templates.at(places).items()
+    )
+    return np.asarray(5 / np.sqrt(information))
+
+
+def test_limits_are_near_the_photon_limit_and_not_below() -> None:
+    ratio = quiet() / photon_limits(frames()[0])
+    assert (ratio > 1).all()
+    assert (ratio < 6).all()
+
+
+def test_light_that_no_reference_has_makes_the_limits_worse() -> None:
+    worse = klip_curve(reduction(rolls(0.5), frames()[1]), SEPARATIONS)["contrast"]
+    assert (worse > 2 * quiet()).all()
+
+
+def test_stars_are_aligned() -> None:
+    """Half a pixel between the star and its recorded position makes the limits worse."""
+    science, references = frames()
+    wrong = [
+        replace(each, observation=replace(each.observation, center=each.observation.center + off))
+        for each, off in zip(references, (0.5, -0.5), strict=True)
+    ]
+    assert (klip_curve(reduction(science, wrong), SEPARATIONS)["contrast"] > 1.2 * quiet()).any()
+
+
+def test_companions_of_the_fit_are_not_noise() -> None:
+    science, references = frames()
+    templates = Templates(SimpleNamespace(frames=science), science[0])  # type: ignore[arg-type]
+    light = templates.at(torch.tensor([[0.5, 0.0]], dtype=torch.float64))
+    known = []
+    for k, each in enumerate(science):
+        planet = 1e-2 * light[k][0].numpy()
+        observation = replace(each.observation, data=each.observation.data + planet)
+        known.append(replace(each, observation=observation, companion_image=planet))
+    curve = klip_curve(reduction(known, references), SEPARATIONS)
+    assert curve["contrast"] == pytest.approx(quiet(), rel=1e-6)
+
+
+def test_two_rolls_alone_and_masked_pixels() -> None:
+    science, _ = frames()
+    valid = science[0].observation.valid.copy()
+    valid[0, 20, 20:22] = False
+    hole = replace(
+        science[0],
+        observation=replace(
+            science[0].observation,
+            valid=valid,
+            data=np.where(valid, science[0].observation.data, 0.0),
+        ),
+    )
+    curve = klip_curve(reduction([hole, science[1]]), [500, 800, 5000] * u.mas)
+    assert curve["separation"].to_value(u.arcsec) == pytest.approx(SEPARATIONS)
+    assert list(curve["modes"]) == [1, 1]
+    assert np.isfinite(curve["contrast"]).all()
+    assert (curve["contrast"] < 5 * quiet()).all()
+    assert ((curve["throughput"] > 0) & (curve["throughput"] < 1.1)).all()
+
+
+def test_without_references_there_is_no_curve() -> None:
+    science, references = frames()
+    same = replace(science[1], observation=replace(science[1].observation, position_angles=None))
+    with pytest.raises(IncompatibleSetupError, match="roll without references"):
+        klip_curve(reduction([science[0], same]))
+    with pytest.raises(IncompatibleSetupError, match="rings are complete"):
+        klip_curve(reduction(science, references), 3.0)
