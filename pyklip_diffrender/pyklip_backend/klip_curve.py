@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.reduction import Reduction
     from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["klip_curve"]
+__all__ = ["KlipSubtraction", "klip_curve"]
 
 Image = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def klip_curve(reduction: Reduction, separations: Any = None) -> QTable:
     detection = reduction.detection
     templates = Templates(detection.fits[0], detection.fits[0].frames[0])
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
-    klip = _Klip(templates, reduction.sequence.references, resolution)
+    klip = KlipSubtraction(templates, reduction.sequence.references, resolution)
     # The corners' smaller coordinates.
     edge = np.abs(klip.grid[[0, -1], [0, -1]]).min() - resolution / 2
     if separations is None:
@@ -145,8 +145,8 @@ def klip_curve(reduction: Reduction, separations: Any = None) -> QTable:
     return table
 
 
-class _Klip:
-    """Aligned frames, and their subtraction.
+class KlipSubtraction:
+    """Aligned frames of a fit and of reference stars, and their subtraction with KLIP.
 
     Parameters
     ----------
@@ -155,6 +155,26 @@ class _Klip:
     references : sequence of Observation
     resolution : float
         lambda/D, arcsec.
+
+    Attributes
+    ----------
+    science, references : (frames, ny, nx), and list of (ny, nx)
+        Aligned frames, the star at `center`.
+    center : (2,)
+        x, y of the star in aligned frames, pixels.
+    shifts : (frames, 2)
+        x, y in pixels by which frames were moved.
+    grid : (ny, nx, 2)
+        x, y of the pixels from the star, arcsec.
+    distance : (ny, nx)
+        arcsec.
+    modes : (modes,)
+        Numbers of Karhunen-Loeve modes.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If a roll has no references.
     """
 
     def __init__(
@@ -195,7 +215,7 @@ class _Klip:
                 "klip_curve: got a roll without references, expected frames of reference stars or "
                 f"rolls that differ by more than {_TURN:g} degree"
             )
-        self._modes = np.arange(1, min(_MODES, fewest) + 1)
+        self.modes = np.arange(1, min(_MODES, fewest) + 1)
         # Halfway to the edge the mask does not matter.
         row, column = self.pixel(np.array([self.grid[0, -1, 0] / 2, 0.0]))
         image = templates.at_pixels(np.array([row]), np.array([column]))[0][0].double().numpy()
@@ -211,9 +231,9 @@ class _Klip:
         row, column = np.unravel_index(int(away.argmin()), away.shape)
         return int(row), int(column)
 
-    def images(self, science: Image) -> Image:
-        """Subtracted, turned, averaged and smoothed frames, one for each number of modes."""
-        total = np.zeros((len(self._modes), *self.distance.shape))
+    def residuals(self, science: Image) -> Image:
+        """Frames without the star, turned and averaged, (modes, ny, nx)."""
+        total = np.zeros((len(self.modes), *self.distance.shape))
         for frame, roll, others in zip(science, self.rolls, self._library, strict=True):
             frames = [*(science[j] for j in others), *self.references]
             library = np.array([each[self._zone] for each in frames])
@@ -221,11 +241,16 @@ class _Klip:
             covariance = np.atleast_2d(np.cov(library))
             residual = np.zeros_like(total)
             residual[:, self._zone] = klip_math(
-                frame[self._zone], library, self._modes, covar_psfs=covariance
+                frame[self._zone], library, self.modes, covar_psfs=covariance
             ).T
             turned = [rotate(each, -roll, self.center) for each in residual]
             total += np.nan_to_num(turned) / len(science)
-        return np.array([fftconvolve(each, self._kernel, mode="same") for each in total])
+        return total
+
+    def images(self, science: Image) -> Image:
+        """The residuals smoothed with the image of a planet, (modes, ny, nx)."""
+        residuals = self.residuals(science)
+        return np.array([fftconvolve(each, self._kernel, mode="same") for each in residuals])
 
 
 def _filled(observation: Observation) -> Image:

@@ -21,35 +21,27 @@ import torch
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.plotting.panels import save
-from tests.benchmarks.injections import MODES, PIXEL, SIZE, aligned, planet, subtraction
+from pyklip_diffrender.pyklip_backend.klip_curve import KlipSubtraction
+from pyklip_diffrender.scene.detector_pixels import shift_frames
 
 Image = NDArray[np.float64]
 
+SIZE = 80
 
-def amount(image: Image, light: Image) -> float:
+
+def amount(image: Image, light: Image, distance: Image) -> float:
     """How much of the light an image has, beyond 0.4 arcsec from the star."""
-    y, x = np.indices(light.shape)
-    outside = (np.hypot(x - SIZE / 2, y - SIZE / 2) * PIXEL > 0.4) & np.isfinite(image)
+    outside = (distance > 0.4) & np.isfinite(image)
     return float((image * light)[outside].sum() / (light**2)[outside].sum())
 
 
-def klip(frames: list[Image], base: dr.Reduction, folder: Path) -> list[Image]:
-    """Rolls without the star, turned onto the first one, for each number of modes."""
-    references = [aligned(folder / each.name) for each in base.sequence.references]
-    science = base.sequence.science
-    rolls = [each.roll_from(science[0]) for each in science]
-    return subtraction(frames, references, rolls)
-
-
-def rendered(base: dr.Reduction, disk: dr.Disk, shifts: list[Image]) -> list[Image]:
-    """Light of the sources of a disk in all frames of another star, which is at the shifts."""
-    images = []
-    for frame, each, shift in zip(base.fit.frames, base.sequence.science, shifts, strict=True):
-        roll = each.roll_from(base.sequence.science[0])
-        sources = zip(disk.offsets, disk.contrasts, strict=True)
-        images.append(sum(c * planet(frame, roll, offset, shift) for offset, c in sources))
-    return images
+def klip_of(base: dr.Reduction, sequence: dr.Sequence) -> KlipSubtraction:
+    """KLIP for the fitted frames, with the frames of all other stars of the sequence."""
+    resolution = base.detection.contrast_curve.meta["resolution_arcsec"]
+    references = sequence.cutout(SIZE).references
+    return KlipSubtraction(Templates(base.fit, base.fit.frames[0]), references, resolution)
 
 
 def draw(reduction: dr.Reduction, subtracted: Image, path: Path) -> None:
@@ -104,8 +96,6 @@ def main() -> None:
 
     sequence = read("V-AU-MIC")
     reduction = dr.reduce(replace(sequence, references=()), options.opd, disk=True)
-    reduction = replace(reduction, sequence=replace(reduction.sequence,
-                                                    references=sequence.references))  # fmt: skip
     disk = reduction.disk
     assert disk is not None
     print(reduction)
@@ -114,15 +104,17 @@ def main() -> None:
     for separation in (0.5, 1.0, 1.5, 2.0):
         limit = np.interp(separation, curve["separation"].value, curve["contrast"])
         print(f"5-sigma contrast at {separation} arcsec: {limit:.2e}")
-    files = [options.frames / each.name for each in reduction.sequence.science]
-    subtracted = klip([aligned(each) for each in files], reduction, options.frames)
+    klip = klip_of(reduction, sequence)
+    subtracted = klip.residuals(klip.science)
     if options.figure:
         draw(reduction, subtracted[-1], options.figure)
 
     sequence = read("HIP17695")
     bare = dr.reduce(replace(sequence, references=()), options.opd)
-    shifts = [np.asarray(frame.values["detector_shift"]) for frame in bare.fit.frames]
-    light = rendered(bare, disk, shifts)
+    # At the same places from the other star, in units of it.
+    images = Templates(bare.fit, bare.fit.frames[0]).at(torch.from_numpy(disk.offsets))
+    contrasts = np.asarray(disk.contrasts)
+    light = [np.tensordot(contrasts, each.numpy(), 1) for each in images.values()]
     science = tuple(
         replace(each, data=each.data + image)
         for each, image in zip(bare.sequence.science, light, strict=True)
@@ -134,21 +126,16 @@ def main() -> None:
     alone = dr.refine(bare.fit.model, star_only.science, bare.fit.initial,
                       systematics=bare.systematics)  # fmt: skip
     print("HIP 17695 with the disk:", found.disk)
-    print(f"fitted together: {amount(found.disk.light[0], light[0]):.3f} of the light, image "
-          f"{amount(found.disk.image, light[0]):.3f}")  # fmt: skip
+    klip = klip_of(bare, sequence)
+    kept = amount(found.disk.light[0], light[0], klip.distance)
+    image = amount(found.disk.image, light[0], klip.distance)
+    print(f"fitted together: {kept:.3f} of the light, image {image:.3f}")
     left = np.nan_to_num(alone.frames[0].residual[0])
-    print(f"star fitted alone: {amount(left, light[0]):.3f}")
-    references = replace(bare, sequence=replace(bare.sequence, references=sequence.references))
-    files = [options.frames / each.name for each in sequence.science]
-    plain = [aligned(each) for each in files]
-    # In KLIP's frames the star is in the middle of a pixel.
-    on_aligned = rendered(bare, disk, [np.full(2, 0.5 * PIXEL)] * len(plain))
-    with_disk = [frame + image for frame, image in zip(plain, on_aligned, strict=True)]
-    for count, with_, without in zip(
-        MODES, klip(with_disk, references, options.frames), klip(plain, references, options.frames),
-        strict=True,
-    ):  # fmt: skip
-        print(f"KLIP, {count} modes: {amount(with_ - without, on_aligned[0]):.3f}")
+    print(f"star fitted alone: {amount(left, light[0], klip.distance):.3f}")
+    aligned = shift_frames(np.array(light), klip.shifts)
+    changes = klip.residuals(klip.science + aligned) - klip.residuals(klip.science)
+    for count, change in zip(klip.modes, changes, strict=True):
+        print(f"KLIP, {count} modes: {amount(change, aligned[0], klip.distance):.3f}")
 
 
 if __name__ == "__main__":
