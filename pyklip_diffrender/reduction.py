@@ -9,14 +9,25 @@ from pathlib import Path
 from typing import Any
 
 from astropy import units as u
+from astropy.table import QTable
 
-from pyklip_diffrender.detection import Detection, Disk, WideField, detect, fit_disk, wide_field
+from pyklip_diffrender.detection import (
+    Detection,
+    Disk,
+    WideField,
+    detect,
+    fit_disk,
+    recover_planets,
+    wide_field,
+)
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.io.units import require_bound, to_bytes
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Systematics, refine
 from pyklip_diffrender.refinement.pattern_choice import PatternRequest, choose_systematics
+from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.wavefront.map_choice import wavefront_for
@@ -45,6 +56,8 @@ class Reduction:
         The search of the whole frames, if it was asked for.
     disk : Disk or None
         Extended light about the star, if it was asked for.
+    injections : QTable or None
+        What was measured of injected planets, see `recover_planets`, if it was asked for.
 
     Examples
     --------
@@ -62,6 +75,7 @@ class Reduction:
     failed: tuple[tuple[str, str], ...] = ()
     wide: WideField | None = None
     disk: Disk | None = None
+    injections: QTable | None = None
 
     def __repr__(self) -> str:
         return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"
@@ -102,6 +116,10 @@ class Reduction:
             written.append(self.disk.write(folder))
         if self.systematics is not None:
             written.append(self.systematics.write(folder / "systematics.fits"))
+        if self.injections is not None:
+            written.append(folder / "injections.ecsv")
+            with replacing(written[-1]) as temporary:
+                self.injections.write(temporary, format="ascii.ecsv", overwrite=True)
         return written + report.write_report(self, folder, written)
 
 
@@ -117,6 +135,7 @@ def reduce(
     threshold: float = 5.0,
     wide: bool = False,
     disk: bool = False,
+    injections: int = 0,
     device: str = "cpu",
     memory: float | str | u.Quantity | None = None,
     progress: bool = False,
@@ -151,6 +170,10 @@ def reduce(
         bright enough to be seen in these, the star is fitted once more without their light.
     disk : bool
         Fit extended light about the star, see `fit_disk`, and search the frames without it.
+    injections : int
+        Number of planets to add to the fitted frames, slightly brighter than the limits, to see
+        how well they are recovered; see `recover_planets`. Seven of them take as long as the
+        fit and the search, fewer where the fitted square is smaller than 80 pixels.
     device : str
         PyTorch device of the optical model.
     memory : float, str or Quantity, optional
@@ -179,6 +202,7 @@ def reduce(
     """
     # Before the fits, which take minutes.
     require_bound(threshold, "threshold", "positive")
+    require_bound(injections, "injections", "not negative")
     if wide and disk:
         raise IncompatibleSetupError(
             "got wide=True and disk=True, expected one of them: beyond the fitted pixels a disk "
@@ -206,6 +230,11 @@ def reduce(
         "settings": choice.settings,
         "progress": progress,
     }
+
+    def searched(science: tuple[Observation, ...]) -> Detection:
+        fit = refine(model, science, wavefront, **options)
+        return detect(fit, threshold=threshold, progress=progress)
+
     with stage("2 of 4: wavefront"):
         fit = refine(model, sequence.science, wavefront, **options)
     extended = None
@@ -222,6 +251,10 @@ def reduce(
             fit = refine(model, cleaned, wavefront, **options)
             detection = detect(fit, threshold=threshold, progress=progress)
             outside = wide_field(detection, whole)
+    recovered = None
+    if injections:
+        with stage(f"3 of 4: {injections} injected planets"):
+            recovered = recover_planets(detection, injections, searched)
     return Reduction(
         sequence,
         fit,
@@ -231,4 +264,5 @@ def reduce(
         choice.failed,
         outside,
         extended,
+        recovered,
     )

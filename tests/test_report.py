@@ -286,6 +286,37 @@ def test_with_reference_frames_klip_is_shown_beside(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("_few_pictures")
+@pytest.mark.parametrize("count", [1, 4])
+def test_injected_planets_have_a_section(tmp_path: Path, count: int) -> None:
+    planets = QTable(
+        {
+            "separation": np.linspace(0.3, 0.9, count) * u.arcsec,
+            "position_angle": np.linspace(0, 300, count) * u.deg,
+            "injected": np.full(count, 1e-5), "contrast": np.linspace(0.9e-5, 1.3e-5, count),
+            "contrast_error": np.full(count, 1.5e-6), "snr": np.full(count, 7.0),
+            "detected": np.arange(count) > 0,
+        },
+        meta={"strength": 1.6},
+    )  # fmt: skip
+    whole = replace(reduction(), injections=planets)
+    assert "injections.ecsv" in [path.name for path in whole.write(tmp_path)]
+    assert list(QTable.read(tmp_path / "injections.ecsv")["injected"]) == [1e-5] * count
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["injections"]
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert len(summary["planets"]) == summary["count"] == count
+    assert f"{count - 1} of {count} were detected." in text
+    if count == 1:
+        assert summary["pull_deviation"] is None
+        assert "The mean of recovered" not in text
+    else:
+        # -0.67, 0.22, 1.11 and 2 standard deviations from the truth.
+        assert summary["mean_ratio"] == pytest.approx(1.1)
+        assert summary["within_one_error"] == 0.5
+        assert summary["pull_deviation"] == pytest.approx(np.std([-6, 2, 10, 18], ddof=1) / 9)
+        assert "is 1.10\u00a0±\u00a00.09" in text or "1.10 ± 0.09" in text
+
+
+@pytest.mark.usefixtures("_few_pictures")
 def test_a_failure_of_klip_does_not_break_the_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

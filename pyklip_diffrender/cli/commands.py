@@ -32,7 +32,7 @@ _DEMO = ("demo.fits", "demo.ecsv", "candidates.ecsv", "demo.png")
 _REDUCTION = (
     "detection.fits", "candidates.ecsv", "contrast.ecsv", "fit.fits", "systematics.fits",
     "astrometry.csv", "wide_field.fits", "wide_field_candidates.ecsv", "wide_field_contrast.ecsv",
-    "disk.fits", "report.html", "summary.json", "detection.png",
+    "disk.fits", "injections.ecsv", "report.html", "summary.json", "detection.png",
 )  # fmt: skip
 
 
@@ -294,6 +294,7 @@ def _reduction(
     threshold: float,
     wide: bool,
     disk: bool,
+    injections: int,
     systematics: str,
     memory: str | None,
     opd: Path | None,
@@ -315,7 +316,8 @@ def _reduction(
         if dry_run:
             from pyklip_diffrender.cli.estimate import describe_plan
 
-            click.echo(describe_plan(sequence, size, systematics, wide=wide, disk=disk))
+            parts: dict[str, Any] = {"wide": wide, "disk": disk, "injections": injections}
+            click.echo(describe_plan(sequence, size, systematics, **parts))
             return
         from pyklip_diffrender.io.progress import stage
         from pyklip_diffrender.plotting import draw_detection, save
@@ -333,6 +335,7 @@ def _reduction(
             threshold=threshold,
             wide=wide,
             disk=disk,
+            injections=injections,
             device=run.device,
             memory=memory,
             progress=run.progress,

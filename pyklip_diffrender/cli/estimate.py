@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 from pyklip_diffrender.cli.machine import free_memory
+from pyklip_diffrender.detection.recovery import TOGETHER
 from pyklip_diffrender.refinement import known_systematics
 from pyklip_diffrender.scene.sequence import Sequence
 
@@ -23,11 +27,17 @@ _MEMORY_PER_FRAME = 0.4e9
 
 
 def steps_of(
-    sequence: Sequence, size: int, systematics: str, *, wide: bool = False, disk: bool = False
+    sequence: Sequence,
+    size: int,
+    systematics: str,
+    *,
+    wide: bool = False,
+    disk: bool = False,
+    injections: int = 0,
 ) -> list[tuple[str, float]]:
     """The steps of a reduction, each with its duration on two cores, s.
 
-    `wide` and `disk` are those of `reduce`.
+    `wide`, `disk` and `injections` are those of `reduce`.
 
     Raises
     ------
@@ -53,17 +63,18 @@ def steps_of(
         refit = _DISK * fit * count**_FRAMES
         steps.append(("extended light, and the wavefront without it", refit))
     steps.append(("search of point sources", _SEARCH * area * count))
+    if injections:
+        seconds = fit * count**_FRAMES + _SEARCH * area * count
+        steps.append((f"{injections} injected planets", math.ceil(injections / TOGETHER) * seconds))
     if wide:
         steps.append(("search of the whole frames", _WIDE * count))
     steps.append(("products", _WRITE))
     return steps
 
 
-def describe_plan(
-    sequence: Sequence, size: int, systematics: str, *, wide: bool = False, disk: bool = False
-) -> str:
-    """Steps, time and memory as lines of text."""
-    steps = steps_of(sequence, size, systematics, wide=wide, disk=disk)
+def describe_plan(sequence: Sequence, size: int, systematics: str, **parts: Any) -> str:
+    """Steps, time and memory as lines of text; `parts` are options of `steps_of`."""
+    steps = steps_of(sequence, size, systematics, **parts)
     lines = [f"{k}. {name}: about {_duration(s)}" for k, (name, s) in enumerate(steps, 1)]
     total = sum(seconds for _, seconds in steps)
     memory = _MEMORY + _MEMORY_PER_FRAME * len(sequence.science) * (size / 80) ** 2

@@ -226,6 +226,10 @@ search = _all(
            help="Search the whole frames as well, to their edge."),
     option("--disk", is_flag=True, section="Fit and search",
            help="Fit extended light about the star, such as a disk, together with the star."),
+    option("--injections", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
+           section="Fit and search",
+           help="Add N planets slightly brighter than the limits to the frames, and report how "
+                "well they are recovered. Seven take as long as the fit and the search."),
     option("--systematics", default="auto", show_default=True, metavar="CHOICE",
            section="Fit and search",
            help="Pattern of the model's error: auto (the package's library, else the reference "

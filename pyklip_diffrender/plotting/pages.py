@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.plotting.panels import (
+    ACCENT,
+    INK,
     detector_extent,
     draw_compass,
     extent_of,
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
 
     from pyklip_diffrender.detection import Detection, Disk, WideField
 
-__all__ = ["draw_disk", "draw_search", "draw_star", "draw_wavefronts"]
+__all__ = ["draw_disk", "draw_injections", "draw_search", "draw_star", "draw_wavefronts"]
 
 _SIZE = (4.6, 3.7)
 """Of a panel, inches: its letters are as large as a page's where it is as wide as a phone."""
@@ -119,6 +121,30 @@ def draw_wavefronts(
         ax.set_xlabel("x in the entrance pupil (m)")
         ax.set_ylabel("y in the entrance pupil (m)")
     return figures
+
+
+def draw_injections(planets: QTable) -> Figure:
+    """Recovered over injected contrast of planets against separation.
+
+    Parameters
+    ----------
+    planets : QTable
+        See `recover_planets`.
+    """
+    (figure,), (ax,) = _panels(1)
+    ratio, error = (
+        np.asarray(planets[name] / planets["injected"]) for name in ("contrast", "contrast_error")
+    )
+    separation, detected = planets["separation"].value, np.asarray(planets["detected"])
+    for kept, face in ((detected, ACCENT), (~detected, "white")):
+        ax.errorbar(
+            separation[kept], ratio[kept], error[kept], fmt="o", color=ACCENT, mfc=face, capsize=2
+        )
+    ax.axhline(1.0, color=INK, ls="--", lw=1)
+    ax.set_ylim(0.0, max(2.0, 1.1 * float(np.nanmax(ratio + error))))
+    ax.set_xlabel("separation (arcsec)")
+    ax.set_ylabel("recovered / injected")
+    return figure
 
 
 def _limit(*maps: NDArray[np.float64]) -> float:

@@ -40,6 +40,7 @@ _PRODUCTS = {
     "candidates.ecsv": "the candidates with all columns",
     "contrast.ecsv": "the contrast curve",
     "astrometry.csv": "epoch and positions of the candidates, for orbitize!",
+    "injections.ecsv": "injected planets, and what was measured of them",
     "disk.fits": "the extended light: frames without the star, and its sources",
     "fit.fits": "the fit, for Refinement.read",
     "systematics.fits": "the pattern of the model's error, for other reductions",
@@ -56,6 +57,7 @@ def page(
     wide: Sequence[Picture] = (),
     disk: Sequence[Picture] = (),
     files: Sequence[str] = (),
+    injections: str = "",
 ) -> str:
     """The report.
 
@@ -69,6 +71,8 @@ def page(
         One for each frame of the target that is shown.
     files : sequence of str
         Names of the files that were written with it.
+    injections : str
+        A section, see `injections_section`.
 
     Returns
     -------
@@ -92,6 +96,7 @@ def page(
             if disk
             else []
         ),
+        *filter(None, [injections]),
         pieces.section("Star subtraction", *_star(summary, stars)),
         pieces.section("Wavefront", _wavefront(summary), pieces.pictures(wavefront)),
         pieces.section("Frames", _frames(summary), _left_out(summary)),

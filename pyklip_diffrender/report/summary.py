@@ -86,6 +86,7 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
         "limits": _limits(detection),
         "contrast_curve": _curve(detection.contrast_curve),
         "klip_curve": None if klip is None else _curve(klip),
+        "injections": None if reduction.injections is None else _injected(reduction.injections),
         "frames": [
             *(_frame(each, "target") for each in sequence.science),
             *(_frame(each, "reference") for each in sequence.references),
@@ -192,6 +193,25 @@ def _disk(disk: Disk) -> dict[str, Any]:
         "sources": len(disk.contrasts),
         "chi2_decrease": disk.gain,
         "position_angle_deg": disk.orientation,
+    }
+
+
+def _injected(planets: QTable) -> dict[str, Any]:
+    """Injected planets, and how well they were recovered.
+
+    Pulls are differences from the injected contrasts over their errors.
+    """
+    ratio = np.asarray(planets["contrast"] / planets["injected"])
+    pull = np.asarray((planets["contrast"] - planets["injected"]) / planets["contrast_error"])
+    several = len(pull) > 1
+    return {
+        "count": len(planets),
+        "detected": np.sum(planets["detected"]),
+        "mean_ratio": ratio.mean(),
+        "mean_ratio_error": ratio.std(ddof=1) / math.sqrt(len(ratio)) if several else None,
+        "pull_deviation": pull.std(ddof=1) if several else None,
+        "within_one_error": np.mean(np.abs(pull) < 1),
+        "planets": _rows(planets),
     }
 
 

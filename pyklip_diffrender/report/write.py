@@ -13,6 +13,7 @@ from astropy.table import QTable
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.reduction import Reduction
 from pyklip_diffrender.report.html import page
+from pyklip_diffrender.report.injections import injections_section
 from pyklip_diffrender.report.pictures import (
     MOST_FRAMES,
     disk_pictures,
@@ -57,6 +58,7 @@ def write_report(
         [] if reduction.wide is None else wide_pictures(reduction.wide),
         [] if reduction.disk is None else disk_pictures(reduction.disk),
         [path.name for path in (*files, html, data)],
+        "" if reduction.injections is None else injections_section(summary, reduction.injections),
     )
     written = {html: text, data: json.dumps(summary, indent=2, allow_nan=False) + "\n"}
     for path, content in written.items():

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pyklip_diffrender.detection import measured_planet
 from pyklip_diffrender.reduction import Reduction, reduce
 from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement, Systematics
 from pyklip_diffrender.report import summarise, write_report
@@ -20,9 +21,6 @@ from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.surveys.jobs import Injection, Job
 
 __all__ = ["planet_image", "reduce_job"]
-
-_SAME = 0.1
-"""A candidate this near to an injected planet is the planet, arcsec."""
 
 
 def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str, Any]:
@@ -123,10 +121,7 @@ def _recovered(reduction: Reduction, planet: Injection) -> dict[str, Any]:
     """What is measured of an injected planet: of its candidate, else at its place."""
     found = reduction.detection
     place = np.array(_place(planet, found.north))
-    table = found.table
-    distances = np.hypot(table["x"].value - place[0], table["y"].value - place[1])
-    detected = bool(len(table)) and float(distances.min()) < _SAME
-    row = table[int(distances.argmin())] if detected else found.measure([place])[0]
+    row, detected = measured_planet(found, place)
     values = {key: float(row[key]) for key in ("contrast", "contrast_error", "snr")}
     finite = {key: value if math.isfinite(value) else None for key, value in values.items()}
     return {**finite, "detected": detected}

@@ -1,0 +1,163 @@
+"""Planets that are added to fitted frames, and what the same reduction measures of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from astropy import units as u
+from astropy.table import QTable, Row
+from numpy.typing import NDArray
+
+from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["TOGETHER", "measured_planet", "recover_planets"]
+
+_STRENGTH = 1.6
+"""Contrast of an injected planet over the limit at its separation. At a limit of 5 sigma, nearly
+all planets of 8 sigma should be detected."""
+
+TOGETHER = 7
+"""Largest number of planets in the frames at a time."""
+
+_APART = 0.3
+"""Smallest distance in separation of planets in the frames at a time, arcsec: of images that
+overlap, each is noise for the others."""
+
+_FRACTION = 0.618
+"""The golden section, whose multiples modulo 1 are spread evenly."""
+
+_SAME = 0.1
+"""A candidate this near to an injected planet is the planet, arcsec."""
+
+_CLEAR = 0.3
+"""Distance of injected planets from candidates, arcsec."""
+
+_GOLDEN = 137.5
+"""Degrees between neighbours in separation."""
+
+_NEXT = 47.0
+"""Degrees between planets at the same separation, one set and the next."""
+
+_STEP = 10.0
+"""Degrees by which a planet is moved on until its place is free."""
+
+_COLUMNS = {
+    "separation": ".3f",
+    "position_angle": ".1f",
+    "injected": ".2e",
+    "contrast": ".2e",
+    "contrast_error": ".1e",
+    "snr": ".1f",
+    "detected": None,
+}
+_UNITS = {"separation": u.arcsec, "position_angle": u.deg}
+
+
+def recover_planets(
+    detection: Detection, count: int, search: Callable[[tuple[Observation, ...]], Detection]
+) -> QTable:
+    """Add planets to the frames of a detection and search them again.
+
+    The planets are spread over all separations and angles, up to seven at a time, and are 1.6 times
+    as bright as the contrast curve's limit at their separations.
+
+    Parameters
+    ----------
+    detection : Detection
+    count : int
+        Number of planets.
+    search : callable
+        Fits and searches frames of the target as it was done for the detection.
+
+    Returns
+    -------
+    QTable
+        One row for each planet: where it was injected (as in the table of candidates), its
+        contrast, what was measured, and whether it was among the candidates. If it was not, the
+        contrast is what is measured at its place.
+    """
+    fit = detection.fits[0]
+    templates = Templates(fit, fit.frames[0])
+    curve = detection.contrast_curve
+    planets = QTable(names=list(_COLUMNS), dtype=[float] * (len(_COLUMNS) - 1) + [bool])
+    inner, outer = (float(end) for end in curve["separation"].value[[0, -1]])
+    together = int(np.clip((outer - inner) / _APART, 1, TOGETHER))
+    for trial, start in enumerate(range(0, count, together)):
+        rings = min(together, count - start)
+        # Other separations in every set, so that sets fill the gaps.
+        parts = (np.arange(rings) + (0.5 + _FRACTION * trial) % 1) / rings
+        separations = inner + (outer - inner) * parts
+        limits = np.interp(separations, curve["separation"].value, curve["contrast"])
+        places = np.array(
+            [
+                _free_place(detection, separation, _GOLDEN * k + _NEXT * trial)
+                for k, separation in enumerate(separations)
+            ]
+        )
+        contrasts = _STRENGTH * limits
+        light = templates.at(torch.from_numpy(places))
+        science = []
+        for k, frame in templates.frames.items():
+            added = np.tensordot(contrasts, light[k].numpy(), 1)
+            science.append(replace(frame.observation, data=frame.observation.data + added))
+        again = search(tuple(science))
+        for place, contrast in zip(places, contrasts, strict=True):
+            row, detected = measured_planet(again, place)
+            planet = Planet.from_offset(contrast, *place)
+            angle = (planet.position_angle + detection.north) % 360
+            measured = (row["contrast"], row["contrast_error"], row["snr"], detected)
+            planets.add_row((planet.separation, angle, contrast, *measured))
+    for name, unit in _UNITS.items():
+        planets[name] = planets[name] * unit
+    for name, form in _COLUMNS.items():
+        planets[name].info.format = form
+    planets.meta["strength"] = _STRENGTH
+    return planets
+
+
+def measured_planet(detection: Detection, place: NDArray[np.float64]) -> tuple[Row, bool]:
+    """What is measured of a planet of which the position is known.
+
+    Parameters
+    ----------
+    detection : Detection
+    place : ndarray, (2,)
+        x, y from the star in the first frame, arcsec.
+
+    Returns
+    -------
+    row : Row
+        Of the candidate within 0.1 arcsec, or else of a measurement at the place.
+    detected : bool
+        Whether there is such a candidate.
+    """
+    table = detection.table
+    distances = np.hypot(table["x"].value - place[0], table["y"].value - place[1])
+    if len(table) and distances.min() < _SAME:
+        return table[int(distances.argmin())], True
+    return detection.measure([place])[0], False
+
+
+def _free_place(detection: Detection, separation: float, angle: float) -> NDArray[np.float64]:
+    """x, y at a separation, where the map has a value and no candidate is near.
+
+    The first such place counter-clockwise from the angle; if there is none, that at the angle.
+    """
+    table = detection.table
+    candidates = np.stack([table["x"].value, table["y"].value], axis=-1)
+    turns = np.arange(0, 360, _STEP).tolist()
+    circle: list[NDArray[np.float64]] = [
+        np.array(Planet(1.0, separation, angle + turn).offset) for turn in turns
+    ]
+    for place in circle:
+        away = np.hypot(*np.moveaxis(detection.grid - place, -1, 0))
+        covered = np.isfinite(detection.snr[np.unravel_index(away.argmin(), away.shape)])
+        if covered and (np.hypot(*(candidates - place).T) > _CLEAR).all():
+            return place
+    return circle[0]

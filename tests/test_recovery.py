@@ -1,0 +1,159 @@
+"""Planets that are injected into fitted frames, and what is measured of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+from astropy.table import QTable
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.detection import measured_planet, recover_planets
+from pyklip_diffrender.detection.recovery import TOGETHER, _free_place
+
+NORTH = 20.0
+SIZE = 41
+PIXEL = 0.06
+LIMIT = 1e-4
+
+
+class Light:
+    """In place of `Templates`: a planet is its contrast, on the pixel of its place."""
+
+    def __init__(self, fit: Any, _: Any) -> None:
+        self.frames = dict(enumerate(fit.frames))
+
+    def at(self, places: torch.Tensor) -> dict[int, torch.Tensor]:
+        images = np.zeros((len(places), SIZE, SIZE))
+        x, y = np.round(places.numpy().T / PIXEL + SIZE // 2).astype(int)
+        images[np.arange(len(places)), y, x] = 1.0
+        return {k: torch.from_numpy((k + 1) * images) for k in self.frames}
+
+
+def searched(science: tuple[dr.Observation, ...] | None = None, **changes: Any) -> Any:
+    """A search that measures what is on the pixel, with an error of a tenth of the limit."""
+    y, x = np.indices((SIZE, SIZE))
+    grid = (np.stack([x, y], axis=-1) - SIZE // 2) * PIXEL
+    snr = np.where(np.hypot(*np.moveaxis(grid, -1, 0)) < 1.1, 0.0, np.nan)
+    frames = [
+        dr.Observation.from_arrays(np.zeros((SIZE, SIZE)), np.ones((SIZE, SIZE)), pixelscale=PIXEL)
+    ] * 2
+
+    def measure(places: Any) -> QTable:
+        assert science is not None
+        assert (science[1].data == 2 * science[0].data).all()
+        values = [
+            science[0].data[0][tuple(np.round(place / PIXEL + SIZE // 2).astype(int)[::-1])]
+            for place in places
+        ]
+        return table(np.zeros((len(places), 2)), values)
+
+    curve = QTable({"separation": [0.2, 1.0] * u.arcsec, "contrast": [2 * LIMIT, LIMIT]})
+    values = {
+        "fits": [SimpleNamespace(frames=[SimpleNamespace(observation=each) for each in frames])],
+        "grid": grid, "snr": snr, "north": NORTH, "contrast_curve": curve, "measure": measure,
+        "table": table(np.zeros((0, 2)), []),
+    }  # fmt: skip
+    return SimpleNamespace(**{**values, **changes})
+
+
+def table(places: Any, contrasts: Any) -> QTable:
+    contrasts = np.asarray(contrasts, dtype=float)
+    return QTable(
+        {
+            "x": places[:, 0] * u.arcsec, "y": places[:, 1] * u.arcsec, "contrast": contrasts,
+            "contrast_error": 0.1 * LIMIT * np.ones(len(contrasts)),
+            "snr": 10 * contrasts / LIMIT,
+        }
+    )  # fmt: skip
+
+
+@pytest.fixture
+def _light(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pyklip_diffrender.detection.recovery.Templates", Light)
+
+
+@pytest.mark.usefixtures("_light")
+@pytest.mark.parametrize("count", [1, 5])
+def test_planets_are_as_bright_as_stated_and_where_they_are_said_to_be(count: int) -> None:
+    sets: list[tuple[dr.Observation, ...]] = []
+
+    def search(science: tuple[dr.Observation, ...]) -> Any:
+        sets.append(science)
+        return searched(science)
+
+    planets = recover_planets(searched(), count, search)
+    assert len(planets) == count
+    limit = np.interp(planets["separation"].value, [0.2, 1.0], [2 * LIMIT, LIMIT])
+    assert np.asarray(planets["injected"]) == pytest.approx(1.6 * limit)
+    # What was measured at the place is what was injected there.
+    assert np.asarray(planets["contrast"]) == pytest.approx(np.asarray(planets["injected"]))
+    assert not planets["detected"].any()
+    # Two in a field of 0.8 arcsec.
+    assert [np.count_nonzero(each[0].data) for each in sets] == [2] * (count // 2) + [1]
+    seen = {
+        tuple(np.round((np.array(pixel[::-1]) - SIZE // 2) * PIXEL, 6))
+        for each in sets
+        for pixel in np.argwhere(each[0].data[0]).tolist()
+    }
+    for row in planets:
+        angle = float(row["position_angle"].value) - NORTH
+        place = dr.Planet(1.0, float(row["separation"].value), angle).offset
+        assert min(np.hypot(x - place[0], y - place[1]) for x, y in seen) < 0.75 * PIXEL
+    assert len(set(np.round(planets["separation"].value, 3))) == count
+    assert "..." not in str(planets)
+
+
+@pytest.mark.usefixtures("_light")
+def test_sets_have_at_most_seven_planets_in_a_wide_field() -> None:
+    wide = QTable({"separation": [0.2, 1.1] * u.arcsec, "contrast": [LIMIT, LIMIT]})
+    sizes: list[int] = []
+
+    def search(science: tuple[dr.Observation, ...]) -> Any:
+        sizes.append(np.count_nonzero(science[0].data))
+        return searched(science)
+
+    recover_planets(searched(contrast_curve=wide), 4, search)
+    assert sizes == [3, 1]
+    assert TOGETHER == 7
+
+
+@pytest.mark.parametrize(
+    ("away", "expected"), [((0.05, 0.0), (7e-4, True)), ((0.5, 0.5), (1e-4, False))]
+)
+def test_a_planet_is_its_candidate_or_what_is_measured_at_its_place(
+    away: tuple[float, float], expected: tuple[float, bool]
+) -> None:
+    place = np.array([0.3, -0.6])
+    data = np.zeros((SIZE, SIZE))
+    data[SIZE // 2 - 10, SIZE // 2 + 5] = 1e-4
+    frames = tuple(
+        dr.Observation.from_arrays(k * data, np.ones_like(data), pixelscale=PIXEL) for k in (1, 2)
+    )
+    candidates = table(np.array([[1.0, 1.0], place + away]), [1e-3, 7e-4])
+    row, detected = measured_planet(searched(frames, table=candidates), place)
+    assert (row["contrast"], detected) == (pytest.approx(expected[0]), expected[1])
+
+
+def covered(keep: Callable[[Any, Any], Any]) -> Any:
+    plain = searched()
+    x, y = np.moveaxis(plain.grid, -1, 0)
+    return searched(snr=np.where(keep(x, y), plain.snr, np.nan))
+
+
+def test_planets_keep_away_from_candidates_and_from_pixels_without_a_value() -> None:
+    first = _free_place(searched(), 0.6, 0.0)
+    assert first == pytest.approx([0.0, 0.6])
+    candidate = searched(table=table(first[None], [1e-3]))
+    moved = _free_place(candidate, 0.6, 0.0)
+    assert np.hypot(*moved) == pytest.approx(0.6)
+    assert 0.3 < np.hypot(*(moved - first)) < 0.5
+    below = _free_place(covered(lambda x, y: y < 0), 0.6, 0.0)
+    assert below[1] < 0
+    # Without any such place, planets are not left out.
+    assert _free_place(covered(lambda x, y: x > 9), 0.6, 0.0) == pytest.approx(first)
