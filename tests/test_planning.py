@@ -24,7 +24,8 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_bandpass
-from pyklip_diffrender.linear.response import NANOMETRE, coarse_copy, coarse_npix, downsample
+from pyklip_diffrender.linear.mode_fields import NANOMETRE
+from pyklip_diffrender.linear.response import coarse_copy, coarse_npix, downsample
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.grid import PupilGrid

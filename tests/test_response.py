@@ -12,9 +12,9 @@ from scipy.stats import multivariate_normal
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
 from pyklip_diffrender.linear.response import (
-    NANOMETRE,
     Responses,
     WavefrontResponse,
     coarse_copy,

@@ -10,7 +10,7 @@ from torch import Tensor
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.linear.frames import LinearFrame
-from pyklip_diffrender.linear.response import NANOMETRE
+from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 
 __all__ = ["calibration_errors"]

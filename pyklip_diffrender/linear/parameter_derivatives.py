@@ -5,7 +5,7 @@ As in `response`, the derivative of the complex field may come from a coarser mo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -45,21 +45,48 @@ def field_derivatives(
     moved = {name: values[name] for name in names if name not in _IMAGE_PARAMETERS}
     if not moved:
         return {}
-    # Constants are not kept within a transform, so the model makes them here.
+    behind = {name: value for name, value in moved.items() if name in model.parameters_behind}
+    before = {name: value for name, value in moved.items() if name not in behind}
+    wavelengths = model.bandpass.wavelengths
     with torch.no_grad():
         at = model.values(values)
-        for wavelength in model.bandpass.wavelengths:
-            model.propagate(model.pupil_field(model.opd(opd), wavelength, at), at)
+        waves = [model.pupil_field(model.opd(opd), each, at) for each in wavelengths]
+        if before:
+            # Constants are not kept within a transform, so the model makes them here.
+            for wave in waves:
+                model.propagate(wave, at)
+        if behind:
+            waves = [model.behind_occulter(wave, at) for wave in waves]
 
-    def fields(varied: dict[str, Tensor]) -> list[Tensor]:
+    def all_the_way(varied: dict[str, Tensor]) -> list[Tensor]:
+        return model.fields(opd, **{**values, **varied})
+
+    def last_part(varied: dict[str, Tensor]) -> list[Tensor]:
+        moved = model.values({**values, **varied})
+        return [model.to_detector(wave, moved) for wave in waves]
+
+    slopes = _slopes(all_the_way, before)
+    for name, value in behind.items():
+        # One by one, because the costs of a pass grow with the number of components.
+        slopes |= _slopes(last_part, {name: value})
+    return slopes
+
+
+def _slopes(
+    fields: Callable[[dict[str, Tensor]], list[Tensor]], values: dict[str, Tensor]
+) -> dict[str, list[Tensor]]:
+    """Derivatives of complex fields, (components, ny, nx) each."""
+    if not values:
+        return {}
+
+    def parts(varied: dict[str, Tensor]) -> list[Tensor]:
         # Complex outputs of jacfwd would need complex inputs.
-        return [torch.view_as_real(field) for field in model.fields(opd, **{**values, **varied})]
+        return [torch.view_as_real(field) for field in fields(varied)]
 
-    # All names together, because one pass costs as much for five components as for one.
-    slopes = jacfwd(fields)(moved)
+    slopes = jacfwd(parts)(values)
     return {
         name: [torch.view_as_complex(s[name].movedim(-1, 0).contiguous()) for s in slopes]
-        for name in moved
+        for name in values
     }
 
 

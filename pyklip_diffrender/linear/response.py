@@ -11,20 +11,19 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.linear.mode_fields import ModeFields
 from pyklip_diffrender.linear.parameter_derivatives import field_derivatives, image_derivatives
-from pyklip_diffrender.optics.grid import PupilGrid, samples_for_field
+from pyklip_diffrender.optics.grid import samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.bases import Basis
 
 __all__ = [
-    "NANOMETRE",
     "Responses",
     "WavefrontResponse",
     "coarse_copy",
@@ -33,9 +32,6 @@ __all__ = [
 ]
 
 _log = logging.getLogger(__name__)
-
-NANOMETRE = 1e-9
-"""Wavefront coefficients are in nm inside a fit, so that its numbers are of order 1."""
 
 _CELLS = 1.9
 """Cells of the occulter per lambda/D. With this number one cell per pixel is enough at all
@@ -145,11 +141,7 @@ class WavefrontResponse:
         samples = math.prod(coarse.entrance.grid.shape)
         self._batch = max(1, int(_BATCH_BYTES / (complex_bytes * samples) / 2))
         small = downsample(opd, coarse.npix)
-        self._values = coarse.values(values)
-        with torch.no_grad():
-            self._pupils = [
-                coarse.pupil_field(small, w, self._values) for w in bandpass.wavelengths
-            ]
+        self._mode_fields = ModeFields(coarse, basis, small, values)
         self._slopes = field_derivatives(coarse, small, values, names)
         if stored:
             self.store()
@@ -165,7 +157,7 @@ class WavefrontResponse:
         count = len(self.basis)
         fields = [
             torch.empty(count, ny, nx, dtype=torch.complex64, device=self.model.device)
-            for _ in self._pupils
+            for _ in self.coarse.bandpass.wavelengths
         ]
         with ProgressBar("response", count, shown=self._progress) as bar:
             for start in range(0, count, self._batch):
@@ -180,22 +172,11 @@ class WavefrontResponse:
         """Free the memory of the derivatives."""
         self._fields = None
 
-    @torch.no_grad()
     def _changes(self, part: slice) -> list[Tensor]:
         """Derivatives of the field with respect to some modes, for each wavelength."""
         if self._fields is not None:
             return [kept[part] for kept in self._fields]
-        coarse = self.coarse
-        full = PupilGrid.full(coarse.npix, coarse.diameter)
-        sampled = self.basis.modes(full, part.start, part.stop)
-        modes = coarse.entrance.on_window(sampled).to(self.model.device, coarse.dtype)
-        changes = []
-        for wavefront in self._pupils:
-            # d(exp(i k OPD)) = i k exp(i k OPD) d(OPD), for 1 nm.
-            wavenumber = 2 * math.pi / wavefront.wavelength * NANOMETRE
-            moved = replace(wavefront, field=modes * (1j * wavenumber * wavefront.field))
-            changes.append(coarse.propagate(moved, self._values).to(torch.complex64))
-        return changes
+        return self._mode_fields.changes(part)
 
     def image(
         self,

@@ -20,6 +20,7 @@ from pyklip_diffrender.io.units import require_finite, to_metres, to_unit, warn_
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.fast.path import LatticeRoute
+from pyklip_diffrender.optics.fast.plane_waves import PlaneWaves
 from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.optics.planes import (
     CompactOcculter,
@@ -206,6 +207,58 @@ class Propagation:
         if self._lattice is not None:
             return self._lattice.field(wavefront, values, windows)
         for plane, onto in zip(self.planes, windows, strict=True):
+            wavefront = plane.apply(wavefront, values, onto)
+        return self.detector.field(wavefront, values)
+
+    def plane_waves(self, wavefront: Wavefront, values: Values, reach: int) -> PlaneWaves | None:
+        """Prepare the propagation of a field behind the entrance pupil times plane waves.
+
+        Parameters
+        ----------
+        wavefront : Wavefront
+        values : mapping of str to Tensor
+        reach : int
+            Largest number of cycles across the pupil array along an axis.
+
+        Returns
+        -------
+        PlaneWaves or None
+            None where that is not faster than `propagate`.
+        """
+        if self._lattice is None:
+            return None
+        return self._lattice.plane_waves(wavefront, values, self.windows(values), reach)
+
+    @property
+    def _last_occulter(self) -> int:
+        """Number of planes up to the last occulter."""
+        return max((k + 1 for k, plane in enumerate(self.planes) if is_occulter(plane)), default=0)
+
+    @property
+    def parameters_behind(self) -> frozenset[str]:
+        """Names of the parameters of the planes behind the last occulter, and of the detector."""
+        behind = {n for plane in self.planes[self._last_occulter :] for n in plane.parameters}
+        before = {n for plane in self.planes[: self._last_occulter] for n in plane.parameters}
+        names = behind | set(self.detector.parameters)
+        return frozenset(names - before - set(self.entrance.parameters))
+
+    def behind_occulter(self, wavefront: Wavefront, values: Values) -> Wavefront:
+        """Propagate from behind the entrance pupil to the pupil behind the last occulter.
+
+        Together with `to_detector` this is `propagate`. It is slower, but what it returns does not
+        depend on `parameters_behind`.
+        """
+        windows = self.windows(values)
+        if self._lattice is not None:
+            return self._lattice.behind_occulter(wavefront, values, windows)
+        for plane, onto in zip(self.planes[: self._last_occulter], windows, strict=False):
+            wavefront = plane.apply(wavefront, values, onto)
+        return wavefront
+
+    def to_detector(self, wavefront: Wavefront, values: Values) -> Tensor:
+        """Field on the detector's samples from that in the pupil behind the last occulter."""
+        first = self._last_occulter
+        for plane, onto in zip(self.planes[first:], self.windows(values)[first:], strict=True):
             wavefront = plane.apply(wavefront, values, onto)
         return self.detector.field(wavefront, values)
 

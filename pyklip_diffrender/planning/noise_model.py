@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import NoValidPixelsError, ShapeError
-from pyklip_diffrender.linear.response import NANOMETRE
+from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.planning.choice import ModelError
 from pyklip_diffrender.scene.objects import Scene

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
+from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.linear.response import (
-    NANOMETRE,
     Responses,
     WavefrontResponse,
     coarse_copy,
@@ -21,6 +20,9 @@ from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.refinement.problem import Problem
 
 __all__ = ["Forward", "Point"]
+
+_DIFFERENCE = 5e-4
+"""arcsec between images whose difference is a derivative; accurate to 1e-4."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +156,8 @@ class Forward:
             first = companions.start + 3 * k
             with torch.no_grad():
                 rows[first] = (flux * self.coarse(opd, **source_values)).cpu()
-            moved = parameter_jacobian(self.coarse, opd, source_values, ("star_offset",)).double()
-            turned = torch.tensordot(unknowns.turn.T, moved.cpu(), dims=1)
+            moved = self._position_slopes(opd, source_values)
+            turned = torch.tensordot(unknowns.turn.T, moved, dims=1)
             rows[first + 1 : first + 3] = flux * source[0] * turned
         if response is not None:
             amplitude = unknowns.where("amplitude")
@@ -164,6 +166,19 @@ class Forward:
             rows[amplitude] = slopes[modes:].cpu()
             rows[amplitude.stop :] = slopes[:modes].cpu()
         return rows
+
+    def _position_slopes(self, opd: Tensor, values: dict[str, Tensor]) -> Tensor:
+        """Derivatives with respect to x and y of a source, (2, ny, nx), per arcsec, on the CPU.
+
+        Central differences: four images take a quarter of the time of forward-mode derivatives.
+        """
+        offset, slopes = values["star_offset"], []
+        for step in _DIFFERENCE * torch.eye(2, dtype=offset.dtype, device=offset.device):
+            with torch.no_grad():
+                ahead = self.coarse(opd, **{**values, "star_offset": offset + step})
+                behind = self.coarse(opd, **{**values, "star_offset": offset - step})
+            slopes.append((ahead.double() - behind.double()).cpu() / (2 * _DIFFERENCE))
+        return torch.stack(slopes)
 
     def _response_at(self, point: Point) -> WavefrontResponse:
         """The response of the field, computed at nearly the same wavefront."""

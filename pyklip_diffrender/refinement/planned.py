@@ -14,7 +14,7 @@ import torch
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.frames import Unknown
-from pyklip_diffrender.linear.response import NANOMETRE
+from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import ModelError, Plan, plan

@@ -21,7 +21,7 @@ from pyklip_diffrender.instrument.jwst import TABULATED_GAP, is_jwst_pupil, jwst
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
 from pyklip_diffrender.optics.planes import EntrancePupil
 
-__all__ = ["Basis", "FourierModes", "JointBasis", "SegmentMotions", "default_basis"]
+__all__ = ["Basis", "FourierModes", "JointBasis", "SegmentMotions", "default_basis", "fourier_part"]
 
 
 class Basis(Protocol):
@@ -136,6 +136,9 @@ class FourierModes:
 
     groups = ("texture",)
 
+    amplitude = math.sqrt(2)
+    """Of the cosines and sines, whose rms is 1."""
+
     def __init__(self, max_cycles: float = 24.0, min_cycles: float = 0.5) -> None:
         self.max_cycles, self.min_cycles = float(max_cycles), float(min_cycles)
         reach = math.floor(max_cycles)
@@ -157,6 +160,11 @@ class FourierModes:
         return torch.zeros(len(self), dtype=torch.int64)
 
     @property
+    def reach(self) -> int:
+        """Largest number of cycles along an axis."""
+        return self._reach
+
+    @property
     def frequencies(self) -> Tensor:
         return torch.linalg.vector_norm(self.cycles.double(), dim=1).repeat_interleave(2)
 
@@ -165,7 +173,7 @@ class FourierModes:
         waves = []
         for axis, positions in ((0, grid.x), (1, grid.y)):
             angle = (2 * math.pi / grid.diameter) * pairs[:, axis, None] * positions
-            waves.append(math.sqrt(2) ** 0.5 * torch.complex(torch.cos(angle), torch.sin(angle)))
+            waves.append(self.amplitude**0.5 * torch.complex(torch.cos(angle), torch.sin(angle)))
         # A plane wave is a product of waves in x and y, which saves trigonometry on the full grid.
         product = waves[1][:, :, None] * waves[0][:, None, :]
         stacked = torch.stack([product.real, product.imag], dim=1)
@@ -186,7 +194,7 @@ class FourierModes:
         in_y = 2 * math.pi / grid.diameter * grid.y[:, None] * fy
         waves_x = torch.complex(torch.cos(in_x), torch.sin(in_x))
         waves_y = torch.complex(torch.cos(in_y), torch.sin(in_y))
-        return math.sqrt(2) * (waves_y @ table @ waves_x).real
+        return self.amplitude * (waves_y @ table @ waves_x).real
 
 
 class JointBasis:
@@ -227,6 +235,12 @@ class JointBasis:
             total = total + part.opd(coefficients[offset : offset + len(part)], grid)
             offset += len(part)
         return total
+
+
+def fourier_part(basis: Basis) -> tuple[int, FourierModes] | None:
+    """Return the last modes of a basis, if they are Fourier modes, and the number before them."""
+    last = basis.parts[-1] if isinstance(basis, JointBasis) else basis
+    return (len(basis) - len(last), last) if isinstance(last, FourierModes) else None
 
 
 def default_basis(max_cycles: float = 24.0, pupil: EntrancePupil | None = None) -> Basis:

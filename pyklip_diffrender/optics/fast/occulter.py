@@ -199,6 +199,14 @@ class OcculterLattice:
         transform = self._transform(wavefront, self.x.positions, self.y.positions)
         return transform.forward(wavefront.field)
 
+    def to_pupil(self, light: Tensor, wavefront: Wavefront) -> Tensor:
+        """Field of light on the cells, back in the pupil on the grid of a wavefront.
+
+        The light is `focus` times `blocked` per sample of the detector.
+        """
+        transform = self._transform(wavefront, self.x.positions, self.y.positions)
+        return transform.inverse(light, self.wavelength)
+
     def kernel(self, stop: Wavefront, axes: Sequence[Tensor]) -> Tensor:
         """Transform of the kernel of the convolution, (phases in y, phases in x, n, m).
 

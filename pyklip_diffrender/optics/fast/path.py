@@ -24,6 +24,7 @@ from pyklip_diffrender.optics.differentiation import (
     position_of,
 )
 from pyklip_diffrender.optics.fast.occulter import DEFAULT_SAMPLING, OcculterLattice, finest_spacing
+from pyklip_diffrender.optics.fast.plane_waves import PlaneWaves, ShiftedTransforms
 from pyklip_diffrender.optics.fast.streaming import Branch, PupilStream
 from pyklip_diffrender.optics.fourier import tilt_phases
 from pyklip_diffrender.optics.grid import PupilGrid
@@ -167,6 +168,40 @@ class LatticeRoute:
         direct = self.detector.field(replace(stop, field=passed), {})
         light = lattice.focus(wavefront) * lattice.blocked
         return direct - lattice.convolve(light, self._kernel(stop, values))
+
+    def plane_waves(
+        self, wavefront: Wavefront, values: Values, onto: Sequence[PupilGrid], reach: int
+    ) -> PlaneWaves | None:
+        """Prepare the propagation of a field times plane waves, up to `reach` cycles along an axis.
+
+        None if there are planes in front of the occulter.
+        """
+        if self._place > 0:
+            return None
+        lattice, detector = self.lattice(wavefront.wavelength), self.detector
+        stop = self._stop(onto, wavefront.wavelength, values)
+        passed = replace(stop, field=wavefront.grid.crop(wavefront.field, stop.grid) * stop.field)
+        kernel = self._kernel(stop, values)
+        x, y = detector.axes({})
+        cells_x, cells_y = (a.positions.to(detector.device) for a in (lattice.x, lattice.y))
+        return PlaneWaves(
+            ShiftedTransforms(passed, x, y, detector.shear, reach),
+            ShiftedTransforms(wavefront, cells_x, cells_y, lattice.shear, reach),
+            lattice.blocked,
+            detector.per_sample,
+            lambda light: lattice.convolve(light, kernel),
+        )
+
+    def behind_occulter(
+        self, wavefront: Wavefront, values: Values, onto: Sequence[PupilGrid]
+    ) -> Wavefront:
+        """Propagate from the entrance pupil to the pupil behind the occulter; see `field`."""
+        for plane, window in zip(self.planes[: self._place], onto, strict=False):
+            wavefront = plane.apply(wavefront, values, window)
+        lattice, grid = self.lattice(wavefront.wavelength), onto[self._place]
+        passed = replace(wavefront, field=wavefront.grid.crop(wavefront.field, grid), grid=grid)
+        light = lattice.focus(wavefront) * (lattice.blocked / self.detector.per_sample)
+        return replace(passed, field=passed.field - lattice.to_pupil(light, passed))
 
     def star(
         self,

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
-from pyklip_diffrender.linear.response import NANOMETRE, WavefrontResponse, downsample
+from pyklip_diffrender.linear.mode_fields import NANOMETRE
+from pyklip_diffrender.linear.response import WavefrontResponse, downsample
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import coarse_steps

@@ -1,0 +1,121 @@
+"""Parts of the propagation that share work: plane waves, and the way behind the occulter."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import pytest
+import torch
+
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.linear.mode_fields import ModeFields
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.planes import Wavefront
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
+from pyklip_diffrender.wavefront.opd import random_opd
+
+NPIX = 128
+MASK = ROUND_MASKS["MASK335R"]
+MOVED: dict[str, Any] = {
+    "star_offset": (0.02, -0.03),
+    "detector_shift": (0.011, -0.02),
+    "lyot_shift": (0.003, -0.002),
+    "lyot_rotation": 0.2,
+    "si_zernikes": torch.linspace(-8e-9, 5e-9, 36, dtype=torch.float64),
+}
+DETECTORS: list[dict[str, Any]] = [
+    {},
+    {"pixelscale": MASK.siaf_pixelscale, "shear": MASK.siaf_shear},
+    {"pixelscale": (0.05, 0.08), "shear": 0.2, "oversample": 2},
+]
+
+
+def system(**changes: Any) -> OpticalSystem:
+    settings: dict[str, Any] = {"monochromatic": 4.5e-6, "npix": NPIX, "fov_pixels": (20, 24)}
+    return nircam_coronagraph("F444W", **{**settings, **changes})
+
+
+def start(model: OpticalSystem, values: dict[str, Any]) -> tuple[Wavefront, dict[str, Any]]:
+    checked = model.values(values)
+    opd = torch.from_numpy(random_opd(5, npix=NPIX).data)
+    return model.pupil_field(opd, 4.5e-6, checked), checked
+
+
+def difference(one: torch.Tensor, other: torch.Tensor) -> float:
+    return float((one - other).abs().max() / other.abs().max())
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+@pytest.mark.parametrize("values", [{}, MOVED])
+def test_plane_waves_are_propagated_as_any_field(
+    detector: dict[str, Any], values: dict[str, Any]
+) -> None:
+    model = system(**detector)
+    wavefront, checked = start(model, values)
+    waves = model.plane_waves(wavefront, checked, 9)
+    assert waves is not None
+    cycles = torch.tensor([[0, 0], [3, -2], [-9, 9], [1, 7]])
+    grid = wavefront.grid
+    turns = (
+        cycles[:, 0, None, None] * grid.x + cycles[:, 1, None, None] * grid.y[:, None]
+    ) / grid.diameter
+    moved = wavefront.field * torch.exp(2j * torch.pi * turns)
+    expected = model.propagate(Wavefront(moved, wavefront.wavelength, wavefront.grid), checked)
+    assert difference(waves.fields(cycles), expected) < 1e-12
+
+
+def test_without_the_lattice_there_are_no_plane_waves() -> None:
+    model = system(route="planes")
+    wavefront, checked = start(model, {})
+    assert model.plane_waves(wavefront, checked, 3) is None
+
+
+@pytest.mark.parametrize("route", ["lattice", "planes"])
+@pytest.mark.parametrize("detector", DETECTORS)
+@pytest.mark.parametrize("values", [{}, MOVED])
+def test_the_way_to_the_detector_may_be_interrupted(
+    route: str, detector: dict[str, Any], values: dict[str, Any]
+) -> None:
+    model = system(route=route, **detector)
+    wavefront, checked = start(model, values)
+    whole = model.propagate(wavefront, checked)
+    behind = model.behind_occulter(wavefront, checked)
+    assert difference(model.to_detector(behind, checked), whole) < 1e-12
+
+
+def test_what_is_behind_the_occulter_depends_on_what_is_before_it_alone() -> None:
+    model = system()
+    assert model.parameters_behind == {
+        "lyot_shift", "lyot_rotation", "si_zernikes", "detector_shift", "blur"
+    }  # fmt: skip
+    wavefront, checked = start(model, MOVED)
+    behind = model.behind_occulter(wavefront, checked)
+    other = model.values({**MOVED, "lyot_rotation": 0.4, "detector_shift": (0.0, 0.03)})
+    assert torch.equal(model.behind_occulter(wavefront, other).field, behind.field)
+    expected = model.propagate(wavefront, other)
+    assert difference(model.to_detector(behind, other), expected) < 1e-12
+
+
+@pytest.mark.parametrize("route", ["lattice", "planes"])
+@pytest.mark.parametrize(
+    "basis", [JointBasis([SegmentMotions(), FourierModes(4)]), FourierModes(3)]
+)
+def test_derivatives_are_those_of_modes_propagated_one_by_one(route: str, basis: Any) -> None:
+    model = system(route=route)
+    wavefront, checked = start(model, MOVED)
+    opd = torch.from_numpy(random_opd(5, npix=NPIX).data)
+    fields = ModeFields(model, basis, opd, checked)
+    count = len(basis)
+    modes = model.entrance.on_window(basis.modes(PupilGrid.full(NPIX, model.diameter), 0, count))
+    factor = 2j * torch.pi / 4.5e-6 * 1e-9
+    moved = Wavefront(modes * factor * wavefront.field, 4.5e-6, wavefront.grid)
+    expected = model.propagate(moved, checked).to(torch.complex64)
+    # Parts that begin and end anywhere: between kinds of modes, and between a cosine and its sine.
+    cuts = [0, 1, min(50, count // 2), count - 6, count - 5, count - 2, count]
+    for first, last in pairwise(cuts):
+        (change,) = fields.changes(slice(first, last))
+        assert change.shape == expected[first:last].shape
+        assert difference(change, expected[first:last]) < 1e-6
