@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import FrameFit, Refinement
@@ -24,7 +25,12 @@ source that stands a sixth of a pixel from its template loses 0.5 % of its S/N i
 are measured with templates of their own."""
 
 _WAVELENGTHS = 4
-"""Largest number of wavelengths of the templates of a map."""
+"""Largest number of wavelengths of the templates of a map where they must be the model's own."""
+
+_WIDTH = 0.1
+"""Width of the part of a bandpass, as a fraction of its mean wavelength, that one wavelength stands
+for in the templates of a map. For the filters of NIRCam these differ by an rms of 1 to 3 % from
+those of the whole bandpass, and their amplitudes by 2e-4. Candidates are measured with all."""
 
 _DIFFERENCE = 5e-4
 """arcsec between images whose difference is a derivative; accurate to 1e-4."""
@@ -91,7 +97,7 @@ class Templates:
         key = (k, right, up)
         if key not in self._sources:
             frame = self.frames[k]
-            bandpass = frame.model.bandpass.thinned(_WAVELENGTHS)[1]
+            bandpass = _few_wavelengths(frame.model)
             detector = frame.model.detector
             x, y = (part / _FINE * scale for part, scale in
                     zip((right, up), detector.pixelscale, strict=True))  # fmt: skip
@@ -224,6 +230,14 @@ class Templates:
         values = {**frame.optical_values, "star_offset": star}
         opd = _as_tensor(frame.opd)
         return frame.model(opd if change is None else opd + change, **values).double()
+
+
+def _few_wavelengths(model: OpticalSystem) -> Bandpass:
+    """As few wavelengths as the templates of a map need."""
+    bandpass = model.bandpass
+    if "bandpass" not in model.adjustable:
+        return bandpass.thinned(_WAVELENGTHS)[1]
+    return bandpass.condensed(max(2, math.ceil(bandpass.width / _WIDTH)))
 
 
 def pixel_grid(model: OpticalSystem, values: Mapping[str, Tensor]) -> NDArray[np.float64]:
