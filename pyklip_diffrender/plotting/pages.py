@@ -34,7 +34,7 @@ __all__ = ["draw_disk", "draw_injections", "draw_search", "draw_star", "draw_wav
 _SIZE = (4.6, 3.7)
 """Of a panel, inches: its letters are as large as a page's where it is as wide as a phone."""
 
-_BOX = (0.14, 0.13, 0.62, 0.77)
+_BOX = (0.17, 0.13, 0.6, 0.77)
 """Of the axes in a panel: the same for all, so that panels side by side are aligned."""
 
 _LIMIT = 5.0
@@ -45,6 +45,8 @@ def draw_search(detection: Detection | WideField, klip: QTable | None = None) ->
     """The S/N map with the candidates, and the contrast curve, perhaps with that of KLIP."""
     figures, axes = _panels(2)
     plot_detection(detection, axes, klip)
+    # There is no room below these axes, but limits are high at small separations alone.
+    axes[1].legend(frameon=False, loc="upper right", fontsize="small")
     return figures
 
 

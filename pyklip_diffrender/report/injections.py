@@ -55,6 +55,6 @@ def injections_section(summary: Mapping[str, Any], planets: QTable) -> str:
     return pieces.section(
         "Injected planets",
         pieces.note(text),
-        pieces.pictures([picture], "pair"),
+        pieces.pictures([picture], "half"),
         pieces.table(header, rows),
     )
