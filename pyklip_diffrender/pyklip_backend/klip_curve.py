@@ -7,6 +7,7 @@ KLIP leaves.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -155,6 +156,8 @@ class KlipSubtraction:
     references : sequence of Observation
     resolution : float
         lambda/D, arcsec.
+    science : sequence of Observation, optional
+        In place of the frames of the fit, from which a disk may have been subtracted.
 
     Attributes
     ----------
@@ -178,7 +181,11 @@ class KlipSubtraction:
     """
 
     def __init__(
-        self, templates: Templates, references: tuple[Observation, ...], resolution: float
+        self,
+        templates: Templates,
+        references: Sequence[Observation],
+        resolution: float,
+        science: Sequence[Observation] | None = None,
     ) -> None:
         frames = templates.frames
         self.rolls = list(templates.rolls.values())
@@ -192,7 +199,10 @@ class KlipSubtraction:
         ]
         self.center = np.round(places[0])
         self.shifts = self.center - places
-        images = [_filled(frame.observation) - frame.companion_image for frame in frames.values()]
+        if science is None:
+            science = [frame.observation for frame in frames.values()]
+        companions = [frame.companion_image for frame in frames.values()]
+        images = [_filled(a) - b for a, b in zip(science, companions, strict=True)]
         self.science = shift_frames(np.array(images), self.shifts)
         self.references = [
             shift_frames(_filled(each)[None], (self.center - place)[None])[0]

@@ -38,10 +38,11 @@ def amount(image: Image, light: Image, distance: Image) -> float:
 
 
 def klip_of(base: dr.Reduction, sequence: dr.Sequence) -> KlipSubtraction:
-    """KLIP for the fitted frames, with the frames of all other stars of the sequence."""
+    """KLIP for the frames as they were taken, with those of all other stars of the sequence."""
     resolution = base.detection.contrast_curve.meta["resolution_arcsec"]
     references = sequence.cutout(SIZE).references
-    return KlipSubtraction(Templates(base.fit, base.fit.frames[0]), references, resolution)
+    templates = Templates(base.fit, base.fit.frames[0])
+    return KlipSubtraction(templates, references, resolution, base.sequence.science)
 
 
 def draw(reduction: dr.Reduction, subtracted: Image, path: Path) -> None:
