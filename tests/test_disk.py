@@ -164,3 +164,13 @@ def test_the_threshold_is_in_standard_deviations() -> None:
     light = np.array([3.0, 0.4, 0.5])
     solved = module._brightest(np.diag(information), information * light, np.zeros(3))
     np.testing.assert_allclose(solved, [2.0, 0.0, 0.4], atol=1e-5)
+
+
+def test_sources_stay_on_their_pixels_when_the_star_moves() -> None:
+    """A pixel near the inner edge may then be on the other side of it."""
+    fit = small_fit()
+    first = module._fit_sources(fit, 0.30)
+    again = module._fit_sources(fit, 0.40, first)
+    assert len(module._positions(first.templates.grid, 0.40)[0]) < len(first.contrasts)
+    assert len(again.contrasts) == len(first.contrasts)
+    assert again.offsets == pytest.approx(first.offsets)

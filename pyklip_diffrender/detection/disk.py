@@ -289,8 +289,8 @@ class _Sources:
     Attributes
     ----------
     templates : Templates
-    offsets : ndarray, (k, 2)
-        x, y from the star, arcsec.
+    pixels : tuple of ndarray, (k,)
+        Rows and columns.
     contrasts : ndarray, (k,)
     flux : float
         That of the star, to which contrasts are relative.
@@ -301,7 +301,7 @@ class _Sources:
     """
 
     templates: Templates
-    offsets: Image
+    pixels: tuple[NDArray[np.int64], NDArray[np.int64]]
     contrasts: Image
     flux: float
     light: dict[int, Image]
@@ -309,6 +309,11 @@ class _Sources:
 
     def __len__(self) -> int:
         return int((self.contrasts > 0).sum())
+
+    @property
+    def offsets(self) -> Image:
+        """x, y from the star, arcsec, (k, 2)."""
+        return np.asarray(self.templates.grid[self.pixels])
 
     def __str__(self) -> str:
         return (
@@ -325,9 +330,10 @@ class _Sources:
 def _fit_sources(fit: Refinement, inner: float, start: _Sources | None = None) -> _Sources:
     """Sources in the frames of a fit, to which the light of `start` is added again."""
     ((linear, templates),) = groups_of([fit])
-    rows, columns = _positions(templates.grid, inner)
-    images = templates.at_pixels(rows, columns)
-    flux, before = fit.frames[0].flux, np.zeros(len(rows))
+    # The same pixels in every round, although the star moves a little and with it their distances.
+    pixels = _positions(templates.grid, inner) if start is None else start.pixels
+    images = templates.at_pixels(*pixels)
+    flux, before = fit.frames[0].flux, np.zeros(len(pixels[0]))
     if start is not None:
         linear = linear.without("companions", start.light)
         before = start.contrasts * (start.flux / flux)
@@ -335,7 +341,7 @@ def _fit_sources(fit: Refinement, inner: float, start: _Sources | None = None) -
     contrasts = _brightest(matrix, vector, before)
     light = {k: np.tensordot(contrasts, each.double().numpy(), 1) for k, each in images.items()}
     gain = _gain(matrix, vector, contrasts) - _gain(matrix, vector, before)
-    sources = _Sources(templates, templates.grid[rows, columns], contrasts, flux, light, gain)
+    sources = _Sources(templates, pixels, contrasts, flux, light, gain)
     _log.info("extended light: %s", sources)
     return sources
 
