@@ -20,12 +20,15 @@ WITH_DASK = (
 )  # fmt: skip
 
 
+BY_HAND = ("out_of_memory", "two_surveys", "read_only", "file_limit")
+"""Where importing the libraries alone needs more than the limit, the workers of the first are
+restarted without end. The others take long, and break the same code as those that remain."""
+
+
 @pytest.mark.parametrize(
     "scenario",
     [
-        # Where importing the libraries alone needs more than the limit, the workers of this one
-        # are restarted without end; it is run by hand.
-        pytest.param(name, marks=pytest.mark.study if name == "out_of_memory" else ())
+        pytest.param(name, marks=pytest.mark.study if name in BY_HAND else ())
         for name in (*WITH_DASK, "read_only", "full_disk", "file_limit", "damaged_inputs")
     ],
 )
