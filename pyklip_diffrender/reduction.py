@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from pyklip_diffrender.detection import (
     recover_planets,
     wide_field,
 )
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import stage
@@ -33,6 +34,8 @@ from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.wavefront.map_choice import wavefront_for
 
 __all__ = ["Reduction", "reduce"]
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +192,8 @@ def reduce(
     Raises
     ------
     IncompatibleSetupError
-        For `wide` together with `disk`: beyond the fitted pixels a disk would be taken for point
+        For a number of injections that is negative or not whole, and for `wide` together with
+        `disk`: beyond the fitted pixels a disk would be taken for point
         sources.
     DiffrenderError
         If the target cannot be fitted. A reference star that cannot be is left out.
@@ -203,6 +207,8 @@ def reduce(
     # Before the fits, which take minutes.
     require_bound(threshold, "threshold", "positive")
     require_bound(injections, "injections", "not negative")
+    if injections != int(injections):
+        raise IncompatibleSetupError(f"injections: got {injections}, expected a whole number")
     if wide and disk:
         raise IncompatibleSetupError(
             "got wide=True and disk=True, expected one of them: beyond the fitted pixels a disk "
@@ -252,9 +258,12 @@ def reduce(
             detection = detect(fit, threshold=threshold, progress=progress)
             outside = wide_field(detection, whole)
     recovered = None
-    if injections:
+    if injections and len(detection.contrast_curve):
         with stage(f"3 of 4: {injections} injected planets"):
-            recovered = recover_planets(detection, injections, searched)
+            try:
+                recovered = recover_planets(detection, int(injections), searched)
+            except DiffrenderError as error:  # The reduction is complete without it.
+                _log.warning("no planets were injected: %s", error)
     return Reduction(
         sequence,
         fit,

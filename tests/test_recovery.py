@@ -15,6 +15,7 @@ from astropy.table import QTable
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import measured_planet, recover_planets
 from pyklip_diffrender.detection.recovery import TOGETHER, _free_place
+from pyklip_diffrender.errors import IncompatibleSetupError
 
 NORTH = 20.0
 SIZE = 41
@@ -157,3 +158,9 @@ def test_planets_keep_away_from_candidates_and_from_pixels_without_a_value() -> 
     assert below[1] < 0
     # Without any such place, planets are not left out.
     assert _free_place(covered(lambda x, y: x > 9), 0.6, 0.0) == pytest.approx(first)
+
+
+@pytest.mark.parametrize("count", [-1, 2.5])
+def test_a_wrong_number_of_planets_is_refused_before_anything_is_read(count: Any) -> None:
+    with pytest.raises(IncompatibleSetupError, match="injections"):
+        dr.reduce("no such folder", "no such map", injections=count)

@@ -25,10 +25,6 @@ PLANETS = (
 )
 
 
-# All use one reduction: on one worker it is made once.
-pytestmark = pytest.mark.xdist_group("wide field")
-
-
 def rolls() -> list[dr.Observation]:
     """Two rolls of a star with three planets, at their position angles east of north."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=WHOLE)
