@@ -27,7 +27,6 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Detection, search, small_sample_factor
 from pyklip_diffrender.detection.calibration import calibration_errors
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.headers import world_coordinates
 from pyklip_diffrender.detection.relinearise import with_companions
 from pyklip_diffrender.errors import (
     CorruptFileError,
@@ -42,6 +41,7 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, refine
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.product_headers import world_coordinates
 from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.wavefront.opd import random_opd
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
@@ -701,14 +701,25 @@ def test_the_images_are_on_the_sky_where_the_table_says(one: Detection, tmp_path
         found.observation.pixelscale
     )
     pixel = np.array([column, row]) + step
-    with astropy_fits.open(found.write(tmp_path)[0]) as hdus:
-        assert hdus[0].header["OBJECT"] == "HD 1"
-        for name in ("SNR", "LEFT_OUT", "SUBTRACTED", "DATA"):
-            wcs = WCS(hdus[name].header)
-            place = wcs.pixel_to_world(*pixel)
-            east, north = SkyCoord(311.3, -31.3, unit="deg").spherical_offsets_to(place)
-            assert east.arcsec == pytest.approx(planet["delta_ra"].value, abs=2e-4)
-            assert north.arcsec == pytest.approx(planet["delta_dec"].value, abs=2e-4)
+    maps, fit = found.write(tmp_path)[0], found.fits[0].write(tmp_path / "fit.fits", linear=False)
+    images = {
+        maps: ("SNR", "LEFT_OUT", "SUBTRACTED", "DATA"),
+        fit: ("DATA", "ERROR", "VALID", "STAR", "COMPANIONS", "GAIN"),
+    }
+    for path, names in images.items():
+        with astropy_fits.open(path) as hdus:
+            assert hdus[0].header["OBJECT"] == "HD 1"
+            assert hdus[0].header["DRSTAT"] == "CONVERGED"
+            for name in names:
+                wcs = WCS(hdus[name].header)
+                place = wcs.pixel_to_world(*pixel)
+                east, north = SkyCoord(311.3, -31.3, unit="deg").spherical_offsets_to(place)
+                assert east.arcsec == pytest.approx(planet["delta_ra"].value, abs=2e-4)
+                assert north.arcsec == pytest.approx(planet["delta_dec"].value, abs=2e-4)
+    with astropy_fits.open(fit) as hdus:
+        units = {name: Unit(hdus[name].header["BUNIT"]) for name in ("DATA", "ERROR", "STAR")}
+        assert set(units.values()) == {Unit("photon")}
+        assert "CTYPE1" not in hdus["OPD"].header
 
 
 def test_without_a_position_on_the_sky_the_coordinates_are_arcsec_from_the_star(

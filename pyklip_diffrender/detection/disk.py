@@ -34,11 +34,10 @@ from scipy.optimize import minimize
 
 from pyklip_diffrender.detection.field import Image, separation_of
 from pyklip_diffrender.detection.groups import groups_of, has_only_reference_stars
-from pyklip_diffrender.detection.headers import primary_hdu, world_coordinates
 from pyklip_diffrender.detection.relinearise import without_light
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.storage import image_hdu
-from pyklip_diffrender.detection.templates import Templates, pixel_grid
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.io.html_repr import html_summary
@@ -46,6 +45,7 @@ from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
 __all__ = ["Disk", "fit_disk"]
 
@@ -182,10 +182,7 @@ class Disk:
         first = self.fit.frames[0].observation
         unit, wcs = first.unit.to_string("fits"), world_coordinates(self.grid, first)
         shown = [each for each in self.fit.frames if not each.observation.reference]
-        frames = [
-            world_coordinates(pixel_grid(each.model, each.optical_values), each.observation)
-            for each in shown
-        ]
+        frames = [each.wcs for each in shown]
         sources = fits.BinTableHDU(self.table, name="SOURCES")
         hdus = fits.HDUList(
             [

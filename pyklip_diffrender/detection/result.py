@@ -21,7 +21,6 @@ from pyklip_diffrender.detection.contrast import described
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group
-from pyklip_diffrender.detection.headers import world_coordinates
 from pyklip_diffrender.detection.measurement import (
     contrasts_at,
     measured_shape,
@@ -40,7 +39,6 @@ from pyklip_diffrender.detection.storage import (
     wcs_of,
 )
 from pyklip_diffrender.detection.tables import candidate_table, in_words, measured_table
-from pyklip_diffrender.detection.templates import pixel_grid
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.files import replacing, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
@@ -263,11 +261,7 @@ class Detection:
     @cached_property
     def _wcs(self) -> tuple[Header, ...]:
         """World coordinates of the frames, in the order of `subtracted`."""
-        return tuple(
-            world_coordinates(pixel_grid(f.model, f.optical_values), f.observation)
-            for fit in self.fits
-            for f in fit.frames
-        )
+        return tuple(f.wcs for fit in self.fits for f in fit.frames)
 
     @cached_property
     def left_out(self) -> tuple[Image, Image]:

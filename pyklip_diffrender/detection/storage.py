@@ -16,10 +16,10 @@ from astropy.table import QTable
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group, groups_of
-from pyklip_diffrender.detection.headers import primary_hdu, world_coordinates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.storage import image, observation_hdus, text_hdu
+from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
 __all__ = [
     "MAPS",

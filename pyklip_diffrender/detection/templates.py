@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -11,13 +10,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import FrameFit, Refinement
 
-__all__ = ["Templates", "pixel_grid"]
+__all__ = ["Templates"]
 
 _FINE = 3
 """Positions of sources per pixel, along x and y, in frames where they are not at pixel centres. A
@@ -76,7 +74,7 @@ class Templates:
         }
         self._sources: dict[tuple[int, int, int], PointSources] = {}
         self._rendered: dict[tuple[float, ...], Tensor] = {}
-        self.grid = pixel_grid(origin.model, origin.optical_values)
+        self.grid = origin.grid
         """x, y of all the first frame's pixels from the star, (ny, nx, 2), arcsec."""
 
     @staticmethod
@@ -238,18 +236,6 @@ def _few_wavelengths(model: OpticalSystem) -> Bandpass:
     if "bandpass" not in model.adjustable:
         return bandpass.thinned(_WAVELENGTHS)[1]
     return bandpass.condensed(max(2, math.ceil(bandpass.width / _WIDTH)))
-
-
-def pixel_grid(model: OpticalSystem, values: Mapping[str, Tensor]) -> NDArray[np.float64]:
-    """x, y of all pixels from the star, (ny, nx, 2), arcsec."""
-    detector = model.detector
-    x, y = (
-        (axis.reshape(-1, detector.oversample).mean(dim=1) / ARCSEC).cpu().numpy()
-        for axis in detector.axes(values)
-    )
-    star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu().numpy()
-    across, up = np.meshgrid(x, y)
-    return np.stack([across - star[0], up + detector.shear * across - star[1]], axis=-1)
 
 
 def _as_tensor(opd: NDArray[np.float64]) -> Tensor:

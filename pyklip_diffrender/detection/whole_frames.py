@@ -16,8 +16,8 @@ from scipy.ndimage import convolve, map_coordinates
 from scipy.signal import fftconvolve
 
 from pyklip_diffrender.detection.field import Image, separation_of
-from pyklip_diffrender.detection.templates import pixel_grid
 from pyklip_diffrender.refinement import FrameFit
+from pyklip_diffrender.refinement.frame_fit import pixel_grid
 from pyklip_diffrender.scene.observation import Observation
 
 if TYPE_CHECKING:

@@ -19,7 +19,6 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor, scatter_profile
 from pyklip_diffrender.detection.field import Image, far_from, ring_pixels, separation_of
-from pyklip_diffrender.detection.headers import primary_hdu, world_coordinates
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.storage import image_hdu
 from pyklip_diffrender.detection.tables import candidate_table, in_words
@@ -29,6 +28,7 @@ from pyklip_diffrender.io.files import replacing, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement.companions import local_maxima
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
 __all__ = ["WideField", "wide_field"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,11 +12,13 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.storage import image, observation_hdus, observation_of
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.product_headers import world_coordinates
 
-__all__ = ["FrameFit"]
+__all__ = ["FrameFit", "pixel_grid"]
 
 Image = NDArray[np.float64]
 
@@ -85,6 +88,16 @@ class FrameFit:
             if name in self.model.parameters
         }
 
+    @property
+    def grid(self) -> Image:
+        """x, y of all pixels from the star, (ny, nx, 2), arcsec."""
+        return pixel_grid(self.model, self.optical_values)
+
+    @property
+    def wcs(self) -> fits.Header:
+        """World coordinates of the pixels, see `world_coordinates`."""
+        return world_coordinates(self.grid, self.observation)
+
     def render(
         self,
         fov_pixels: int | tuple[int, int] | None = None,
@@ -141,7 +154,7 @@ class FrameFit:
     def to_hdus(self, k: int) -> tuple[dict[str, Any], list[Any]]:
         """Return metadata and FITS extensions of the frame, with EXTVER k + 1."""
         observation, hdus = observation_hdus(self.observation, k)
-        unit = observation["unit"]
+        unit, wcs = self.observation.unit.to_string("fits"), self.wcs
         arrays = {
             "STAR": (self.star, unit),
             "COMPANIONS": (self.companion_image, unit),
@@ -154,6 +167,9 @@ class FrameFit:
             if array is not None:
                 hdus.append(fits.ImageHDU(array, name=name, ver=k + 1))
                 hdus[-1].header["BUNIT"] = array_unit
+        for hdu in hdus:
+            if hdu.name not in ("OPD", "ABSORPTION", "COEFFICIENTS"):
+                hdu.header.update(wcs)
         facts = {
             "observation": observation,
             "start": self.start,
@@ -187,3 +203,15 @@ class FrameFit:
             gain=image(hdus, "GAIN", k),
             coefficients=image(hdus, "COEFFICIENTS", k) if has_coefficients else None,
         )
+
+
+def pixel_grid(model: OpticalSystem, values: Mapping[str, Tensor]) -> NDArray[np.float64]:
+    """x, y of all pixels from the star, (ny, nx, 2), arcsec."""
+    detector = model.detector
+    x, y = (
+        (axis.reshape(-1, detector.oversample).mean(dim=1) / ARCSEC).cpu().numpy()
+        for axis in detector.axes(values)
+    )
+    star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu().numpy()
+    across, up = np.meshgrid(x, y)
+    return np.stack([across - star[0], up + detector.shear * across - star[1]], axis=-1)

@@ -38,6 +38,7 @@ from pyklip_diffrender.refinement.storage import (
 )
 from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.product_headers import primary_hdu
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.opd import OPDMap
 
@@ -240,8 +241,8 @@ class Refinement:
         """Write the refinement to a FITS file that `read` reads.
 
         Extensions are PARAMETERS (a table), and for each frame DATA, ERROR, VALID, STAR,
-        COMPANIONS, GAIN, OPD and COEFFICIENTS, numbered by EXTVER. The file is written
-        atomically; an existing one is replaced.
+        COMPANIONS, GAIN, OPD and COEFFICIENTS, numbered by EXTVER. Images of the sky have world
+        coordinates. The file is written atomically; an existing one is replaced.
 
         Parameters
         ----------
@@ -258,11 +259,11 @@ class Refinement:
         IncompatibleSetupError
             For settings with a user-defined basis.
         """
-        primary = fits.PrimaryHDU()
-        for key, value in self.summary().items():
-            primary.header[f"HIERARCH {key.upper()}"] = (
-                value if not isinstance(value, float) or math.isfinite(value) else str(value)
-            )
+        names = [frame.observation.name for frame in self.frames]
+        about = {**self.summary(), "observations": names}
+        primary = primary_hdu(self.frames[0].observation, about)
+        for key, value in ({} if self.plan is None else self.plan.summary()).items():
+            primary.header[f"HIERARCH {key.upper()}"] = value
         parameters = self.parameters
         parameters["description"].info.format = None  # FITS has no such format.
         hdus = fits.HDUList([primary, fits.BinTableHDU(parameters, name="PARAMETERS")])

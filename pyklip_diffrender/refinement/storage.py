@@ -209,7 +209,10 @@ def observation_hdus(observation: Observation, frame: int) -> tuple[dict[str, An
         "ERROR": combined.error[0],
         "VALID": combined.valid[0].astype(np.uint8),
     }
-    return facts, [fits.ImageHDU(a, name=name, ver=frame + 1) for name, a in arrays.items()]
+    hdus = [fits.ImageHDU(a, name=name, ver=frame + 1) for name, a in arrays.items()]
+    for hdu in hdus[:2]:
+        hdu.header["BUNIT"] = combined.unit.to_string("fits")
+    return facts, hdus
 
 
 def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Observation:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
+from numpy.typing import NDArray
 
-from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["primary_hdu", "world_coordinates"]
@@ -28,6 +28,7 @@ _REDUCED = {
     "model_error": ("DRMODERR", "error of the model, fraction of the star"),
     "frames": ("DRNFRAME", "number of fitted frames"),
     "seed": ("DRSEED", "random seed"),
+    "seconds": ("DRSECS", "duration of the refinement, s"),
     "opd": ("DROPD", "wavefront map at the start"),
     "opd_sha256": ("DRSHA256", ""),
     "systematics": ("DRSYST", "pattern of the model's error"),
@@ -35,7 +36,7 @@ _REDUCED = {
     "threshold": ("DRTHRESH", "smallest S/N of a candidate"),
     "star_flux_density_jy": ("DRSTARJY", "flux density of the star, Jy"),
 }
-"""Keywords and comments of a detection's provenance."""
+"""Keywords and comments of a reduction's provenance."""
 
 
 def primary_hdu(
@@ -75,7 +76,7 @@ def primary_hdu(
     return hdu
 
 
-def world_coordinates(grid: Image, observation: Observation) -> fits.Header:
+def world_coordinates(grid: NDArray[np.float64], observation: Observation) -> fits.Header:
     """Cards of a WCS for the pixels of a frame.
 
     The star is at the reference coordinates of the frame (CRVAL), where the telescope pointed. If
