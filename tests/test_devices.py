@@ -20,12 +20,11 @@ from pretend_device import DEVICE, pretended
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.bridges import from_poppy
-from pyklip_diffrender.detection import wide_field
+from pyklip_diffrender.detection import wide_field, with_planets
 from pyklip_diffrender.linear.forward_mode import jacfwd
 from pyklip_diffrender.optics.detector_effects import GaussianBlur, LinearResampling, PixelCrosstalk
 from pyklip_diffrender.optics.rotation import SplineRotation
 from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Systematics
-from pyklip_diffrender.surveys.work import planet_image
 
 Array = NDArray[np.float64]
 
@@ -162,7 +161,8 @@ def test_what_a_search_leaves_behind(tmp_path: Path) -> None:
         assert len(detection.left_out) == 2
         detection.measure_shape(np.exp(-(detection.grid**2).sum(axis=-1)))
         assert fit.frames[0].render((SIZE + 4, SIZE)).shape == (SIZE + 4, SIZE)
-        assert planet_image(fit.frames[0], work.PLANET.offset).shape == (SIZE, SIZE)
+        (observation,) = with_planets(fit.frames, [work.PLANET])
+        assert observation.data.shape == fit.frames[0].observation.data.shape
         fit.write(tmp_path / "fit.fits")
     read = Refinement.read(tmp_path / "fit.fits")
     assert read.model.device.type == "cpu"

@@ -25,6 +25,7 @@ from survey_stubs import HOSTILE, configuration, inputs, result, stub
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.cli import main
+from pyklip_diffrender.detection import with_planets
 from pyklip_diffrender.errors import (
     CorruptFileError,
     IncompatibleSetupError,
@@ -634,9 +635,9 @@ def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for() -> None:
         for roll in ROLLS
     ]  # fmt: skip
     planet = Injection(1e-4, 0.6, 100.0)
-    sequence = work._with_planet(frames, planet)
-    assert len(sequence.science) == 2
-    for roll, frame in zip(ROLLS, sequence.science, strict=True):
+    science = with_planets(frames, [work._planet(planet, ROLLS[0])])
+    assert len(science) == 2
+    for roll, frame in zip(ROLLS, science, strict=True):
         light = (frame.data - star.data)[0]
         # Position angles of planets in a scene are counted from +y of the frame.
         truth = dr.Planet(planet.contrast, planet.separation, planet.angle - roll)

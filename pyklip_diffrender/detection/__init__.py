@@ -11,7 +11,7 @@ from __future__ import annotations
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import small_sample_factor
 from pyklip_diffrender.detection.disk import Disk, fit_disk
-from pyklip_diffrender.detection.recovery import measured_planet, recover_planets
+from pyklip_diffrender.detection.recovery import measured_planet, recover_planets, with_planets
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure
 from pyklip_diffrender.detection.wide_search import WideField, wide_field
@@ -29,4 +29,5 @@ __all__ = [
     "recover_planets",
     "small_sample_factor",
     "wide_field",
+    "with_planets",
 ]

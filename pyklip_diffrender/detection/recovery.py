@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 from astropy import units as u
 from astropy.table import QTable, Row
 from numpy.typing import NDArray
 
 from pyklip_diffrender.detection.result import Detection
-from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["TOGETHER", "measured_planet", "recover_planets"]
+__all__ = ["TOGETHER", "measured_planet", "recover_planets", "with_planets"]
 
 _STRENGTH = 1.6
 """Contrast of an injected planet over the limit at its separation. At a limit of 5 sigma, nearly
@@ -82,8 +81,7 @@ def recover_planets(
         contrast, what was measured, and whether it was among the candidates. If it was not, the
         contrast is what is measured at its place.
     """
-    fit = detection.fits[0]
-    templates = Templates(fit, fit.frames[0])
+    frames = [each for each in detection.fits[0].frames if not each.observation.reference]
     curve = detection.contrast_curve
     planets = QTable(names=list(_COLUMNS), dtype=[float] * (len(_COLUMNS) - 1) + [bool])
     inner, outer = (float(end) for end in curve["separation"].value[[0, -1]])
@@ -100,19 +98,16 @@ def recover_planets(
                 for k, separation in enumerate(separations)
             ]
         )
-        contrasts = _STRENGTH * limits
-        light = templates.at(torch.from_numpy(places))
-        science = []
-        for k, frame in templates.frames.items():
-            added = np.tensordot(contrasts, light[k].numpy(), 1)
-            science.append(replace(frame.observation, data=frame.observation.data + added))
-        again = search(tuple(science))
-        for place, contrast in zip(places, contrasts, strict=True):
-            row, detected = measured_planet(again, place)
-            planet = Planet.from_offset(contrast, *place)
+        injected = [
+            Planet.from_offset(_STRENGTH * limit, *place)
+            for limit, place in zip(limits, places, strict=True)
+        ]
+        again = search(with_planets(frames, injected))
+        for planet in injected:
+            row, detected = measured_planet(again, planet.offset)
             angle = (planet.position_angle + detection.north) % 360
             measured = (row["contrast"], row["contrast_error"], row["snr"], detected)
-            planets.add_row((planet.separation, angle, contrast, *measured))
+            planets.add_row((planet.separation, angle, planet.contrast, *measured))
     for name, unit in _UNITS.items():
         planets[name] = planets[name] * unit
     for name, form in _COLUMNS.items():
@@ -121,13 +116,41 @@ def recover_planets(
     return planets
 
 
-def measured_planet(detection: Detection, place: NDArray[np.float64]) -> tuple[Row, bool]:
+def with_planets(frames: Sequence[FrameFit], planets: Sequence[Planet]) -> tuple[Observation, ...]:
+    """Add planets to the data of fitted frames, with the wavefront and the flux of the fit.
+
+    Parameters
+    ----------
+    frames : sequence of FrameFit
+        Of the target.
+    planets : sequence of Planet
+        Position angles are counted from +y of the first frame.
+
+    Returns
+    -------
+    tuple of Observation
+        Without photon noise of the planets.
+    """
+    science = []
+    for frame in frames:
+        roll = frame.observation.roll_from(frames[0].observation)
+        star = frame.values.get("star_offset", np.zeros(2))
+        data = frame.observation.data
+        for planet in planets:
+            x, y = star + planet.rotated(roll).offset
+            light = frame.render(background=False, source=(float(x), float(y)))
+            data = data + planet.contrast * light
+        science.append(replace(frame.observation, data=data))
+    return tuple(science)
+
+
+def measured_planet(detection: Detection, place: tuple[float, float]) -> tuple[Row, bool]:
     """What is measured of a planet of which the position is known.
 
     Parameters
     ----------
     detection : Detection
-    place : ndarray, (2,)
+    place : (float, float)
         x, y from the star in the first frame, arcsec.
 
     Returns

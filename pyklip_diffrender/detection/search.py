@@ -335,8 +335,8 @@ def _search(
 ) -> tuple[Candidates, ErrorFactor]:
     """Candidates in the order in which they were found, and the factor for the errors."""
     groups, grid, pixel = maps.groups, maps.grid, pixel_width(maps.grid)
-    candidates = refine_candidates(groups, start, reach=pixel / 2)
     # A fit may have taken a residual for a companion while its wavefront was still wrong.
+    candidates = refine_candidates(groups, start, pixel / 2, _STEPS)
     unscaled = ErrorFactor.constant(1.0)
     while len(candidates) and candidates.snr(unscaled).min() < threshold:
         candidates = _without_weakest(groups, candidates, unscaled, pixel)

@@ -8,11 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
-from pyklip_diffrender.detection import measured_planet
+from pyklip_diffrender.detection import measured_planet, with_planets
 from pyklip_diffrender.reduction import Reduction, reduce
 from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement, Systematics
 from pyklip_diffrender.report import summarise, write_report
@@ -20,7 +16,7 @@ from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.surveys.jobs import Injection, Job
 
-__all__ = ["planet_image", "reduce_job"]
+__all__ = ["reduce_job"]
 
 
 def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str, Any]:
@@ -35,7 +31,10 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
     }
     if job.injection is not None and job.base is not None:
         fit = Refinement.read(folder.parent / job.base / "fit.fits")
-        sequence = _with_planet(_with_disk(fit.frames, job), job.injection)
+        first = fit.frames[0].observation
+        planet = _planet(job.injection, first.position_angle)
+        science = with_planets(_with_disk(fit.frames, job), [planet])
+        sequence = Sequence(first.target, science)
         reduction = reduce(sequence, job.opd, systematics=fit.systematics or "off", **common)
         extra = {"recovered": _recovered(reduction, job.injection)}
     else:
@@ -60,33 +59,6 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
     return {**_result(summarise(reduction)), **extra}
 
 
-def planet_image(
-    frame: FrameFit, offset: tuple[float, float], roll: float = 0.0
-) -> NDArray[np.float64]:
-    """Image of a planet of contrast 1 beside the star of a fitted frame.
-
-    Parameters
-    ----------
-    frame : FrameFit
-    offset : tuple of float
-        x, y from the star in the orientation of the first frame, arcsec.
-    roll : float
-        Degrees by which the sky is turned in this frame, counter-clockwise, as
-        `Observation.roll_from` says.
-
-    Returns
-    -------
-    ndarray, (ny, nx)
-        In the unit of the observation.
-    """
-    values = frame.optical_values
-    star = values.pop("star_offset", torch.zeros(2, dtype=torch.float64))
-    away = torch.tensor(Planet.from_offset(1.0, *offset).rotated(roll).offset, dtype=torch.float64)
-    with torch.no_grad():
-        image = frame.model(torch.from_numpy(frame.opd), star_offset=star + away, **values)
-    return frame.flux * np.asarray(image.double().cpu().numpy())
-
-
 def _with_disk(frames: abc.Sequence[FrameFit], job: Job) -> list[FrameFit]:
     """The frames of a fit, with the extended light that was subtracted from them."""
     if not job.options.disk:
@@ -99,29 +71,15 @@ def _with_disk(frames: abc.Sequence[FrameFit], job: Job) -> list[FrameFit]:
     ]
 
 
-def _with_planet(frames: abc.Sequence[FrameFit], planet: Injection) -> Sequence:
-    """The frames of a fit with a planet added."""
-    first = frames[0].observation
-    science = []
-    for frame in frames:
-        observation = frame.observation
-        light = planet_image(
-            frame, _place(planet, first.position_angle), observation.roll_from(first)
-        )
-        science.append(replace(observation, data=observation.data + planet.contrast * light))
-    return Sequence(first.target, tuple(science))
-
-
-def _place(planet: Injection, north: float) -> tuple[float, float]:
-    """x, y on the first frame, arcsec; `north` is the position angle of its +y axis."""
-    return Planet(planet.contrast, planet.separation, planet.angle - north).offset
+def _planet(injection: Injection, north: float) -> Planet:
+    """Beside the star in the first frame, whose +y axis has the position angle `north`."""
+    return Planet(injection.contrast, injection.separation, injection.angle - north)
 
 
 def _recovered(reduction: Reduction, planet: Injection) -> dict[str, Any]:
     """What is measured of an injected planet: of its candidate, else at its place."""
     found = reduction.detection
-    place = np.array(_place(planet, found.north))
-    row, detected = measured_planet(found, place)
+    row, detected = measured_planet(found, _planet(planet, found.north).offset)
     values = {key: float(row[key]) for key in ("contrast", "contrast_error", "snr")}
     finite = {key: value if math.isfinite(value) else None for key, value in values.items()}
     return {**finite, "detected": detected}

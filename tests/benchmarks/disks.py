@@ -5,9 +5,10 @@ Run from the root of the project, with the frames of programme 1184 in ../shared
     python -m tests.benchmarks.disks --filter F444W --figure docs/images/au_mic.png
 
 It fits the edge-on disk of AU Mic with `reduce(disk=True)`, and subtracts the star with KLIP
-(ADI+RDI: the other roll and four frames of two other stars). Then it injects the sources of this
-disk into the frames of HIP 17695, which has none, and prints how much of that known light each
-keeps.
+(ADI+RDI: the other roll and four frames of two other stars). It prints the 5-sigma limits of both
+for point sources, KLIP's for frames from which the fitted disk was subtracted. Then it injects the
+sources of this disk into the frames of HIP 17695, which has none, and prints how much of that known
+light each keeps.
 """
 
 from __future__ import annotations
@@ -23,12 +24,13 @@ from numpy.typing import NDArray
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.plotting.panels import save
-from pyklip_diffrender.pyklip_backend.klip_curve import KlipSubtraction
+from pyklip_diffrender.pyklip_backend.klip_curve import KlipSubtraction, klip_curve
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 
 Image = NDArray[np.float64]
 
 SIZE = 80
+SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])
 
 
 def amount(image: Image, light: Image, distance: Image) -> float:
@@ -102,9 +104,16 @@ def main() -> None:
     print(reduction)
     print(disk, f"position angle {disk.orientation:.2f} deg, chi2 {disk.fit.chi2_per_pixel:.2f}")
     curve = reduction.detection.contrast_curve
-    for separation in (0.5, 1.0, 1.5, 2.0):
-        limit = np.interp(separation, curve["separation"].value, curve["contrast"])
-        print(f"5-sigma contrast at {separation} arcsec: {limit:.2e}")
+    ours, corrected = (
+        np.interp(SEPARATIONS, curve["separation"].value, curve[name])
+        for name in ("contrast", "small_sample")
+    )
+    references = sequence.cutout(SIZE).references
+    fitted = replace(reduction, sequence=replace(reduction.sequence, references=references))
+    theirs = np.asarray(klip_curve(fitted, SEPARATIONS)["contrast"])
+    print("5-sigma limits: ours; with small-sample correction: ours, KLIP, ratio")
+    for row in zip(SEPARATIONS, ours, corrected, theirs, theirs / corrected, strict=True):
+        print("{:.1f}  {:.2e}  {:.2e}  {:.2e}  {:.2f}".format(*row))
     klip = klip_of(reduction, sequence)
     subtracted = klip.residuals(klip.science)
     if options.figure:
