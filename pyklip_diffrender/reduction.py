@@ -26,7 +26,15 @@ from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.io.units import require_bound, to_bytes
-from pyklip_diffrender.refinement import GaussNewton, Refinement, Systematics, refine
+from pyklip_diffrender.refinement import (
+    GaussNewton,
+    Refinement,
+    Systematics,
+    refine,
+    require_calibrated,
+    to_jansky,
+    with_star_flux,
+)
 from pyklip_diffrender.refinement.pattern_choice import PatternRequest, choose_systematics
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
@@ -139,6 +147,8 @@ def reduce(
     wide: bool = False,
     disk: bool = False,
     injections: int = 0,
+    star_flux: float | str | u.Quantity | None = None,
+    star_flux_error: float = 0.05,
     device: str = "cpu",
     memory: float | str | u.Quantity | None = None,
     progress: bool = False,
@@ -177,6 +187,14 @@ def reduce(
         Number of planets to add to the fitted frames, slightly brighter than the limits, to see
         how well they are recovered; see `recover_planets`. Seven of them take as long as the
         fit and the search, fewer where the fitted square is smaller than 80 pixels.
+    star_flux : float, str or Quantity, optional
+        Flux density of the star in the filter, from a catalogue or a model of its spectrum: Jy, or
+        an AB magnitude. Contrasts then refer to it, as spaceKLIP's do. By default the light that
+        is diffracted around the mask determines the star's flux, to 10 %, which errors of
+        contrasts include. Flux densities of planets do not depend on it. Takes a second, shorter
+        fit.
+    star_flux_error : float
+        Relative error of `star_flux`, with that of the photometric calibration of the frames.
     device : str
         PyTorch device of the optical model.
     memory : float, str or Quantity, optional
@@ -192,9 +210,9 @@ def reduce(
     Raises
     ------
     IncompatibleSetupError
-        For a number of injections that is negative or not whole, and for `wide` together with
-        `disk`: beyond the fitted pixels a disk would be taken for point
-        sources.
+        For a number of injections that is negative or not whole, for `wide` together with
+        `disk` (beyond the fitted pixels a disk would be taken for point sources), and for
+        `star_flux` with frames that are not calibrated.
     DiffrenderError
         If the target cannot be fitted. A reference star that cannot be is left out.
 
@@ -214,10 +232,15 @@ def reduce(
             "got wide=True and disk=True, expected one of them: beyond the fitted pixels a disk "
             "would be taken for point sources"
         )
+    jansky = None if star_flux is None else to_jansky(star_flux)
+    require_bound(star_flux_error, "star_flux_error", "positive")
     limit = None if memory is None else to_bytes(memory, "memory")
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
     wavefront = wavefront_for(opd, sequence.date)
+    if jansky is not None:
+        for each in sequence.science:
+            require_calibrated(each)
     model = model_for(sequence.science[0], size, device=device)
     whole, sequence = sequence.science, sequence.cutout(size)
     choice = choose_systematics(
@@ -237,12 +260,17 @@ def reduce(
         "progress": progress,
     }
 
-    def searched(science: tuple[Observation, ...]) -> Detection:
+    def fitted(science: tuple[Observation, ...]) -> Refinement:
         fit = refine(model, science, wavefront, **options)
-        return detect(fit, threshold=threshold, progress=progress)
+        if jansky is None:
+            return fit
+        return with_star_flux(fit, jansky, star_flux_error, progress=progress)
+
+    def searched(science: tuple[Observation, ...]) -> Detection:
+        return detect(fitted(science), threshold=threshold, progress=progress)
 
     with stage("2 of 4: wavefront"):
-        fit = refine(model, sequence.science, wavefront, **options)
+        fit = fitted(sequence.science)
     extended = None
     if disk:
         with stage("2 of 4: extended light, and wavefront without it"):
@@ -254,7 +282,7 @@ def reduce(
     cleaned = None if outside is None else outside.subtracted(whole, sequence.science)
     if cleaned is not None:
         with stage("3 of 4: star and search without the light of sources beyond the fitted pixels"):
-            fit = refine(model, cleaned, wavefront, **options)
+            fit = fitted(cleaned)
             detection = detect(fit, threshold=threshold, progress=progress)
             outside = wide_field(detection, whole)
     recovered = None

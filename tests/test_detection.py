@@ -442,9 +442,10 @@ def test_what_flux_and_image_do_to_a_contrast_may_cancel(world: World, one: Dete
 
     def error(curvature: torch.Tensor, frames: int = 1) -> float:
         known = replace(linear, deviation=deviation, curvature=curvature)
-        return float(
-            calibration_errors([(known, templates)] * frames, offset, torch.tensor([1e3]))[0]
-        )
+        groups = [(known, templates)] * frames
+        ones = torch.ones(1, dtype=torch.float64)
+        errors = calibration_errors(groups, offset, 1e3 * ones, 3 * ones)
+        return float(errors[0]) / 3
 
     untied, tied = torch.zeros_like(linear.curvature), 1e14 * torch.outer(changes, changes)
     assert error(untied) == pytest.approx(math.sqrt(2) * 1e-3, rel=1e-5)

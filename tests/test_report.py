@@ -221,10 +221,12 @@ def test_the_summary_has_the_numbers_of_the_result(folder: Path) -> None:
 
 def test_calibrated_frames_have_flux_densities_on_the_page() -> None:
     summary = summarise(reduction())
-    summary["star"] = {"flux_density_Jy": 0.41, "flux_density_error_Jy": 0.05}
+    summary["star"] = {
+        "flux_density_Jy": 0.41, "flux_density_error_Jy": 0.05, "source": "diffracted light"
+    }  # fmt: skip
     summary["candidates"][0] |= {"flux_density_Jy": 1.2e-4, "flux_density_error_Jy": 1e-5}
     words = Tags(page(summary, [], [], [])).words
-    assert "0.41 ± 0.05 Jy" in words
+    assert "0.41 ± 0.05 Jy, from its diffracted light" in words
     assert scientific(1.2e-4, 1e-5) in words
 
 

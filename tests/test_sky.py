@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -21,11 +22,11 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.orbits import write_astrometry
-from pyklip_diffrender.detection.sky import Positions, Sky, star_flux_density
+from pyklip_diffrender.detection.sky import Positions, Sky
 from pyklip_diffrender.detection.tables import candidate_table, measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument.masks import ROUND_MASKS
-from pyklip_diffrender.refinement import FrameFit
+from pyklip_diffrender.refinement import FrameFit, jansky_per_unit, require_calibrated, to_jansky
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import world_coordinates
 
@@ -227,7 +228,7 @@ def fitted(observation: Observation) -> FrameFit:
         "FrameFit",
         SimpleNamespace(
             observation=observation, model=model, opd=np.zeros((128, 128)), flux=2e7,
-            optical_values={}, errors={"flux": np.array([1e6])},
+            optical_values={}, errors={"flux": np.array([1e6])}, start={},
         ),
     )  # fmt: skip
 
@@ -249,18 +250,37 @@ def test_the_stop_passes_what_arrives_of_a_star_without_the_occulter() -> None:
 def test_a_stars_flux_density_is_that_of_its_unocculted_image(tmp_path: Path) -> None:
     got = observation(tmp_path)
     frame = fitted(got)
-    value, error = cast("tuple[float, float]", star_flux_density(frame))
-    expected = 2e7 * frame.model.transmission() * REAL["PIXAR_SR"] * 1e6
-    assert value == pytest.approx(expected)
-    assert error == pytest.approx(0.05 * expected)
+    scale = jansky_per_unit(frame)
+    assert scale == pytest.approx(frame.model.transmission() * REAL["PIXAR_SR"] * 1e6)
+    # The posterior's 5 %, doubled, and the 10 % that it does not know of, unless there is a prior.
+    for deviations, share in (({}, math.hypot(0.1, 0.1)), ({"flux": 0.03}, 0.1)):
+        fit = SimpleNamespace(frames=[frame], settings=dr.GaussNewton(deviations=deviations))
+        value, error = cast("tuple[float, float]", Sky.of(cast("Any", [fit]), scatter=2.0).star)
+        assert value == pytest.approx(2e7 * scale)
+        assert error == pytest.approx(share * value)
     # What is not calibrated has no flux density.
     del got.header["PIXAR_SR"]
-    assert star_flux_density(fitted(got)) is None
+    assert jansky_per_unit(fitted(got)) is None
+    with pytest.raises(IncompatibleSetupError, match="is not calibrated: expected"):
+        require_calibrated(got)
 
 
 def test_simulated_frames_have_no_flux_density() -> None:
     frames = Observation.from_arrays(np.ones((4, 4)), np.ones((4, 4)), pixelscale=0.06)
-    assert star_flux_density(fitted(frames)) is None
+    assert jansky_per_unit(fitted(frames)) is None
+
+
+@pytest.mark.parametrize(
+    "star", [0.36308, "0.36308 Jy", 363.08 * u.mJy, 10.0 * u.ABmag, "363.08 mJy"]
+)
+def test_the_stars_flux_may_be_given_in_any_unit(star: Any) -> None:
+    assert to_jansky(star) == pytest.approx(0.36308, rel=1e-4)
+
+
+@pytest.mark.parametrize("star", [0, -1.0, math.nan, math.inf, "bright", 3 * u.m, None, [0.1, 0.2]])
+def test_what_is_no_flux_is_refused(star: Any) -> None:
+    with pytest.raises(IncompatibleSetupError, match=r"star_flux: got .* expected a"):
+        to_jansky(star)
 
 
 def test_the_epoch_is_the_middle_of_the_exposures(tmp_path: Path) -> None:
@@ -269,7 +289,8 @@ def test_the_epoch_is_the_middle_of_the_exposures(tmp_path: Path) -> None:
     later = observation(tmp_path / "b", EXPMID=None, **{"DATE-BEG": "2022-10-03T16:00:00"})
     assert first.mid_date is not None
     assert first.mid_date.mjd == REAL["EXPMID"]
-    fits_ = cast("Any", [SimpleNamespace(frames=[fitted(first), fitted(later)])])
+    frames = [fitted(first), fitted(later)]
+    fits_ = cast("Any", [SimpleNamespace(frames=frames, settings=dr.GaussNewton())])
     sky = Sky.of(fits_)
     assert sky.mjd == pytest.approx((REAL["EXPMID"] + 59855 + 16 / 24) / 2, abs=1e-8)
     assert sky.date == Time(sky.mjd, format="mjd").isot[:19]

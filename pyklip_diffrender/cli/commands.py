@@ -296,6 +296,8 @@ def _reduction(
     disk: bool,
     injections: int,
     systematics: str,
+    star_flux: str | None,
+    star_flux_error: float,
     memory: str | None,
     opd: Path | None,
     opd_folder: Path | None,
@@ -317,6 +319,7 @@ def _reduction(
             from pyklip_diffrender.cli.estimate import describe_plan
 
             parts: dict[str, Any] = {"wide": wide, "disk": disk, "injections": injections}
+            parts["star_flux"] = star_flux is not None
             click.echo(describe_plan(sequence, size, systematics, **parts))
             return
         from pyklip_diffrender.io.progress import stage
@@ -336,6 +339,8 @@ def _reduction(
             wide=wide,
             disk=disk,
             injections=injections,
+            star_flux=star_flux,
+            star_flux_error=star_flux_error,
             device=run.device,
             memory=memory,
             progress=run.progress,

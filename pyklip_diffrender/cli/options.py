@@ -230,6 +230,11 @@ search = _all(
            section="Fit and search",
            help="Add N planets slightly brighter than the limits to the frames, and report how "
                 "well they are recovered. Seven take as long as the fit and the search."),
+    option("--star-flux", metavar="FLUX", section="Fit and search",
+           help='Flux density of the star in the filter, such as "0.45 Jy", to which contrasts '
+                "refer; default: what diffracted light says, to 10 %."),
+    option("--star-flux-error", type=float, default=0.05, show_default=True, metavar="PART",
+           section="Fit and search", help="Relative error of --star-flux."),
     option("--systematics", default="auto", show_default=True, metavar="CHOICE",
            section="Fit and search",
            help="Pattern of the model's error: auto (the package's library, else the reference "

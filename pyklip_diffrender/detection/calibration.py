@@ -12,6 +12,7 @@ from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.linear.frames import LinearFrame
 from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.refinement import star_flux_error
 
 __all__ = ["calibration_errors"]
 
@@ -19,13 +20,16 @@ _CLEAR = 25.0
 """S/N above which the error of a source's own image matters."""
 
 
-def calibration_errors(groups: Sequence[Group], offsets: Tensor, snr: Tensor) -> Tensor:
+def calibration_errors(
+    groups: Sequence[Group], offsets: Tensor, snr: Tensor, factors: Tensor
+) -> Tensor:
     """Relative errors of contrasts because of the star's flux and of the source's image.
 
     A contrast is the flux of the source over that of the star. The source is measured with an
     image that depends on the wavefront, so errors of the wavefront and of the star's flux change
     the contrast in proportion. They do not change the significance of a source. Both come from
-    the same posterior and may partly cancel.
+    the same posterior and may partly cancel. In real frames the posterior understates the error of
+    the star's flux, see `star_flux_error`, which is added.
 
     Parameters
     ----------
@@ -34,6 +38,8 @@ def calibration_errors(groups: Sequence[Group], offsets: Tensor, snr: Tensor) ->
         x, y of the sources from the star, arcsec.
     snr : Tensor, (k,)
         S/N of the sources. Below 25 the image is taken as known, because noise dominates.
+    factors : Tensor, (k,)
+        By which errors of the posterior are multiplied.
 
     Returns
     -------
@@ -57,7 +63,9 @@ def calibration_errors(groups: Sequence[Group], offsets: Tensor, snr: Tensor) ->
                 on_rows[frame.first_mode :, [j, count + j]] = by_modes[:, None]
             changes += frame.onto_unknowns(on_rows, len(linear.vector)) / frames
         variance += linear.variances(changes)
-    return variance.sqrt().reshape(2, count)
+    errors = factors * variance.sqrt().reshape(2, count)
+    untied = sum(star_flux_error(templates.fit) for _, templates in groups) / len(groups)
+    return torch.stack([torch.hypot(errors[0], torch.full_like(errors[0], untied)), errors[1]])
 
 
 def _by_modes(templates: Templates, k: int, frame: LinearFrame, offset: Tensor) -> Tensor:

@@ -53,7 +53,9 @@ def contrasts_at(
     error = factors / products.information.sqrt().numpy()
     contrast = (products.numerator / products.information).numpy()
     snr = contrast / error
-    calibration = factors * calibration_errors(groups, places, torch.from_numpy(snr)).numpy()
+    calibration = calibration_errors(
+        groups, places, torch.from_numpy(snr), torch.from_numpy(factors)
+    ).numpy()
     table = QTable(
         {
             "x": places[:, 0].numpy() * u.arcsec,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from astropy import units as u
-from astropy.table import QTable, Row
+from astropy.table import QTable
 from numpy.typing import NDArray
 
 from pyklip_diffrender.detection.result import Detection
@@ -58,6 +59,26 @@ _COLUMNS = {
 _UNITS = {"separation": u.arcsec, "position_angle": u.deg}
 
 
+class MeasuredPlanet(NamedTuple):
+    """What is measured of a planet.
+
+    Attributes
+    ----------
+    contrast : float
+        Of the candidate within 0.1 arcsec, or else measured at the place of the planet.
+    contrast_error : float
+        Without that of the star's flux, which is the unit of injected planets, too.
+    snr : float
+    detected : bool
+        Whether there is such a candidate.
+    """
+
+    contrast: float
+    contrast_error: float
+    snr: float
+    detected: bool
+
+
 def recover_planets(
     detection: Detection, count: int, search: Callable[[tuple[Observation, ...]], Detection]
 ) -> QTable:
@@ -78,8 +99,7 @@ def recover_planets(
     -------
     QTable
         One row for each planet: where it was injected (as in the table of candidates), its
-        contrast, what was measured, and whether it was among the candidates. If it was not, the
-        contrast is what is measured at its place.
+        contrast, and what `measured_planet` says of it.
     """
     frames = [each for each in detection.fits[0].frames if not each.observation.reference]
     curve = detection.contrast_curve
@@ -104,9 +124,8 @@ def recover_planets(
         ]
         again = search(with_planets(frames, injected))
         for planet in injected:
-            row, detected = measured_planet(again, planet.offset)
             angle = (planet.position_angle + detection.north) % 360
-            measured = (row["contrast"], row["contrast_error"], row["snr"], detected)
+            measured = measured_planet(again, planet.offset)
             planets.add_row((planet.separation, angle, planet.contrast, *measured))
     for name, unit in _UNITS.items():
         planets[name] = planets[name] * unit
@@ -144,7 +163,7 @@ def with_planets(frames: Sequence[FrameFit], planets: Sequence[Planet]) -> tuple
     return tuple(science)
 
 
-def measured_planet(detection: Detection, place: tuple[float, float]) -> tuple[Row, bool]:
+def measured_planet(detection: Detection, place: tuple[float, float]) -> MeasuredPlanet:
     """What is measured of a planet of which the position is known.
 
     Parameters
@@ -155,16 +174,15 @@ def measured_planet(detection: Detection, place: tuple[float, float]) -> tuple[R
 
     Returns
     -------
-    row : Row
-        Of the candidate within 0.1 arcsec, or else of a measurement at the place.
-    detected : bool
-        Whether there is such a candidate.
+    MeasuredPlanet
     """
     table = detection.table
     distances = np.hypot(table["x"].value - place[0], table["y"].value - place[1])
-    if len(table) and distances.min() < _SAME:
-        return table[int(distances.argmin())], True
-    return detection.measure([place])[0], False
+    detected = len(table) > 0 and bool(distances.min() < _SAME)
+    row = table[int(distances.argmin())] if detected else detection.measure([place])[0]
+    contrast, snr = float(row["contrast"]), float(row["snr"])
+    error = contrast / snr if snr else float(row["contrast_error"])
+    return MeasuredPlanet(contrast, error, snr, detected)
 
 
 def _free_place(detection: Detection, separation: float, angle: float) -> NDArray[np.float64]:

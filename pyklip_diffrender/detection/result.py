@@ -179,9 +179,10 @@ class Detection:
 
         Errors are standard deviations, with all parameters of the star marginalised. Those of
         positions do not include errors of the pixel scale and of the roll angle. The error of the
-        contrast includes the errors of the star's flux and of the source's own image (see
-        `calibration.calibration_errors`); that of the flux density does not depend on the star's
-        flux. The S/N includes neither, because they do not change the significance of a source.
+        contrast includes the errors of the star's flux (10 % for real frames, unless
+        ``reduce(star_flux=...)`` says it) and of the source's own image; that of the flux density
+        does not depend on the star's flux. The S/N includes neither, because they do not change the
+        significance of a source.
         """
         table = candidate_table(
             self.candidates, self.error_factor, self._calibration_errors, self.sky
@@ -195,7 +196,7 @@ class Detection:
         candidates = self.candidates
         factors = torch.from_numpy(self.error_factor.of(candidates.offsets))
         snr = candidates.contrasts / (factors * candidates.errors[:, 0])
-        return (factors * calibration_errors(self.groups, candidates.offsets, snr)).numpy()
+        return calibration_errors(self.groups, candidates.offsets, snr, factors).numpy()
 
     def measure(self, offsets: ArrayLike, *, sigmas: float = 5.0) -> QTable:
         """Contrast of a point source at given positions, one at a time.

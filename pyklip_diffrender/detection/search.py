@@ -226,9 +226,7 @@ def _measured(
         sources = _as_candidates(table[table["snr"] > _SOURCE])
         companions = Candidates.of_fit(fits[0])
         factor = error_inflation(fits, groups, torch.cat([companions.offsets, sources.offsets]))
-        table["contrast_error"] *= factor
-        table["snr"] /= factor
-        calibration = factor * calibration
+        table, calibration = contrasts_at(groups, offsets, ErrorFactor.constant(factor))
     return table, calibration, factor
 
 

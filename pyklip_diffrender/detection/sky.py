@@ -6,17 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from astropy import units as u
 from astropy.time import Time
 from numpy.typing import NDArray
 
 from pyklip_diffrender.detection.field import Image
-from pyklip_diffrender.refinement import FrameFit, Refinement
+from pyklip_diffrender.refinement import Refinement, jansky_per_unit, star_flux_error
 
 __all__ = ["Positions", "Sky"]
-
-_BRIGHTNESS = u.MJy / u.sr
 
 
 @dataclass(frozen=True)
@@ -31,7 +27,8 @@ class Sky:
         Mean of the target's mid-exposures, UTC; None if no frame has a date.
     star : (float, float) or None
         Flux density of the star and its standard deviation, Jy; None where the frames have no
-        photometric calibration. See `star_flux_density`.
+        photometric calibration. The error is that of the diffracted light or of the catalogue,
+        without that of the calibration.
     """
 
     north: float | None = None
@@ -49,11 +46,14 @@ class Sky:
             for f in frames
         ]
         known = [date.mjd for date in dates if date is not None]
-        stars = [star_flux_density(frame) for frame in frames]
         star = None
-        if all(each is not None for each in stars):
-            value, error = np.mean(np.array(stars), axis=0)
-            star = (float(value), float(scatter * error))
+        # Unknown scales become NaN.
+        scales = np.array([jansky_per_unit(frame) for frame in frames], dtype=float)
+        if np.isfinite(scales).all():
+            flux = np.mean(scales * [frame.flux for frame in frames])
+            error = scatter * np.mean(scales * [frame.errors["flux"][0] for frame in frames])
+            untied = np.mean([star_flux_error(fit) for fit in fits])
+            star = (float(flux), float(np.hypot(error, untied * flux)))
         return cls(
             None if first.position_angles is None else first.position_angle,
             float(np.mean(known)) if known else None,
@@ -75,33 +75,6 @@ class Sky:
     def date(self) -> str | None:
         """The epoch in words, to the second."""
         return None if self.mjd is None else Time(self.mjd, format="mjd").isot[:19]
-
-
-def star_flux_density(frame: FrameFit) -> tuple[float, float] | None:
-    """Flux density of a star and its standard deviation, Jy.
-
-    The fitted flux is the light that the entrance pupil collects, in the unit of the pixels. What
-    the pipeline calibrates is the light of a source far from the occulter, all of its image
-    through the Lyot stop. That is the fitted flux times the transmission of the stop, times the
-    solid angle of a pixel for which the pipeline calculated its surface brightness (PIXAR_SR).
-
-    Returns
-    -------
-    tuple of float or None
-        None for frames that are not NIRCam's, that are not in units of surface brightness, or
-        whose header has no PIXAR_SR.
-    """
-    observation = frame.observation
-    area = observation.header.get("PIXAR_SR")
-    if not (observation.is_nircam and observation.unit.is_equivalent(_BRIGHTNESS)):
-        return None
-    if isinstance(area, bool) or not isinstance(area, float) or not area > 0:
-        return None
-    # A tensor, because the wavefront is complex where the pupil's amplitude was fitted.
-    opd = torch.from_numpy(np.ascontiguousarray(frame.opd))
-    transmission = frame.model.transmission(opd, **frame.optical_values)
-    scale = transmission * area * observation.unit.to(_BRIGHTNESS) * 1e6
-    return scale * frame.flux, scale * float(frame.errors["flux"][0])
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,8 @@ def planet_cards(
         factor = max(factor, float(error_factor.of(sources.offsets[-1:])[0]))
     error = factor * np.sqrt(covariance[0, 0])
     snr = sources.contrasts[-1:] / error
-    calibration = factor * float(calibration_errors(groups, sources.offsets[-1:], snr)[1, 0])
+    factors = snr.new_full(snr.shape, factor)
+    calibration = float(calibration_errors(groups, sources.offsets[-1:], snr, factors)[1, 0])
     detector = part.frame.model.detector
     # From arcsec along x and y to pixels, then as pyKLIP turns the frames; east is to the left.
     pixels = np.linalg.inv([[1.0, 0.0], [detector.shear, 1.0]])

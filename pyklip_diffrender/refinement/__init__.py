@@ -9,6 +9,13 @@ from pyklip_diffrender.refinement.library import known_systematics
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
+from pyklip_diffrender.refinement.star_flux import (
+    jansky_per_unit,
+    require_calibrated,
+    star_flux_error,
+    to_jansky,
+    with_star_flux,
+)
 from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.refinement.systematics import Systematics
 
@@ -19,9 +26,14 @@ __all__ = [
     "Refinement",
     "Status",
     "Systematics",
+    "jansky_per_unit",
     "known_systematics",
     "learn_systematics",
     "refine",
     "refine_again",
+    "require_calibrated",
     "settings_for",
+    "star_flux_error",
+    "to_jansky",
+    "with_star_flux",
 ]

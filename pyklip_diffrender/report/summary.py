@@ -18,7 +18,7 @@ from pyklip_diffrender import __version__
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.reduction import Reduction
-from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.report.words import MANY, advice, sentence
 from pyklip_diffrender.scene.observation import Observation
 
@@ -150,7 +150,13 @@ def _star(detection: Detection) -> dict[str, Any] | None:
     if detection.sky.star is None:
         return None
     value, error = detection.sky.star
-    return {"flux_density_Jy": value, "flux_density_error_Jy": error}
+    settings = detection.fits[0].settings
+    known = isinstance(settings, GaussNewton) and "flux" in settings.deviations
+    return {
+        "flux_density_Jy": value,
+        "flux_density_error_Jy": error,
+        "source": "star_flux" if known else "diffracted light",
+    }
 
 
 def _label(table: QTable, name: str) -> str:

@@ -40,6 +40,10 @@ class Options:
         "auto", "references", "off", or the path of a file of `Systematics.write`.
     wide, disk : bool
         Search the whole frames as well, or fit extended light together with the star.
+    star_flux : float or None
+        Flux density of the star, Jy.
+    star_flux_error : float
+        Its relative error.
     settings : dict
         Arguments of `GaussNewton.nircam`; empty for the defaults of `reduce`.
     """
@@ -49,6 +53,8 @@ class Options:
     systematics: str = "auto"
     wide: bool = False
     disk: bool = False
+    star_flux: float | None = None
+    star_flux_error: float = 0.05
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -285,6 +291,12 @@ def _options(table: _Table, default: Options) -> Options:
     if wide and disk:
         table.complain("", "wide = true and disk = true", "one of them")
         disk = False
+    star = table.take(
+        "star_flux", default.star_flux, "a flux density in Jy, such as 0.45", _positive
+    )
+    star_error = table.take(
+        "star_flux_error", default.star_flux_error, "a relative error, such as 0.05", _positive
+    )
     own = table.take("settings", {}, "a table with arguments of GaussNewton", _mapping)
     # Those of a sequence come on top of the survey's.
     settings = {**default.settings, **own}
@@ -292,7 +304,7 @@ def _options(table: _Table, default: Options) -> Options:
     where = f"{table.place}: settings"
     table.problems += [f"{where}: {each}" for each in wrong]
     allowed = default.settings if wrong else settings
-    return Options(size, threshold, pattern, wide, disk, allowed)
+    return Options(size, threshold, pattern, wide, disk, star, star_error, allowed)
 
 
 def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:

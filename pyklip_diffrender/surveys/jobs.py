@@ -122,7 +122,7 @@ def _jobs(
 ) -> list[Job]:
     files = _files(sequence.files)
     opd = _nearest(sequence.opd, files, date) if sequence.opd.is_dir() else sequence.opd
-    pattern = sequence.options.systematics
+    pattern, star = sequence.options.systematics, sequence.options.star_flux
     known = [] if pattern in ("auto", "references", "off") else [Path(pattern)]
     inputs = {str(path): digest(path) for path in (*files, opd, *known)}
     facts = {
@@ -135,8 +135,9 @@ def _jobs(
         "threshold": sequence.options.threshold,
         "systematics": inputs.get(pattern, pattern),
         "settings": dict(sequence.options.settings),
-        # Only where they are on, so that jobs of configurations without them keep their names.
+        # Only where they are used, so that jobs of configurations without them keep their names.
         **{name: True for name in ("wide", "disk") if getattr(sequence.options, name)},
+        **({} if star is None else {"star_flux": [star, sequence.options.star_flux_error]}),
     }
     plain = Job(
         _hash(facts),

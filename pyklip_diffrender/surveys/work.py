@@ -27,6 +27,8 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
         "threshold": options.threshold,
         "memory": memory,
         "disk": options.disk,
+        "star_flux": options.star_flux,
+        "star_flux_error": options.star_flux_error,
         "settings": GaussNewton.nircam(**options.settings) if options.settings else None,
     }
     if job.injection is not None and job.base is not None:
@@ -51,8 +53,9 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
         written += reduction.wide.write(folder)
     if reduction.disk is not None:
         written.append(reduction.disk.write(folder))
-    # The linear model takes twenty times the rest of the fit.
-    written.append(reduction.fit.write(folder / "fit.fits", linear=False))
+    if job.injection is None:
+        # The linear model takes twenty times the rest of the fit, which injections start from.
+        written.append(reduction.fit.write(folder / "fit.fits", linear=False))
     if reduction.systematics is not None:
         written.append(reduction.systematics.write(folder / "systematics.fits"))
     write_report(reduction, folder, written)
@@ -79,10 +82,8 @@ def _planet(injection: Injection, north: float) -> Planet:
 def _recovered(reduction: Reduction, planet: Injection) -> dict[str, Any]:
     """What is measured of an injected planet: of its candidate, else at its place."""
     found = reduction.detection
-    row, detected = measured_planet(found, _planet(planet, found.north).offset)
-    values = {key: float(row[key]) for key in ("contrast", "contrast_error", "snr")}
-    finite = {key: value if math.isfinite(value) else None for key, value in values.items()}
-    return {**finite, "detected": detected}
+    measured = measured_planet(found, _planet(planet, found.north).offset)._asdict()
+    return {key: value if math.isfinite(value) else None for key, value in measured.items()}
 
 
 def _result(summary: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,100 @@
+"""The flux of the star, to which contrasts refer: from diffracted light, or from a catalogue."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from astropy import units as u
+from astropy.io import fits
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.detection import measured_planet
+from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
+from pyklip_diffrender.refinement import Refinement, star_flux_error, with_star_flux
+
+TRUTH = 3e-5
+PLANET = dr.Planet(TRUTH, 0.6, 120.0)
+SETTINGS = dr.GaussNewton(cycles=6)
+
+
+@pytest.fixture(scope="module")
+def fit() -> Refinement:
+    """A simulated star and planet, with the header of a calibrated frame."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    opd = dr.random_opd(1, npix=128)
+    frame = dr.simulate(model, dr.Scene(planets=(PLANET,)), opd, seed=3)
+    header = fits.Header({"INSTRUME": "NIRCAM", "PIXAR_SR": 9.2e-14})
+    frame = replace(frame, unit=u.MJy / u.sr, header=header)
+    return dr.refine(model, frame, opd, settings=SETTINGS, plan="off")
+
+
+def test_contrasts_of_real_frames_have_the_error_of_the_stars_flux(fit: Refinement) -> None:
+    detection = dr.detect(fit)
+    (planet,) = detection.table
+    assert star_flux_error(fit) == 0.1
+    # The noise is 1/469 of the planet.
+    assert planet["contrast_error"] / planet["contrast"] == pytest.approx(0.1, rel=0.01)
+    assert planet["flux_density_error"] / planet["flux_density"] < 0.02
+    assert planet["delta_mag_error"].value == pytest.approx(0.1086, rel=0.01)
+    measured = detection.measure([PLANET.offset])[0]
+    assert measured["contrast_error"] / measured["contrast"] == pytest.approx(0.1, rel=0.01)
+    # An injected planet is as bright as it is in units of the same star.
+    injected = measured_planet(detection, PLANET.offset)
+    assert injected.detected
+    assert injected.contrast_error / injected.contrast == pytest.approx(1 / injected.snr)
+
+
+def test_simulated_frames_have_no_such_error(fit: Refinement) -> None:
+    (frame,) = fit.frames
+    plain = replace(frame, observation=replace(frame.observation, header=fits.Header()))
+    assert star_flux_error(replace(fit, frames=(plain,))) == 0.0
+
+
+@pytest.mark.parametrize("share", [0.98, 1.02])
+def test_contrasts_refer_to_the_catalogues_star(fit: Refinement, share: float) -> None:
+    """A prior far tighter than the data's own error: the star obeys, the planet's flux stays."""
+    before = dr.detect(fit)
+    assert before.sky.star is not None
+    tied = with_star_flux(fit, share * before.sky.star[0], 1e-6)
+    after = dr.detect(tied)
+    assert star_flux_error(tied) == 0.0
+    assert after.sky.star is not None
+    assert after.sky.star[0] / before.sky.star[0] == pytest.approx(share, rel=3e-4)
+    (then,), (now,) = before.table, after.table
+    assert now["contrast"] / then["contrast"] == pytest.approx(1 / share, rel=6e-3)
+    ratio = (now["flux_density"] / then["flux_density"]).value
+    assert ratio == pytest.approx(1.0, abs=6e-3)
+
+
+def test_a_prior_that_agrees_changes_nothing_but_the_error(fit: Refinement) -> None:
+    before = dr.detect(fit)
+    assert before.sky.star is not None
+    after = dr.detect(with_star_flux(fit, before.sky.star[0], 0.03))
+    (then,), (now,) = before.table, after.table
+    assert now["contrast"] == pytest.approx(then["contrast"], rel=2e-3)
+    assert now["contrast"] == pytest.approx(TRUTH, rel=4 / now["snr"])
+    assert now["contrast_error"] < 0.1 * then["contrast_error"]
+
+
+def test_frames_without_calibration_are_refused_before_the_fit(fit: Refinement) -> None:
+    (frame,) = fit.frames
+    bare = replace(frame.observation, header=fits.Header({"INSTRUME": "NIRCAM"}))
+    with pytest.raises(IncompatibleSetupError, match="is not calibrated: expected"):
+        with_star_flux(replace(fit, frames=(replace(frame, observation=bare),)), 0.4, 0.03)
+    sequence = dr.Sequence("a star", (bare,))
+    with pytest.raises(IncompatibleSetupError, match="is not calibrated: expected"):
+        dr.reduce(sequence, fit.initial, size=16, star_flux="0.4 Jy")
+
+
+@pytest.mark.parametrize("error", [0.0, -0.1, math.nan])
+def test_errors_that_are_not_positive_are_refused(fit: Refinement, error: float) -> None:
+    sequence = dr.Sequence("a star", (fit.frames[0].observation,))
+    with pytest.raises((IncompatibleSetupError, UnitError, ValueError), match="star_flux_error"):
+        dr.reduce(sequence, fit.initial, star_flux=0.4, star_flux_error=error)
+
+
+def test_the_adam_recipe_has_no_prior(fit: Refinement) -> None:
+    with pytest.raises(IncompatibleSetupError, match="expected GaussNewton"):
+        with_star_flux(replace(fit, settings=dr.Adam()), 0.4, 0.03)
