@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -451,6 +452,20 @@ def test_what_flux_and_image_do_to_a_contrast_may_cancel(world: World, one: Dete
     assert error(untied) == pytest.approx(math.sqrt(2) * 1e-3, rel=1e-5)
     assert error(untied, frames=2) == pytest.approx(1e-3, rel=1e-5)
     assert error(tied) < 1e-6
+
+
+def test_a_search_ends_with_a_number_of_candidates_that_stand_for_something_extended(
+    world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two of three planets, with S/N that would be worth another fit of the star."""
+    planets = [Planet(1e-5, 0.6, angle) for angle in (0.0, 120.0, 240.0)]
+    fit = world.fitted(5, *planets)
+    monkeypatch.setattr("pyklip_diffrender.detection.search._MAX_CANDIDATES", 2)
+    with caplog.at_level(logging.WARNING, "pyklip_diffrender"):
+        found = dr.detect(fit, relinearise=5.0, scatter=1.0)
+    assert len(found.candidates) == 2
+    assert found.fits[0] is fit
+    assert "2 candidates, the most that are looked for" in caplog.text
 
 
 @pytest.mark.slow

@@ -118,7 +118,13 @@ def detect(
     if not all(fit.status.calibrated for fit in fits):
         relinearise = min(relinearise, threshold)
     bright = candidates.snr(factor) > relinearise
-    if bright.any() and lacks_candidates(fits, candidates):
+    if len(candidates) >= _MAX_CANDIDATES:
+        _log.warning(
+            "%d candidates, the most that are looked for: parts of something extended? The star is "
+            "not refined with them in the model",
+            len(candidates),
+        )
+    elif bright.any() and lacks_candidates(fits, candidates):
         fits = with_companions(fits, candidates, progress)
         maps = Maps(groups_of(fits), progress)
         candidates, factor = _search(maps, fits, threshold, inner, scatter, candidates)
