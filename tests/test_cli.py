@@ -351,6 +351,8 @@ def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
     assert more["extended light, and the wavefront without it"] > one
     eight = dict(steps_of(twice, 6, "off", injections=8))
     assert eight["8 injected planets"] == 2 * sum(list(both.values())[:2])
+    tied = dict(steps_of(twice, 6, "off", star_flux=True))
+    assert tied["wavefront: 2 files of the target"] == pytest.approx(1.6 * two)
     whole = dict(steps_of(twice, 6, "off", wide=True))
     assert set(whole) - set(both) == {"search of the whole frames"}
 
@@ -401,7 +403,7 @@ def test_reduce_passes_its_options_on_and_names_the_products(
     products = tmp_path / "products"
     arguments = ["reduce", str(frames), "--opd-folder", str(maps), "--opd-date", "before"]
     arguments += ["-o", str(products), "--size", "6", "--threshold", "4", "--systematics", "off"]
-    arguments += ["--memory", "2 GB", "--injections", "7"]
+    arguments += ["--memory", "2 GB", "--injections", "7", "--star-flux", "0.4 Jy"]
     assert main(arguments) == 0
     shown = capsys.readouterr()
     assert "what was found\n" in shown.out
@@ -410,7 +412,8 @@ def test_reduce_passes_its_options_on_and_names_the_products(
     (call,) = reduced
     assert call.arguments["opd"].name == "opd_2022-07-20.fits"
     wanted = {"size": 6, "threshold": 4.0, "systematics": "off", "device": "cpu"}
-    assert {**wanted, "memory": "2 GB", "injections": 7}.items() <= call.arguments.items()
+    wanted |= {"memory": "2 GB", "injections": 7, "star_flux": "0.4 Jy", "star_flux_error": 0.05}
+    assert wanted.items() <= call.arguments.items()
     # Not on a terminal: no bar, but the stages.
     assert call.arguments["progress"] is False
     assert "4 of 4: products" in shown.err

@@ -107,6 +107,9 @@ def test_whole_frames_and_disks_are_asked_for_by_sequence(tmp_path: Path) -> Non
     keys = {job.key for job in planned(config)}
     assert len(keys) == 3
     assert planned({**config, "sequence": [plain]})[0].key in keys
+    star = planned({**config, "sequence": [{**plain, "star_flux": 0.4}]})[0]
+    assert (star.options.star_flux, star.options.star_flux_error) == (0.4, 0.05)
+    assert star.key not in keys
     config["options"] = {"disk": True}
     assert [job.options.disk for job in planned({**config, "sequence": [plain]})] == [True]
 
@@ -128,6 +131,8 @@ def test_whole_frames_and_disks_are_asked_for_by_sequence(tmp_path: Path) -> Non
         ((), "options", {"settings": {"tolerance": []}}, ["options: settings", "wrong type"]),
         ((), "options", {"disk": 1}, ["options: disk", "true or false"]),
         ((1,), "wide", "yes", ["sequence 2: wide", "true or false"]),
+        ((1,), "star_flux", -0.4, ["sequence 2: star_flux", "-0.4", "Jy"]),
+        ((), "options", {"star_flux_error": 0}, ["options: star_flux_error", "0.05"]),
         ((), "options", {"disk": True, "wide": True}, ["options", "one of them"]),
         ((), "injections", {"contrasts": [1e-5]}, ["injections", "both"]),
         ((), "injections", {"angles": 3}, ["injections: angles", "a list"]),
@@ -666,8 +671,8 @@ def test_a_disk_and_the_whole_frames_are_part_of_the_job(
         def write(self, folder: Path) -> Path:
             return folder / "disk.fits"
 
-    def reduce(*_: Any, wide: bool, disk: bool, **__: Any) -> Any:
-        asked.append({"wide": wide, "disk": disk})
+    def reduce(*_: Any, wide: bool, disk: bool, star_flux: Any, **__: Any) -> Any:
+        asked.append({"wide": wide, "disk": disk, "star_flux": star_flux})
         return SimpleNamespace(
             detection=part, fit=part, systematics=None,
             wide=part if wide else None, disk=Disk() if disk else None,
@@ -687,11 +692,12 @@ def test_a_disk_and_the_whole_frames_are_part_of_the_job(
     )
     config = inputs(tmp_path, 1)
     for name in ("wide", "disk"):
-        (job,) = planned({**config, "options": {name: True}})
+        (job,) = planned({**config, "options": {name: True, "star_flux": 0.4}})
         record = work.reduce_job(job, tmp_path)
         assert [each["false_alarm_probability"] for each in record["candidates"]] == [None]
         assert record["curve"] == wide_field["contrast_curve"]
-    assert asked == [{"wide": True, "disk": False}, {"wide": False, "disk": True}]
+    asked_for = [{"wide": True, "disk": False}, {"wide": False, "disk": True}]
+    assert asked == [{**each, "star_flux": 0.4} for each in asked_for]
     assert [len(each) for each in written] == [3, 3]
     assert "disk.fits" in written[1]
 
