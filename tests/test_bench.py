@@ -18,6 +18,7 @@ import torch
 from astropy.table import Table
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from tests.benchmarks import operations
 from tests.benchmarks.speed import Setting, rivals, run_bench, timing, write_page, write_table
 from tests.benchmarks.speed import images as bench_images
 from tests.benchmarks.speed.__main__ import main
@@ -306,3 +307,19 @@ def test_it_runs_as_a_script(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "--quick" in done.stdout
+
+
+# -- operations ------------------------------------------------------------------------------------
+
+
+def test_operations_and_bytes_are_counted() -> None:
+    """A product, a transform and a choice of rows, of which the table is not read."""
+    left, right = torch.ones(4, 6), torch.ones(6, 5)
+    waves, rows = torch.ones(8, 8, dtype=torch.complex64), torch.tensor([0, 1])
+    product = operations.counted(lambda: left @ right)
+    assert (product.kernels, product.operations) == (1, 2 * 4 * 6 * 5)
+    assert product.bytes == 4 * (4 * 6 + 6 * 5 + 4 * 5)
+    assert product.seconds == operations.START
+    assert operations.counted(lambda: torch.fft.fft2(waves)).operations == 5 * 64 * 6
+    assert operations.counted(lambda: left[rows]).bytes == 2 * 4 * 12
+    assert operations.counted(lambda: left.T[1:]).kernels == 0

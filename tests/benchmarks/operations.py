@@ -46,6 +46,7 @@ _VIEWS = ("view", "slice", "select", "unsqueeze", "squeeze", "expand", "t", "tra
           "view_as_real", "view_as_complex", "conj", "_conj", "_reshape_alias", "movedim",
           "_unsafe_view", "empty", "new_empty", "lift_fresh", "_local_scalar_dense")  # fmt: skip
 _PRODUCTS = ("mm", "bmm", "addmm", "baddbmm", "mv", "dot")
+_PICKED = ("index", "index_select", "gather")
 _TRANSFORMS = ("_fft_c2c", "_fft_r2c", "_fft_c2r")
 
 
@@ -61,7 +62,11 @@ class Total:
     def add(self, name: str, inputs: list[Tensor], outputs: list[Tensor]) -> None:
         """Add an operation."""
         kind = outputs[0].dtype
-        moved = sum(each.numel() * each.element_size() for each in (*inputs, *outputs))
+        written, read = (
+            sum(e.numel() * e.element_size() for e in part) for part in (outputs, inputs)
+        )
+        # What is picked from a table is read, not the table.
+        moved = written + (min(read, written) if name in _PICKED else read)
         operations = operations_of(name, inputs, outputs[0])
         peak = PEAK[32 if kind in (torch.float32, torch.complex64) else 64]
         self.kernels += 1
