@@ -11,7 +11,7 @@ from astropy.io import fits as astropy_fits
 from astropy.table import QTable
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import Detection, WideField, wide_field
+from pyklip_diffrender.detection import Detection, WideField, wide_field, wide_search
 from pyklip_diffrender.detection.whole_frames import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 
@@ -75,6 +75,21 @@ def test_planets_are_measured_wherever_they_are(wide: WideField) -> None:
             planet.contrast, abs=4 * float(row["contrast_error"]), rel=0.05
         )
         assert row["fit_chi2"] < 3 or np.isnan(row["fit_chi2"])
+
+
+@pytest.mark.slow
+def test_contrasts_outside_have_the_error_of_the_stars_flux_as_well(
+    wide: WideField,
+    searched: tuple[Detection, list[dr.Observation]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(wide_search, "star_flux_error", lambda fit: 0.1)
+    again = wide_field(*searched).table
+    outside = np.isfinite(again["fit_chi2"])
+    assert outside.any()
+    added = again["contrast_error"] ** 2 - wide.table["contrast_error"] ** 2
+    ratio = np.sqrt(np.abs(added[outside])) / again["contrast"][outside]
+    np.testing.assert_allclose(ratio, 0.1, rtol=1e-3)
 
 
 @pytest.mark.slow

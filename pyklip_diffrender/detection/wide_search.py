@@ -26,6 +26,7 @@ from pyklip_diffrender.detection.whole_frames import WholeFrame
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.refinement import star_flux_error
 from pyklip_diffrender.refinement.companions import local_maxima
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
@@ -241,7 +242,8 @@ def wide_field(
         ours[rows, columns] = theirs
     calibration = np.zeros((2, len(sources)))
     star = detection.fits[0].frames[0]
-    calibration[0] = detection.scatter * float(star.errors["flux"][0]) / star.flux
+    fitted = detection.scatter * float(star.errors["flux"][0]) / star.flux
+    calibration[0] = np.hypot(fitted, star_flux_error(detection.fits[0]))
     table = candidate_table(sources, factor, calibration, detection.sky)
     # As in the table, the highest S/N first.
     order = np.argsort(-sources.snr(factor))
