@@ -189,11 +189,11 @@ def _candidates(summary: Mapping[str, Any]) -> str:
         "Magnitude difference (mag)", "S/N", "False-alarm probability",
     ]  # fmt: skip
     note = (
-        "Contrast is relative to the star without coronagraph; errors are standard deviations, those "
-        "of contrasts with that of the star's flux. The false-alarm probability is that of noise "
-        "alone making such a peak anywhere in the field; errors of the star model are not Gaussian "
-        "and can be more frequent. One epoch does not show whether a candidate is bound or in the "
-        "background."
+        "Contrast is relative to the star without coronagraph; errors are standard deviations, "
+        "those of contrasts with that of the star's flux. The false-alarm probability is that of "
+        "noise alone making such a peak anywhere in the field; errors of the star model are not "
+        "Gaussian and can be more frequent. One epoch does not show whether a candidate is bound "
+        "or in the background."
     )
     return (
         "<h3>Candidates</h3>"
