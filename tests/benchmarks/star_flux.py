@@ -1,0 +1,50 @@
+"""How well do real frames determine the flux of their star? Fits with brighter and fainter stars.
+
+Run from the root of the project, with the frames of programme 1184 in ../shared/data/gto1184::
+
+    python -m tests.benchmarks.star_flux --target HIP17695 --filter F444W
+    python -m tests.benchmarks.star_flux --frames ../shared/data/hip65426_f444w_calints.fits.gz
+        --opd ../shared/data/opd_2022-07-30.fits.gz
+
+The rolls of a target are fitted by `reduce`, and once more with the star's flux held within 0.3 % of
+other values. It prints chi-squared and what is measured of the candidates.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.refinement import jansky_per_unit, with_star_flux
+
+SHARES = (1.0, 0.9, 1.1, 1.2)
+HELD = 0.003
+
+
+def main() -> None:
+    """Fit with several fluxes."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--frames", type=Path, default=Path("../shared/data/gto1184"))
+    parser.add_argument("--opd", type=Path, default=Path("../shared/data/opd_2022-08-14.fits.gz"))
+    parser.add_argument("--target")
+    parser.add_argument("--filter")
+    options = parser.parse_args()
+    sequence = dr.Sequence.from_files(options.frames, target=options.target, filter=options.filter)
+    first = dr.reduce(replace(sequence, references=()), options.opd).fit
+    jansky = np.mean([frame.flux * (jansky_per_unit(frame) or np.nan) for frame in first.frames])
+    print(f"{sequence.target}: {jansky:.4f} Jy; times it, chi-squared per pixel, candidates")
+    for share in SHARES:
+        fit = first if share == 1 else with_star_flux(first, share * float(jansky), HELD)
+        seen = [
+            f"contrast {row['contrast']:.3e}, {row['flux_density']:.3e}, S/N {row['snr']:.1f}"
+            for row in dr.detect(fit).table
+        ]
+        print(f"{share:.1f}  {fit.chi2_per_pixel:.4f}  {'; '.join(seen) or 'none'}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
