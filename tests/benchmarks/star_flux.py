@@ -6,8 +6,8 @@ Run from the root of the project, with the frames of programme 1184 in ../shared
     python -m tests.benchmarks.star_flux --frames ../shared/data/hip65426_f444w_calints.fits.gz
         --opd ../shared/data/opd_2022-07-30.fits.gz
 
-The rolls of a target are fitted by `reduce`, and once more with the star's flux held within 0.3 % of
-other values. It prints chi-squared and what is measured of the candidates.
+The rolls of a target are fitted by `reduce`, and once more with the star's flux held within 0.3 %
+of other values. It prints chi-squared and what is measured of the candidates.
 """
 
 from __future__ import annotations
