@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from astropy import units as u
 from astropy.io import fits
 
@@ -18,6 +19,9 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
+from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.linear.response import coarse_copy
+from pyklip_diffrender.optics.fast.occulter import finest_spacing
 from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
 from pyklip_diffrender.scene.observation import Observation
 
@@ -364,3 +368,29 @@ def test_frames_of_another_instrument_are_refused_before_a_fit() -> None:
     frame = Observation.from_arrays(ones, ones, pixelscale=0.11, filter="F444W", header=header)
     with pytest.raises(IncompatibleSetupError, match="of MIRI, and only NIRCam"):
         dr.model_for(frame)
+
+
+@pytest.mark.parametrize(
+    ("name", "mask"),
+    [("F250M", "MASKA335R"), ("F356W", "MASKA335R"), ("F444W", "MASKA335R"),
+     ("F356W", "MASKA430R")],
+)  # fmt: skip
+def test_few_cells_of_the_occulter_are_enough_for_a_round_mask(name: str, mask: str) -> None:
+    """Star and planet against four cells per lambda/D; one cell per pixel at all wavelengths."""
+    header = fits.Header({"INSTRUME": "NIRCAM", "CORONMSK": mask, "PUPIL": "MASKRND"})
+    ones = np.ones((40, 40))
+    frame = Observation.from_arrays(ones, ones, pixelscale=0.063, filter=name, header=header)
+    model = dr.model_for(frame, npix=128, nlambda=3)
+    fine = dr.model_for(frame, npix=128, nlambda=3, occulter_sampling=4.0)
+    opd = dr.random_opd(1, npix=128).data
+    for place in ((0.01, 0.02), (0.6, 0.3)):
+        with torch.no_grad():
+            image, expected = model(opd, place), fine(opd, place)
+        assert float((image - expected).abs().max() / expected.max()) < 1e-6
+    spacings = [
+        finest_spacing(model.planes[0], model.detector, wavelength, model.planes[0].sampling)
+        for wavelength in model.bandpass.wavelengths
+    ]
+    assert min(spacings) == pytest.approx(min(model.detector.pixelscale) * ARCSEC)
+    coarse = coarse_copy(model, 64)
+    assert coarse.recipe["occulter_sampling"] == model.recipe["occulter_sampling"] < 1.5

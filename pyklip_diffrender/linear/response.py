@@ -34,8 +34,8 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 _CELLS = 1.9
-"""Cells of the occulter per lambda/D. With this number one cell per pixel is enough at all
-wavelengths of F444W, down to 3.9 um; two cells per pixel would take four times as long."""
+"""Largest number of cells of the occulter per lambda/D. With this number one cell per pixel is
+enough at all wavelengths of F444W, down to 3.9 um; two cells per pixel take four times as long."""
 
 _BATCH_BYTES = 1e7
 """Bytes of the fields in the pupil whose propagation is computed at a time, which takes several
@@ -68,7 +68,8 @@ def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     npix = coarse_npix(model, npix)
     if npix == model.npix:
         return model
-    coarser = {"npix": npix, "occulter_sampling": _CELLS, "dtype": torch.float32}
+    cells = min(_CELLS, model.recipe.get("occulter_sampling") or _CELLS)
+    coarser = {"npix": npix, "occulter_sampling": cells, "dtype": torch.float32}
     return model.with_fidelity(**{k: v for k, v in coarser.items() if k in model.adjustable})
 
 
