@@ -100,7 +100,8 @@ class Setting:
     def data(self) -> Path | None:
         """The data directory of stpsf, if there is one."""
         named = self.stpsf_path or os.environ.get("STPSF_PATH", "")
-        return Path(named) if named and Path(named).is_dir() else None
+        # Absolute, because stpsf joins some of its paths with it twice.
+        return Path(named).resolve() if named and Path(named).is_dir() else None
 
     @cached_property
     def model(self) -> OpticalSystem:
