@@ -253,8 +253,8 @@ def test_a_stars_flux_density_is_that_of_its_unocculted_image(tmp_path: Path) ->
     scale = jansky_per_unit(frame)
     assert scale == pytest.approx(frame.model.transmission() * REAL["PIXAR_SR"] * 1e6)
     # The posterior's 5 %, doubled, and the 10 % that it does not know of, unless there is a prior.
-    for deviations, share in (({}, math.hypot(0.1, 0.1)), ({"flux": 0.03}, 0.1)):
-        fit = SimpleNamespace(frames=[frame], settings=dr.GaussNewton(deviations=deviations))
+    for known, share in ((None, math.hypot(0.1, 0.1)), (0.05, math.hypot(0.1, 0.05))):
+        fit = SimpleNamespace(frames=[frame], settings=dr.GaussNewton(star_flux_error=known))
         value, error = cast("tuple[float, float]", Sky.of(cast("Any", [fit]), scatter=2.0).star)
         assert value == pytest.approx(2e7 * scale)
         assert error == pytest.approx(share * value)

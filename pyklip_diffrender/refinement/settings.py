@@ -80,6 +80,9 @@ class GaussNewton:
     robust : float
         Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain
         least squares.
+    star_flux_error : float, optional
+        Relative error of the star's flux that errors of contrasts include besides that of the fit.
+        Default 0.1 for real frames and 0 for others, see `star_flux.star_flux_error`.
     memory : float, str or Quantity, optional
         Memory that the process should take, bytes or such as "2 GB", of which it needs 1.3 GB
         for itself. Derivatives that do not fit are computed in parts whenever they are needed,
@@ -117,6 +120,7 @@ class GaussNewton:
     min_model_error: float = 0.0
     relinearise: float = 0.05
     robust: float = math.inf
+    star_flux_error: float | None = None
     memory: float | None = None
 
     def __post_init__(self) -> None:
@@ -158,8 +162,9 @@ class GaussNewton:
             "companion_threshold",
             "drift_cycles",
         )
-        for name in ("min_model_error", "max_companions"):
-            if not getattr(self, name) >= 0:
+        for name in ("min_model_error", "max_companions", "star_flux_error"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
                 raise IncompatibleSetupError(
                     f"{name}: got {getattr(self, name)}, expected 0 or more"
                 )

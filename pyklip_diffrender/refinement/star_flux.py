@@ -28,6 +28,10 @@ _UNTIED = 0.1
 is seen, and the prior on the wavefront decides how much of it a star has: fits with a star 10 %
 brighter or fainter explain real frames nearly as well (docs/validation/real_frames.md)."""
 
+_HELD = 0.003
+"""Relative deviation of a star's flux from that of a catalogue. The posterior of a fit understates
+the error of the flux, so that a prior as wide as the catalogue's error would hardly move it."""
+
 _BRIGHTNESS = u.MJy / u.sr
 
 
@@ -102,7 +106,7 @@ def to_jansky(star_flux: float | str | u.Quantity) -> float:
 def with_star_flux(
     fit: Refinement, star_flux: float, error: float, *, progress: bool = False
 ) -> Refinement:
-    """Continue a fit with a prior on the flux of the star.
+    """Continue a fit with the flux of the star held at that of a catalogue.
 
     The wavefront then makes up for the change of the diffracted light, so that contrasts refer to
     the catalogue's star.
@@ -114,7 +118,7 @@ def with_star_flux(
     star_flux : float
         Flux density in the filter, Jy.
     error : float
-        Its relative standard deviation.
+        Its relative standard deviation, which errors of contrasts then include.
     progress : bool
         Show progress bars.
 
@@ -133,19 +137,16 @@ def with_star_flux(
         scale = jansky_per_unit(frame)
         assert scale is not None
         frames.append(replace(frame, start={**frame.start, "flux": star_flux / scale}))
-    deviations = {**fit.settings.deviations, "flux": error}
-    return refine_again(
-        replace(fit, frames=tuple(frames)), deviations=deviations, progress=progress
-    )
+    changes = {"deviations": {**fit.settings.deviations, "flux": _HELD}, "star_flux_error": error}
+    return refine_again(replace(fit, frames=tuple(frames)), progress=progress, **changes)
 
 
 def star_flux_error(fit: Refinement) -> float:
     """Relative error of the star's flux that is not in the fit's own covariance.
 
-    10 % for real frames whose star has no prior on its flux, otherwise 0.
+    That of its settings; by default 10 % for real frames, and 0 for others.
     """
-    settings = fit.settings
-    is_tied = isinstance(settings, GaussNewton) and (
-        "flux" in settings.deviations or "flux" not in settings.free
-    )
-    return _UNTIED if fit.frames[0].observation.is_nircam and not is_tied else 0.0
+    known = fit.settings.star_flux_error if isinstance(fit.settings, GaussNewton) else None
+    if known is not None:
+        return known
+    return _UNTIED if fit.frames[0].observation.is_nircam else 0.0

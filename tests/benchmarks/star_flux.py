@@ -22,7 +22,6 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.refinement import jansky_per_unit, with_star_flux
 
 SHARES = (1.0, 0.9, 1.1, 1.2)
-HELD = 0.003
 
 
 def main() -> None:
@@ -38,7 +37,7 @@ def main() -> None:
     jansky = np.mean([frame.flux * (jansky_per_unit(frame) or np.nan) for frame in first.frames])
     print(f"{sequence.target}: {jansky:.4f} Jy; times it, chi-squared per pixel, candidates")
     for share in SHARES:
-        fit = first if share == 1 else with_star_flux(first, share * float(jansky), HELD)
+        fit = first if share == 1 else with_star_flux(first, share * float(jansky), 0.05)
         seen = [
             f"contrast {row['contrast']:.3e}, {row['flux_density']:.3e}, S/N {row['snr']:.1f}"
             for row in dr.detect(fit).table
