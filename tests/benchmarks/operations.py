@@ -7,8 +7,9 @@ Run from the root of the project, with the frames of programme 1184 in ../shared
 Every operation of PyTorch is counted with its floating-point operations and the bytes of its inputs
 and outputs. The predicted time is the sum over operations of the longest of three: operations over
 the peak rate of their precision, bytes over the bandwidth of the memory, and the start of a kernel.
-No GPU was measured. Of the reduction, the linear algebra is counted as if it were on the GPU as
-well; it stays on the processor.
+(`torch.utils.flop_counter` counts neither transforms nor bytes.) No GPU was measured. Of the
+reduction, the linear algebra is counted as if it were on the GPU as well; it stays on the
+processor.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ def operations_of(name: str, inputs: list[Tensor], out: Tensor) -> float:
         factor = inputs[-2]
         return (8.0 if is_complex else 2.0) * out.numel() * factor.shape[-1]
     if name in _TRANSFORMS:
-        # Sides of the transformed axes; both here are two-dimensional or one of them is 1.
+        # All transforms of the package are over the last two axes.
         return 5.0 * out.numel() * math.log2(max(2, math.prod(out.shape[-2:])))
     if "cholesky" in name:
         return out.shape[-1] ** 3 / 3 * math.prod(out.shape[:-2])
