@@ -248,6 +248,26 @@ def test_a_fit_with_a_basis_of_its_own_can_go_on(change: dict[str, bool]) -> Non
         assert first < 0.9 * fit.history[0]["chi2_per_pixel"]
 
 
+def test_a_fit_goes_on_from_where_it_ended() -> None:
+    """With a smallest error of the model, and a pattern in the frame that no wavefront explains."""
+    rng = np.random.default_rng(9)
+    frame = shot()
+    frame = replace(frame, data=frame.data * (1 + 0.05 * rng.normal(size=frame.data.shape)))
+    settings = GaussNewton(
+        basis=default_basis(CYCLES[0]), response_npix=64, min_model_error=0.002, robust=4.0,
+        prior=WavefrontPrior({"segment": 10.0, "texture": 6.0}, fit_scales=False),
+    )  # fmt: skip
+    fit = dr.refine(model(), frame, before(), settings=settings, plan="off")
+    assert fit.status is Status.MODEL_MISMATCH
+    kappas = [step["kappa"] for step in fit.history]
+    assert kappas[0] > 0.05
+    assert kappas[-1] == 0.002
+    again = refine_again(fit)
+    assert {step["kappa"] for step in again.history} == {0.002}
+    assert len(again.history) < len(fit.history) / 2
+    assert again.chi2_per_pixel == pytest.approx(fit.chi2_per_pixel, rel=0.02)
+
+
 def test_a_fit_by_adam_cannot_go_on() -> None:
     fit = dr.refine(model(), shot(), before(), settings=Adam(iterations=2))
     with pytest.raises(IncompatibleSetupError, match=r"Gauss-Newton.*'adam'"):

@@ -282,7 +282,18 @@ class Propagation:
         power = wavefront.field.abs().double().square().sum(dim=(-2, -1))
         return float(power * wavefront.grid.spacing**2)
 
-    def _field(self, opd: Tensor, wavelength: float, values: Values) -> Tensor:
+    def field(self, opd: Tensor, wavelength: float, values: Values) -> Tensor:
+        """Complex field on the detector's samples at a wavelength, (..., ny, nx).
+
+        Parameters
+        ----------
+        opd : Tensor, (..., npix, npix)
+            m; see `opd`.
+        wavelength : float
+            m.
+        values : mapping of str to Tensor
+            See `values`.
+        """
         if self._lattice is not None:
             windows = self.windows(values)
             field = self._lattice.star(self.entrance, opd, wavelength, values, windows)
@@ -293,7 +304,7 @@ class Propagation:
     def fields(self, opd: Value | None = None, **parameters: Value) -> list[Tensor]:
         """Complex field on the detector's samples at each wavelength, each (..., ny, nx)."""
         tensor, values = self.opd(opd), self.values(parameters)
-        return [self._field(tensor, wavelength, values) for wavelength in self.bandpass.wavelengths]
+        return [self.field(tensor, wavelength, values) for wavelength in self.bandpass.wavelengths]
 
     def image_of(
         self, fields: Sequence[Tensor], values: Values, weights: Tensor | None = None
@@ -367,5 +378,5 @@ class Propagation:
             wavefront = plane.apply(wavefront, values, onto)
             fields[plane.name] = wavefront.field
         # As in a call, which may take another route than the planes above.
-        fields[self.detector.name] = self._field(tensor, wavelength, values)
+        fields[self.detector.name] = self.field(tensor, wavelength, values)
         return fields

@@ -72,8 +72,9 @@ class CheapSystem(OpticalSystem):
         shifted._constants = dict(zip(self.bandpass.wavelengths, constants, strict=True))
         return shifted
 
-    def _field(self, opd: Tensor, wavelength: float, values: Values) -> Tensor:
-        field = super()._field(opd, wavelength, values)
+    def field(self, opd: Tensor, wavelength: float, values: Values) -> Tensor:
+        """Field with the constant of its wavelength, see `Propagation.field`."""
+        field = super().field(opd, wavelength, values)
         constant = self._constants.get(wavelength)
         return field if constant is None else field + constant
 

@@ -112,6 +112,8 @@ class Annealing:
         best_error = (math.inf, math.inf)
         first_scales = solver.scales
         kappa = max(self.objective.model_error(state), floor)
+        if self._is_warm and floor:
+            kappa = floor  # A larger one would lead away from the solution, and back.
         modes = 0
         if settings.wavefront and (not settings.free or self._is_warm):
             modes = self._modes_for(kappa)

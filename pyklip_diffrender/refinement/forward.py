@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -166,6 +167,61 @@ class Forward:
             rows[amplitude] = slopes[modes:].cpu()
             rows[amplitude.stop :] = slopes[:modes].cpu()
         return rows
+
+    def slopes(self, point: Point, pixels: Tensor) -> dict[str, Tensor]:
+        """Derivatives of ``(pixels * total).sum()`` through the model itself.
+
+        They take as long as two or three images, by reverse mode at one wavelength after the other.
+        `jacobian` has those of a coarse copy at fewer wavelengths, with an error that exceeds a
+        gradient near its zero. The dependence of companions on the wavefront is neglected in both.
+
+        Parameters
+        ----------
+        point : Point
+        pixels : Tensor, (ny, nx)
+
+        Returns
+        -------
+        dict of str to Tensor
+            float64, on the CPU: by the optical parameters, the modes, and the amplitude if it is
+            free.
+        """
+        unknowns, vector, model = point.unknowns, point.vector, self.model
+        names, spectrum = unknowns.optical, self.model.bandpass
+        values = model.values(unknowns.values(vector))
+        inputs = [each.detach().clone() for each in (point.opd, *(values[n] for n in names))]
+        for each in inputs:
+            each.requires_grad_()
+        values = {**values, **dict(zip(names, inputs[1:], strict=True))}
+        grad = partial(torch.autograd.grad, allow_unused=True, materialize_grads=True)
+        # The detector's part is linear in the light, and the same at all wavelengths.
+        light = torch.zeros((), dtype=model.dtype, device=model.device)
+        for field, weight in zip(point.fields, spectrum.weights, strict=True):
+            light = light + weight * field.abs().square()
+        light.requires_grad_()
+        scale = unknowns.level("flux", vector) * self.problem.gain * pixels
+        number = (model.detector.image(light, values) * scale.to(model.dtype)).sum()
+        by_light, *totals = grad(number, [light, *inputs])
+        for wavelength, weight, field in zip(
+            spectrum.wavelengths, spectrum.weights, point.fields, strict=True
+        ):
+            again = model.field(inputs[0], wavelength, values)
+            by_field = 2 * weight * by_light * field
+            for total, part in zip(totals, grad(again, inputs, by_field), strict=True):
+                total += part
+        by_name = dict(zip(names, totals[1:], strict=True))
+        result = {name: slope.double().cpu().flatten() for name, slope in by_name.items()}
+        result["modes"] = self._by_modes(totals[0].real)
+        if totals[0].is_complex():
+            result["amplitude"] = -self._by_modes(totals[0].imag)
+        return result
+
+    def _by_modes(self, by_opd: Tensor) -> Tensor:
+        """Derivatives by the modes, from those by the OPD."""
+        grid = PupilGrid.full(self.model.npix, self.model.diameter)
+        modes = torch.zeros(len(self.basis), dtype=torch.float64, requires_grad=True)
+        opd = self.basis.opd(modes * NANOMETRE, grid)
+        return torch.autograd.grad(opd, modes, by_opd.cpu().to(opd.dtype))[0]
 
     def _position_slopes(self, opd: Tensor, values: dict[str, Tensor]) -> Tensor:
         """Derivatives with respect to x and y of a source, (2, ny, nx), per arcsec, on the CPU.

@@ -37,9 +37,10 @@ _RESPONSES = 4e9
 _ACCURATE = 0.05
 """Value of `GaussNewton.relinearise` with which a step is repeated if it fails or is the last. With
 derivatives from farther away, fits of bright stars stopped at a chi-squared that was up to a fifth
-too large."""
+too large. The gradient of a repeated step is that of the model itself: near the minimum, the error
+of the coarse copy's gradient is as large as the gradient."""
 
-_WORTHWHILE = 0.005
+_WORTHWHILE = 0.002
 """Gain in chi-squared per pixel of a repeated step below which, with this model error, no further
 step is repeated. Where the model cannot explain the data, steps gain little for many iterations."""
 
@@ -193,7 +194,7 @@ class Solver:
         taken = self._try_step(state, kappa, modes, repeats=kappa != self._exhausted)
         if taken is None:
             allowed, self._responses.relinearise = self._responses.relinearise, _ACCURATE
-            taken = self._try_step(state, kappa, modes, repeats=False)
+            taken = self._try_step(state, kappa, modes, repeats=False, exact=True)
             self._responses.relinearise = allowed
             assert taken is not None
             if taken[1] < _WORTHWHILE:
@@ -201,16 +202,18 @@ class Solver:
         return taken
 
     def _try_step(
-        self, state: State, kappa: float, modes: int, repeats: bool
+        self, state: State, kappa: float, modes: int, *, repeats: bool, exact: bool = False
     ) -> tuple[State, float] | None:
-        """Take a step.
+        """Take a step; `exact` as for `linearise`.
 
         None if it fails, or is the last, with derivatives from far away, and may be repeated.
         """
         layout, objective = state.joint, self.objective
         self._equations = None  # The next ones are as large.
         self._responses.farthest = 0.0
-        equations = self._equations = linearise(objective, state, kappa, modes, objective.robust)
+        equations = self._equations = linearise(
+            objective, state, kappa, modes, objective.robust, exact=exact
+        )
         far = repeats and self._responses.farthest > _ACCURATE
         weights = objective.weights(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales

@@ -71,7 +71,13 @@ def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Ten
 
 
 def linearise(
-    objective: Objective, state: State, kappa: float, modes: int, robust: float
+    objective: Objective,
+    state: State,
+    kappa: float,
+    modes: int,
+    robust: float,
+    *,
+    exact: bool = False,
 ) -> NormalEquations:
     """Linearise all frames about a state.
 
@@ -86,6 +92,9 @@ def linearise(
         between frames, 0 for the alignment only.
     robust : float
         Residual, in standard deviations, of half weight; inf for least squares.
+    exact : bool
+        Whether the gradient is that of the model itself and not of its coarse copy, with which the
+        curvature is computed; see `Forward.slopes`.
     """
     joint = state.joint
     size = joint.unknowns_with(modes)
@@ -94,6 +103,7 @@ def linearise(
     gradient = torch.zeros(size, dtype=torch.float64)
     frames = []
     weights = objective.weights(state, kappa, robust)
+    whitened = objective.whitened_residuals(state, weights)
     for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
         residual, weight, common = (
             each.cpu() for each in (objective.residual(k, point), *weights[k])
@@ -104,8 +114,13 @@ def linearise(
         drift = joint.drift_rows(k) if modes else torch.zeros(0, dtype=torch.int64)
         frames.append(LinearFrame(residual, weight, rendered, rows, drift, first, common))
         product, pulled = _accumulate(
-            rendered.flatten(1), weight.flatten(), (weight * residual).flatten()
+            rendered.flatten(1), weight.flatten(), whitened[k].cpu().flatten()
         )
+        if exact and modes:
+            slopes = forward.slopes(point, weights[k].weight * whitened[k])
+            for name, slope in slopes.items():
+                places = point.unknowns.where(name)
+                pulled[places] = slope[: len(pulled[places])]
         if len(state.points) == 1:
             curvature, gradient = product, pulled
             continue
@@ -115,11 +130,8 @@ def linearise(
             for onto, selection in ((rows, slice(None)), (drift, leading)):
                 curvature[to[:, None], onto] += product[which, selection]
     if objective.shares_pattern:
-        summed = (
-            torch.stack([frame.summed(frame.residual) for frame in frames]).sum(dim=0).flatten()
-        )
-        product, pulled = _accumulate(summed_rows(frames, size), torch.ones_like(summed), summed)
-        curvature -= product
-        gradient -= pulled
+        rows = summed_rows(frames, size)
+        ones = torch.ones(rows.shape[1], dtype=torch.float64)
+        curvature -= _accumulate(rows, ones, ones)[0]
     gradient = gradient + curvature @ current
     return NormalEquations(state, kappa, robust, curvature, gradient, current, tuple(frames))

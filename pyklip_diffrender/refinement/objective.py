@@ -144,13 +144,32 @@ class Objective:
 
     def chi2(self, state: State, weights: Sequence[Weights]) -> float:
         """Chi-squared of all frames, with the pattern that they share marginalised."""
-        total, summed = 0.0, torch.zeros((), dtype=torch.float64)
-        for k, (point, each) in enumerate(zip(state.points, weights, strict=True)):
-            residual = self.residual(k, point)
-            total += float(((each.weight * residual) ** 2).sum())
-            if self.shares_pattern:
-                summed = summed + each.weight**2 * each.common * residual
-        return total - float((summed**2).sum())
+        residuals = [self.residual(k, point) for k, point in enumerate(state.points)]
+        total = sum(
+            float(((each.weight * residual) ** 2).sum())
+            for each, residual in zip(weights, residuals, strict=True)
+        )
+        return total - float((self._summed(residuals, weights) ** 2).sum())
+
+    def whitened_residuals(self, state: State, weights: Sequence[Weights]) -> list[Tensor]:
+        """Minus half the derivative of chi-squared by the rendered pixels, over the weights.
+
+        For frames without a common pattern these are the residuals over their errors.
+        """
+        residuals = [self.residual(k, point) for k, point in enumerate(state.points)]
+        summed = self._summed(residuals, weights)
+        return [
+            each.weight * (residual - each.common * summed)
+            for each, residual in zip(weights, residuals, strict=True)
+        ]
+
+    def _summed(self, residuals: Sequence[Tensor], weights: Sequence[Weights]) -> Tensor:
+        """What the residuals say of the pattern that the frames share; 0 if there is none."""
+        total = torch.zeros_like(residuals[0])
+        if self.shares_pattern:
+            for each, residual in zip(weights, residuals, strict=True):
+                total += each.weight**2 * each.common * residual
+        return total
 
     def chi2_per_pixel(self, state: State) -> float:
         """Chi-squared per pixel without a model error."""
