@@ -21,12 +21,15 @@ from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import GaussNewton, Refinement
+from pyklip_diffrender.refinement.gauss_newton import Solver
+from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.wavefront.bases import FourierModes
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = [
-    "PLANET", "QUICK", "SIZE", "fitted", "forward_mode", "frame", "gradient", "image", "model_on",
-    "opd", "point_sources", "reached", "response", "rolls", "search", "settings", "tensors",
+    "PLANET", "QUICK", "SIZE", "fit_gradient", "fitted", "forward_mode", "frame", "gradient",
+    "image", "model_on", "opd", "point_sources", "reached", "response", "rolls", "search", "settings",
+    "tensors",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -136,6 +139,16 @@ def point_sources(device: Any, **changes: object) -> list[Array]:
     model = model_on(device, **changes)
     sources = PointSources(model, opd(), tensors(model), offset=(0.01, 0.0))
     return [sources.images([3, 12, 20], [12, 12, 4]).cpu().numpy()]
+
+
+def fit_gradient(device: Any, **changes: object) -> list[Array]:
+    """Through the model itself, by everything that a fit may vary."""
+    problem = Problem(model_on(device, **changes), frame(), dr.random_opd(1, npix=NPIX))
+    solver = Solver([problem], settings(), BASIS, progress=False)
+    layout = solver.first_layout()
+    (point,) = solver.objective.at(layout, layout.initial()).points
+    pixels = solver.objective.residual(0, point)
+    return [each.numpy() for each in solver.objective.forwards[0].slopes(point, pixels).values()]
 
 
 def response(device: Any, **changes: object) -> list[Array]:

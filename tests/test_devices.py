@@ -85,6 +85,7 @@ def test_the_pretended_device_follows_data() -> None:
         (work.image, 1e-9),
         (work.gradient, 1e-9),
         (work.response, 1e-5),
+        (work.fit_gradient, 1e-9),
         pytest.param(work.forward_mode, 1e-9, marks=pytest.mark.slow),
         pytest.param(work.point_sources, 1e-5, marks=pytest.mark.slow),
     ],

@@ -207,8 +207,8 @@ class Forward:
         ):
             again = model.field(inputs[0], wavelength, values)
             by_field = 2 * weight * by_light * field
-            for total, part in zip(totals, grad(again, inputs, by_field), strict=True):
-                total += part
+            parts = grad(again, inputs, by_field)
+            totals = [total + part for total, part in zip(totals, parts, strict=True)]
         by_name = dict(zip(names, totals[1:], strict=True))
         result = {name: slope.double().cpu().flatten() for name, slope in by_name.items()}
         result["modes"] = self._by_modes(totals[0].real)
