@@ -28,8 +28,8 @@ from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = [
     "PLANET", "QUICK", "SIZE", "fit_gradient", "fitted", "forward_mode", "frame", "gradient",
-    "image", "model_on", "opd", "point_sources", "reached", "response", "rolls", "search", "settings",
-    "tensors",
+    "image", "model_on", "opd", "point_sources", "reached", "response", "rolls", "search",
+    "settings", "tensors",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
