@@ -96,6 +96,8 @@ def list_calints(
 
     Examples
     --------
+    This needs a network:
+
     >>> import pyklip_diffrender as dr
     >>> print(dr.list_calints(1184, "G-7-34", filter="F444W"))  # doctest: +SKIP
     """
@@ -175,6 +177,8 @@ def fetch_calints(
 
     Examples
     --------
+    This needs a network:
+
     >>> import pyklip_diffrender as dr
     >>> files = dr.fetch_calints(1184, "G-7-34", filter="F444W")  # doctest: +SKIP
     >>> result = dr.reduce(files, "maps")  # doctest: +SKIP

@@ -72,6 +72,8 @@ class Reduction:
 
     Examples
     --------
+    With frames and wavefront maps in folders, which the package does not contain:
+
     >>> import pyklip_diffrender as dr
     >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
     >>> print(result.detection.table["separation", "contrast", "snr"])  # doctest: +SKIP
@@ -218,6 +220,8 @@ def reduce(
 
     Examples
     --------
+    With frames and wavefront maps in folders, which the package does not contain:
+
     >>> import pyklip_diffrender as dr
     >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
     >>> print(result)  # doctest: +SKIP

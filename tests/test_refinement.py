@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,15 @@ from pyklip_diffrender.instrument.jwst import maskrnd_openings
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, refine
+from pyklip_diffrender.refinement import (
+    Adam,
+    GaussNewton,
+    Refinement,
+    Status,
+    gauss_newton,
+    refine,
+)
+from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import (
     FourierModes,
@@ -610,7 +619,7 @@ def test_a_broken_wavefront_is_an_error(tiny: Case) -> None:
         refine(tiny.model, tiny.observation, tiny.opd * 1e9, settings=few(max_iterations=1))
 
 
-def test_derivatives_from_far_away_do_not_end_a_fit() -> None:
+def test_derivatives_from_far_away_do_not_end_a_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps that fail, and the last one, are repeated with accurate derivatives.
 
     A bright star, and a wavefront that is far from the map. Without the repetition chi-squared ends
@@ -626,9 +635,19 @@ def test_derivatives_from_far_away_do_not_end_a_fit() -> None:
         counts, np.sqrt(np.maximum(counts, 0) + 42.0**2), pixelscale=system.detector.pixelscale
     )
     prior = WavefrontPrior({"segment": 20.0, "texture": 20.0}, fit_scales=False)
+    exact = []
+
+    def recorded(*arguments: Any, **options: Any) -> NormalEquations:
+        exact.append(options["exact"])
+        return linearise(*arguments, **options)
+
+    monkeypatch.setattr(gauss_newton, "linearise", recorded)
     chi2 = []
     for relinearise in (0.3, 0.02):
         settings = GaussNewton(cycles=3.0, prior=prior, response_npix=64, relinearise=relinearise)
         chi2.append(refine(system, frame, opd, settings=settings).chi2_per_pixel)
+    # Repeated steps have the gradient of the model, the first one has not.
+    assert not exact[0]
+    assert any(exact)
     assert chi2[1] < 1.05
     assert chi2[0] < 1.01 * chi2[1]

@@ -97,6 +97,8 @@ class Disk:
 
     Examples
     --------
+    With frames and wavefront maps in folders, which the package does not contain:
+
     >>> import pyklip_diffrender as dr
     >>> result = dr.reduce("calints", "maps", disk=True)  # doctest: +SKIP
     >>> result.disk.contrast, result.disk.orientation  # doctest: +SKIP

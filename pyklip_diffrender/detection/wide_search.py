@@ -98,6 +98,8 @@ class WideField:
 
     Examples
     --------
+    With frames and wavefront maps in folders, which the package does not contain:
+
     >>> import pyklip_diffrender as dr
     >>> result = dr.reduce("calints", "maps", wide=True)  # doctest: +SKIP
     >>> print(result.wide)  # doctest: +SKIP
@@ -220,6 +222,8 @@ def wide_field(
 
     Examples
     --------
+    With frames and wavefront maps in folders, which the package does not contain:
+
     >>> import pyklip_diffrender as dr
     >>> frame = dr.Observation.from_fits("roll1_calints.fits")  # doctest: +SKIP
     >>> fit = dr.refine(dr.model_for(frame, 80), frame.cutout(80), "opd.fits")  # doctest: +SKIP
