@@ -20,6 +20,7 @@ from pyklip_diffrender.refinement.companions import bright_companions
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.gauss_newton import Solver, count_modes_below
 from pyklip_diffrender.refinement.objective import State
+from pyklip_diffrender.refinement.outliers import isolated_outliers
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton
@@ -31,7 +32,7 @@ __all__ = ["Annealing"]
 
 _log = logging.getLogger(__name__)
 
-_EXPLAINED = 1.5
+_EXPLAINED = 1.2
 """Chi-squared per pixel below which the noise explains the residual."""
 
 _NEGLIGIBLE = 1e-3
@@ -63,6 +64,9 @@ _ALIGNED = 0.05
 
 _ANNEALING = 0.6
 """Largest ratio of kappa in successive steps."""
+
+_ROUNDS = 3
+"""Largest number of searches for bad pixels; a bright one hides fainter ones beside it."""
 
 
 class Annealing:
@@ -159,9 +163,34 @@ class Annealing:
             if kappa < max(_NEGLIGIBLE, floor):
                 kappa = floor
             modes = self._modes_for(kappa)
+        best = self._without_outliers(best)
+        if status in (Status.CONVERGED, Status.MODEL_MISMATCH):
+            status = _status_of(self.objective.chi2_per_pixel(best))
         if best.flux <= 0:
             status = Status.DIVERGED
         return self._conclude(best, status, seed, time.perf_counter() - began)
+
+    def _without_outliers(self, state: State) -> State:
+        """Leave out bad pixels that stand alone, with a step after they are found."""
+        for _ in range(_ROUNDS):
+            kappa = self._unexplained(state)
+            linear, _ = self.solver.linear_model(state, kappa, self._all_modes, math.inf)
+            outliers = isolated_outliers(self.objective, state, linear)
+            if not any(bool(each.any()) for each in outliers):
+                break
+            self.solver.leave_out(outliers)
+            kappa = max(self._unexplained(state), self.settings.min_model_error)
+            state, _ = self.solver.step(state, kappa, self._all_modes)
+        return state
+
+    @property
+    def _all_modes(self) -> int:
+        return len(self.basis) if self.settings.wavefront else 0
+
+    def _unexplained(self, state: State) -> float:
+        """The model error, as a fraction of the star, if the noise does not explain the data."""
+        explained = self.objective.chi2_per_pixel(state) < _EXPLAINED
+        return 0.0 if explained else self.objective.model_error(state)
 
     def _record(self, kappa: float, modes: int, chi2: float, error: float, gain: float) -> None:
         record = {
@@ -204,10 +233,11 @@ class Annealing:
 
     def _conclude(self, state: State, status: Status, seed: int, seconds: float) -> Refinement:
         """Compute errors and make the result."""
-        chi2 = self.objective.chi2_per_pixel(state)
-        kappa = 0.0 if chi2 < _EXPLAINED else self.objective.model_error(state)
-        modes = len(self.basis) if self.settings.wavefront else 0
-        linear, update = self.solver.linear_model(state, kappa, modes)
+        kappa = self._unexplained(state)
+        # Robust weights take a source that is not in the model for an outlier, and a tenth of the
+        # light of one of S/N 7 with it.
+        robust = self.objective.robust if kappa else math.inf
+        linear, update = self.solver.linear_model(state, kappa, self._all_modes, robust)
         assert update.variance is not None
         deviation = update.variance.sqrt()
         if status is Status.CONVERGED and not self.solver.prior_holds(update):
@@ -246,7 +276,7 @@ class Annealing:
             settings=self.settings,
             basis=self.basis,
             status=status,
-            chi2_per_pixel=chi2,
+            chi2_per_pixel=self.objective.chi2_per_pixel(state),
             model_error=kappa,
             companions=first.unknowns.sources(first.vector).numpy(),
             companion_errors=deviation[rows].reshape(-1, 3).numpy(),

@@ -28,7 +28,7 @@ _DIFFERENCE = 5e-4
 
 @dataclass(frozen=True)
 class Point:
-    """FrameLayout and what they render.
+    """Values of the unknowns of a frame, and what they render.
 
     Attributes
     ----------
@@ -118,6 +118,20 @@ class Forward:
                 with torch.no_grad():
                     total = total + flux * source[0] * model(full, **source_values).double()
         return Point(unknowns, vector, opd, fields, image, light, star, total)
+
+    def sources(self, point: Point, offsets: Tensor) -> Tensor:
+        """Images of point sources of contrast 1, (k, ny, nx), in the data's unit.
+
+        Parameters
+        ----------
+        point : Point
+        offsets : Tensor, (k, 2)
+            x, y from the star, arcsec, in the orientation of this frame.
+        """
+        values = self._towards(point.unknowns.values(point.vector), offsets)
+        with torch.no_grad():
+            images = self.coarse(self.coarse_opd(point), **values)
+        return point.unknowns.level("flux", point.vector) * images
 
     @staticmethod
     def _towards(values: dict[str, Tensor], offset: Tensor) -> dict[str, Tensor]:

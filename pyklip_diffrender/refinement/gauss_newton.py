@@ -244,16 +244,29 @@ class Solver:
             self.damping = max(6 * self.damping, 0.05)
         return state, 0.0
 
+    def leave_out(self, pixels: Sequence[Tensor]) -> None:
+        """Leave out pixels from now on; a mask, (ny, nx), for every frame."""
+        self._equations = None
+        for forward, mask in zip(self.objective.forwards, pixels, strict=True):
+            forward.problem.leave_out(mask)
+
     def linear_model(
-        self, state: State, kappa: float, modes: int
+        self, state: State, kappa: float, modes: int, robust: float
     ) -> tuple[LinearModel, EvidenceUpdate]:
         """Return the linear model about a state and the errors of all unknowns.
 
-        Without a model error, pixels have their full weights: robust ones take a source that is not
-        in the model for an outlier, and a tenth of the light of one of S/N 7 with it.
+        Parameters
+        ----------
+        state : State
+        kappa : float
+            Assumed error of the star model, as a fraction of the star.
+        modes : int
+            Number of leading wavefront modes that are unknowns.
+        robust : float
+            Residual, in standard deviations, of half weight; inf for the full weights of all
+            pixels.
         """
         layout, equations = state.joint, self._equations
-        robust = self.objective.robust if kappa else math.inf
         count = layout.unknowns_with(modes)
         if (
             equations is None

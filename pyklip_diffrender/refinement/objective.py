@@ -79,7 +79,11 @@ class Objective:
         self.forwards = tuple(forwards)
         self.shares_pattern = _share_pattern([forward.problem for forward in self.forwards])
         self.robust = robust
-        self.pixels = sum(forward.problem.pixels for forward in self.forwards)
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of all frames that are fitted."""
+        return sum(forward.problem.pixels for forward in self.forwards)
 
     def at(self, joint: JointLayout, vector: Tensor) -> State:
         """Render all frames."""

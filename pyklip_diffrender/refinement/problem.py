@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -19,6 +20,8 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.opd import OPDMap, resample
 
 __all__ = ["Problem"]
+
+_log = logging.getLogger(__name__)
 
 _SCALE_TOLERANCE = 0.02
 """NIRCam's pixels differ by 1.3 % in x and y, and by 0.7 % from the square ones of stpsf."""
@@ -83,6 +86,16 @@ class Problem:
             self.gain = 1 + torch.from_numpy(pattern).to(device)
             self.gain_error = torch.from_numpy(error).to(device)
             self.pedestal = self.systematics.pedestal
+
+    def leave_out(self, pixels: Tensor) -> None:
+        """Mask pixels, (ny, nx), in all frames of the observation."""
+        if bool(pixels.any()):
+            places = [(x, y) for y, x in torch.nonzero(pixels).tolist()]
+            _log.info("%s: bad pixels (x, y) left out: %s", self.observation.name, places)
+            self.valid = self.valid & ~pixels.to(self.valid.device)
+            self.observation = replace(
+                self.observation, valid=self.observation.valid & ~pixels.cpu().numpy()
+            )
 
     def starting_opd(self, npix: int) -> Tensor:
         """The starting wavefront on a pupil array of (npix, npix), m."""
