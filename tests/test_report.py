@@ -230,6 +230,21 @@ def test_calibrated_frames_have_flux_densities_on_the_page() -> None:
     assert scientific(1.2e-4, 1e-5) in words
 
 
+def test_pixels_that_the_fit_left_out_are_named() -> None:
+    whole = reduction()
+    frame = whole.fit.frames[0]
+    valid = frame.observation.valid.copy()
+    valid[0, 3, 5] = False
+    fitted = replace(frame, observation=replace(frame.observation, valid=valid))
+    fits = (replace(whole.detection.fits[0], frames=(fitted,)),)
+    summary = summarise(replace(whole, detection=replace(whole.detection, fits=fits)))
+    (place,) = summary["frames"][0]["bad_pixels"]
+    assert place == pytest.approx(frame.grid[3, 5], abs=6e-4)
+    assert f"({place[0]:+.2f}, {place[1]:+.2f})" in page(summary, [], [], [])
+    assert summarise(whole)["frames"][0]["bad_pixels"] == []
+    assert "left out because" not in page(summarise(whole), [], [], [])
+
+
 def test_every_picture_has_words_and_nothing_is_loaded(folder: Path) -> None:
     page = Tags((folder / "report.html").read_text(encoding="utf-8"))
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]

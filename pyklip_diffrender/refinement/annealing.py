@@ -68,6 +68,9 @@ _ANNEALING = 0.6
 _ROUNDS = 3
 """Largest number of searches for bad pixels; a bright one hides fainter ones beside it."""
 
+_STEPS = 4
+"""Largest number of steps after each. With robust weights, bad pixels have done little harm."""
+
 
 class Annealing:
     """One fit with a given basis.
@@ -171,7 +174,7 @@ class Annealing:
         return self._conclude(best, status, seed, time.perf_counter() - began)
 
     def _without_outliers(self, state: State) -> State:
-        """Leave out bad pixels that stand alone, with a step after they are found."""
+        """Leave out bad pixels that stand alone, and go on without them."""
         for _ in range(_ROUNDS):
             kappa = self._unexplained(state)
             linear, _ = self.solver.linear_model(state, kappa, self._all_modes, math.inf)
@@ -180,7 +183,10 @@ class Annealing:
                 break
             self.solver.leave_out(outliers)
             kappa = max(self._unexplained(state), self.settings.min_model_error)
-            state, _ = self.solver.step(state, kappa, self._all_modes)
+            for _ in range(_STEPS):
+                state, gain = self.solver.step(state, kappa, self._all_modes)
+                if gain < self.settings.tolerance:
+                    break
         return state
 
     @property

@@ -31,7 +31,8 @@ class FrameFit:
     ----------
     model : OpticalSystem
     observation : Observation
-        The observation; its frames are averaged for the fit.
+        The observation; its frames are averaged for the fit. Bad pixels that the fit has left out
+        are not valid.
     start : dict
         Starting values of parameters, by name.
     opd : ndarray, (npix, npix)

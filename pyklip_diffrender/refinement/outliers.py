@@ -21,9 +21,10 @@ __all__ = ["isolated_outliers"]
 _SIGNIFICANT = 6.0
 """Deviation of an outlier in standard deviations, of the prediction from all other pixels."""
 
-_BETTER = 2.0
+_BETTER = 1.3
 """Smallest ratio of the chi-squared that an outlier explains to that of a point source. For bad
-pixels of NIRCam it was 4 to 30 in F356W and F444W, for the pixels of a planet at most 0.2."""
+pixels of NIRCam it was 4 to 30. For the brightest pixel of a planet it is below 0.2 in F444W, and
+cannot exceed 1, which it approaches where the image of a point is as sharp as a pixel."""
 
 _DEVIATES = 2.0
 """Smallest contribution of such a pixel to Sigma^-1 r, which is less than its deviation where the

@@ -337,7 +337,19 @@ def _frames(summary: Mapping[str, Any]) -> str:
     ]
     header = ["Use", "Star", "Date (UTC)", "Position angle of +y (deg)", "Integrations",
               "Pixels used (%)", "File"]  # fmt: skip
-    return pieces.table(header, rows)
+    table = pieces.table(header, rows)
+    bad = [
+        f"{each['file']}: "
+        + ", ".join(f"({x:+.2f}, {y:+.2f})" for x, y in each["bad_pixels"])
+        for each in summary["frames"]
+        if each.get("bad_pixels")
+    ]
+    if not bad:
+        return table
+    return table + pieces.note(
+        "Pixels left out because they deviate from the model and no point source explains it "
+        f"(x, y from the star, arcsec): {'; '.join(bad)}."
+    )
 
 
 def _left_out(summary: Mapping[str, Any]) -> str:

@@ -18,7 +18,7 @@ from pyklip_diffrender import __version__
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.reduction import Reduction
-from pyklip_diffrender.refinement import GaussNewton, Refinement
+from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement
 from pyklip_diffrender.report.words import MANY, advice, sentence
 from pyklip_diffrender.scene.observation import Observation
 
@@ -88,7 +88,10 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
         "klip_curve": None if klip is None else _curve(klip),
         "injections": None if reduction.injections is None else _injected(reduction.injections),
         "frames": [
-            *(_frame(each, "target") for each in sequence.science),
+            *(
+                _frame(each, "target") | {"bad_pixels": _bad_pixels(each, fitted)}
+                for each, fitted in zip(sequence.science, fit.frames, strict=True)
+            ),
             *(_frame(each, "reference") for each in sequence.references),
         ],
         "left_out": [
@@ -282,6 +285,12 @@ def _frame(observation: Observation, use: str) -> dict[str, Any]:
         "pixels_used": observation.valid.mean(),
         "file": observation.name,
     }
+
+
+def _bad_pixels(observation: Observation, fitted: FrameFit) -> list[list[float]]:
+    """x, y from the star, arcsec, of good pixels of the file that the fit has left out."""
+    left_out = observation.valid.any(axis=0) & ~fitted.observation.valid.any(axis=0)
+    return [[round(float(v), 3) for v in place] for place in fitted.grid[left_out]]
 
 
 def _seconds(reduction: Reduction, fit: Refinement) -> float:

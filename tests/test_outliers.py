@@ -1,0 +1,136 @@
+"""Bad pixels that the file does not flag, told from planets by their neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.refinement import annealing, refine_again
+
+SIZE, NPIX, SCENE = 32, 64, 5
+PIXEL = (9, 21)
+"""Row and column of the bad pixel, 0.55 arcsec from the star."""
+
+SETTINGS = dr.GaussNewton(cycles=6.0, response_npix=NPIX, min_model_error=1e-6)
+"""With a model error that is allowed for, fits do not look for companions by themselves."""
+
+
+@cache
+def model(name: str = "F444W") -> OpticalSystem:
+    wavelength = {"F444W": 4.5e-6, "F250M": 2.5e-6}[name]
+    return dr.nircam_coronagraph(
+        name, monochromatic=wavelength, npix=NPIX, fov_pixels=SIZE, fov_arcsec=None
+    )
+
+
+@cache
+def start() -> dr.wavefront.opd.OPDMap:
+    return dr.random_opd(1, npix=NPIX)
+
+
+def shot(*planets: dr.Planet, seed: int = SCENE, name: str = "F444W") -> dr.Observation:
+    return dr.simulate(model(name), dr.Scene(planets=planets), start(), seed=seed)
+
+
+def spoiled(frame: dr.Observation, sigmas: float) -> dr.Observation:
+    data = frame.data.copy()
+    data[0][PIXEL] += sigmas * frame.error[0][PIXEL]
+    return replace(frame, data=data)
+
+
+def fitted(*frames: dr.Observation, name: str = "F444W", **changes: object) -> dr.Refinement:
+    settings = replace(SETTINGS, **changes)  # type: ignore[arg-type]
+    return dr.refine(model(name), list(frames), start(), settings=settings, plan="off")
+
+
+def left_out(fit: dr.Refinement, k: int = 0) -> list[tuple[int, int]]:
+    rows, columns = np.nonzero(~fit.frames[k].observation.valid[0])
+    return list(zip(rows.tolist(), columns.tolist(), strict=True))
+
+
+def here(*, row: float = PIXEL[0], column: float = PIXEL[1], contrast: float) -> dr.Planet:
+    """A planet at a place on the frame, in pixels."""
+    x, y = (np.array([column, row]) - (SIZE - 1) / 2) * np.array(model().detector.pixelscale)
+    return dr.Planet.from_offset(contrast, float(x), float(y))
+
+
+@pytest.fixture
+def trusting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits that take all pixels for good ones."""
+    monkeypatch.setattr(
+        annealing,
+        "isolated_outliers",
+        lambda objective, state, linear: [torch.zeros(SIZE, SIZE, dtype=torch.bool)],
+    )
+
+
+def test_a_hot_pixel_is_no_planet() -> None:
+    frame = spoiled(shot(), 25.0)
+    before = frame.data.copy(), frame.valid.copy()
+    fit = fitted(frame)
+    assert left_out(fit) == [PIXEL]
+    assert len(dr.detect(fit).table) == 0
+    assert fit.reduced_chi2 == pytest.approx(1.0, abs=0.15)
+    np.testing.assert_array_equal(frame.data, before[0])
+    np.testing.assert_array_equal(frame.valid, before[1])
+
+
+@pytest.mark.usefixtures("trusting")
+def test_it_would_be_one() -> None:
+    table = dr.detect(fitted(spoiled(shot(), 25.0))).table
+    separation = np.hypot(*here(contrast=1.0).offset)
+    assert table["separation"][0].value == pytest.approx(separation, abs=0.1)
+
+
+def test_the_star_is_fitted_without_a_dead_pixel() -> None:
+    """One that is 60 sigma too faint raises chi-squared per pixel to 4 if it stays."""
+    frame = spoiled(shot(), -60.0)
+    fit = fitted(frame)
+    assert left_out(fit) == [PIXEL]
+    assert fit.chi2_per_pixel == pytest.approx(1.0, abs=0.1)
+    good = fit.frames[0].observation.valid[0]
+    pulls = ((frame.data[0] - fit.frames[0].star) / frame.error[0])[good]
+    assert pulls.std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_pixel_that_the_fit_took_for_a_companion() -> None:
+    planet = here(contrast=3e-6)
+    fit = fitted(spoiled(shot(), 40.0), companions=(planet,))
+    assert left_out(fit) == [PIXEL]
+
+
+@pytest.mark.parametrize(
+    ("name", "shift", "contrast"),
+    [
+        ("F444W", (0.0, 0.0), 2e-6),
+        ("F444W", (0.5, 0.3), 1e-4),
+        # An image that is hardly wider than a pixel.
+        ("F250M", (0.0, 0.0), 2e-6),
+        ("F250M", (0.0, 0.0), 1e-4),
+        ("F250M", (0.25, 0.25), 1e-4),
+    ],
+)
+def test_planets_are_kept(name: str, shift: tuple[float, float], contrast: float) -> None:
+    planet = here(row=PIXEL[0] + shift[0], column=PIXEL[1] + shift[1], contrast=contrast)
+    frame, without = shot(planet, name=name), shot(name=name)
+    assert ((frame.data - without.data) / frame.error).max() > 8
+    assert left_out(fitted(frame, name=name)) == []
+
+
+def test_only_the_frame_that_shows_it_loses_the_pixel() -> None:
+    frames = [spoiled(shot(), 30.0), shot(seed=SCENE + 1)]
+    fit = fitted(*frames)
+    assert (left_out(fit, 0), left_out(fit, 1)) == ([PIXEL], [])
+
+
+def test_fits_that_go_on_do_not_get_it_back() -> None:
+    fit = fitted(spoiled(shot(), 25.0))
+    again = refine_again(fit)
+    assert left_out(again) == [PIXEL]
+    assert again.chi2_per_pixel == pytest.approx(fit.chi2_per_pixel, rel=0.01)
