@@ -26,7 +26,7 @@ from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pyklip_backend import backend, reduction
-from pyklip_diffrender.refinement import GaussNewton
+from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.spaceklip import run
 from pyklip_diffrender.spaceklip.products import complete_header, write_contrast, write_database
 from pyklip_diffrender.spaceklip.sources import source_table
@@ -71,7 +71,8 @@ def frame(path: Path, data: Any, roll: float) -> str:
         "TARGPROP": "STAR", "XOFFSET": 0.0, "YOFFSET": 0.0,
     }  # fmt: skip
     science = {
-        "BUNIT": "MJy/sr", "PIXAR_A2": PIXEL**2, "STARCENX": center, "STARCENY": center,
+        "BUNIT": "MJy/sr", "PIXAR_SR": 9.2e-14, "PIXAR_A2": PIXEL**2,
+        "STARCENX": center, "STARCENY": center,
         "CRPIX1": center, "CRPIX2": center, "CRVAL1": 201.0, "CRVAL2": -51.0, "ROLL_REF": roll,
         "V3I_YANG": 0.0, "VPARITY": -1, "WCSAXES": 2, "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN",
         "CUNIT1": "deg", "CUNIT2": "deg", "CD1_1": -PIXEL / 3600, "CD1_2": 0.0, "CD2_1": 0.0,
@@ -275,6 +276,35 @@ def test_a_concatenation_from_frames_to_sources(
     assert np.abs(rolls[0] - rolls[1])[seen].max() > 10
     assert (product.parent / f"{KEY}.dat").exists()
     assert Detection.read(product.parent / f"ADI_NANNU1_NSUBS1_{KEY}").table["snr"][0] > 5
+
+
+@pytest.mark.slow
+def test_a_catalogues_star_is_that_of_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, files = two_rolls(tmp_path, monkeypatch)
+    tied: list[tuple[float, float]] = []
+
+    def with_star_flux(fit: Refinement, jansky: float, error: float) -> Refinement:
+        tied.append((jansky, error))
+        return replace(fit, settings=replace(fit.settings, star_flux_error=error))
+
+    monkeypatch.setattr(run, "with_star_flux", with_star_flux)
+    detections = spaceklip.run_obs(
+        StandIn(tmp_path, {KEY: concatenation(files)}), opd=OPD, model=model, systematics="off",
+        plan="off", fit=ALIGNED, star_flux={"F444W": "450 mJy"}, star_flux_error=0.3,
+    )  # fmt: skip
+    assert tied == [(pytest.approx(0.45), 0.3)]
+    table = detections[KEY].table
+    assert table["contrast_error"][0] / table["contrast"][0] == pytest.approx(0.3, rel=0.1)
+
+
+def test_a_flux_of_no_filter_is_refused(tmp_path: Path) -> None:
+    database = StandIn(tmp_path, {KEY: concatenation(["one_calints.fits"])})
+    with pytest.raises(IncompatibleSetupError, match=r"'F335M'.*\['F444W'\]"):
+        spaceklip.run_obs(database, opd=OPD, star_flux={"F335M": 0.4})
+    with pytest.raises(IncompatibleSetupError, match="positive"):
+        spaceklip.run_obs(database, opd=OPD, star_flux={"F444W": -0.4})
 
 
 @pytest.mark.slow

@@ -339,8 +339,7 @@ def _frames(summary: Mapping[str, Any]) -> str:
               "Pixels used (%)", "File"]  # fmt: skip
     table = pieces.table(header, rows)
     bad = [
-        f"{each['file']}: "
-        + ", ".join(f"({x:+.2f}, {y:+.2f})" for x, y in each["bad_pixels"])
+        f"{each['file']}: " + ", ".join(f"({x:+.2f}, {y:+.2f})" for x, y in each["bad_pixels"])
         for each in summary["frames"]
         if each.get("bad_pixels")
     ]

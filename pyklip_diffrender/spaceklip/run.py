@@ -5,16 +5,20 @@ from __future__ import annotations
 import logging
 import os
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from astropy import units as u
 from astropy.table import Table
 
 from pyklip_diffrender.detection import Detection, detect
-from pyklip_diffrender.errors import DiffrenderWarning
+from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.io.units import require_bound
 from pyklip_diffrender.pyklip_backend.jwst_files import reduce_jwst_files
+from pyklip_diffrender.refinement import to_jansky, with_star_flux
 from pyklip_diffrender.spaceklip.products import (
     complete_header,
     write_contrast,
@@ -59,6 +63,8 @@ def run_obs(
     subdir: str = "diffrender",
     threshold: float = 5.0,
     save_rolls: bool = False,
+    star_flux: Mapping[str, float | str | u.Quantity] | None = None,
+    star_flux_error: float = 0.05,
     verbose: bool = False,
     **settings: Any,
 ) -> dict[str, Detection]:
@@ -84,6 +90,12 @@ def run_obs(
         S/N of a candidate.
     save_rolls : bool
         Also write the subtracted image of each file, with `_roll1` and so on after its name.
+    star_flux : mapping of str to float, str or Quantity, optional
+        Flux density of the star by filter, such as ``{"F444W": "0.45 Jy"}``, to which contrasts
+        then refer; see `pyklip_diffrender.reduce`. Without it, or in other filters, the diffracted
+        light determines it. The subtracted images are the same.
+    star_flux_error : float
+        Relative error of these, with that of the photometric calibration.
     verbose : bool
         Print what is being done.
     **settings
@@ -96,6 +108,8 @@ def run_obs(
 
     Raises
     ------
+    IncompatibleSetupError
+        For a `star_flux` that is no flux density, or of a filter that the database does not have.
     ExceptionGroup
         After all concatenations, if some failed: their errors, each with a note that names the
         concatenation. The log has the tracebacks, and the others are complete.
@@ -110,6 +124,8 @@ def run_obs(
     >>> from pyklip_diffrender import spaceklip
     >>> spaceklip.run_obs(database, opd="maps")  # doctest: +SKIP
     """
+    fluxes = _fluxes(star_flux or {}, database)
+    require_bound(star_flux_error, "star_flux_error", "positive")
     folder = Path(database.output_dir) / subdir
     folder.mkdir(parents=True, exist_ok=True)
     products: dict[str, Path] = {}
@@ -125,9 +141,14 @@ def run_obs(
         logger.info("concatenation %s", key)
         try:
             products[key], detections[key] = _reduced(
-                key, table, folder, threshold, save_rolls,
+                key,
+                table,
+                folder,
+                threshold,
+                save_rolls,
+                (fluxes.get(_filter(table)), star_flux_error),
                 {"opd": opd, "verbose": verbose, **settings},
-            )  # fmt: skip
+            )
         except Exception as error:  # Reported after the other concatenations.
             logger.exception("concatenation %s failed", key)
             error.add_note(f"concatenation {key}")
@@ -140,6 +161,23 @@ def run_obs(
         tried = len(failures) + len(detections)
         raise ExceptionGroup(f"{len(failures)} of {tried} concatenations failed", failures)
     return detections
+
+
+def _filter(table: Table) -> str:
+    return str(table["FILTER"][0])
+
+
+def _fluxes(
+    star_flux: Mapping[str, float | str | u.Quantity], database: Database
+) -> dict[str, float]:
+    """Flux densities by filter, Jy."""
+    filters = {_filter(table) for table in database.obs.values()}
+    for name in star_flux:
+        if name not in filters:
+            raise IncompatibleSetupError(
+                f"star_flux: got {name!r}, expected filters of the database: {sorted(filters)}"
+            )
+    return {name: to_jansky(value) for name, value in star_flux.items()}
 
 
 def why_unsupported(table: Table) -> str | None:
@@ -164,9 +202,13 @@ def _reduced(
     folder: Path,
     threshold: float,
     save_rolls: bool,
+    star_flux: tuple[float | None, float],
     settings: dict[str, Any],
 ) -> tuple[Path, Detection]:
-    """Reduce one concatenation and write its files; the path of the product."""
+    """Reduce one concatenation and write its files; the path of the product.
+
+    `star_flux` is the flux density, Jy, and its relative error.
+    """
     kinds = np.array(table["TYPE"], dtype=str)
     files = np.array(table["FITSFILE"], dtype=object)
     mode = "ADI+RDI" if (kinds == "REF").any() else "ADI"
@@ -175,6 +217,9 @@ def _reduced(
         files[kinds == "SCI"], files[kinds == "REF"], folder=folder, prefix=prefix, **settings
     )
     fits = [fit.result for record in dataset.diffrender_results for fit in record.subtraction.fits]
+    jansky, error = star_flux
+    if jansky is not None:
+        fits = [with_star_flux(fit, jansky, error) for fit in fits]
     detection = detect(fits, threshold=threshold)
     product = folder / f"{prefix}-KLmodes-all.fits"
     complete_header(product, table, mode)
