@@ -265,7 +265,9 @@ def test_lost_pixels_are_found_by_the_pattern(moved: tuple[float, float] | None)
     assert frame is not None
     assert frame.first_pixel == (103 - 0, 203 - 1)
     np.testing.assert_allclose(frame.center - observation.center, [[-0.3, -0.2]], atol=0.11)
-    assert np.array_equal(frame.valid, valid)
+    assert not frame.valid[~valid].any()
+    # The fit leaves out pixels that deviate by as much as the star in them: ringing does that.
+    assert (frame.valid != valid).sum() < 4
     for row, column in ((12, 19), (12, 21), (11, 20), (13, 20)):
         assert frame.data[0, row, column] == pytest.approx(onto[row, column], rel=0.08)
 

@@ -177,8 +177,9 @@ class Annealing:
         """Leave out bad pixels that stand alone, and go on without them."""
         for _ in range(_ROUNDS):
             kappa = self._unexplained(state)
-            linear, _ = self.solver.linear_model(state, kappa, self._all_modes, math.inf)
+            linear = self.solver.linear_model(state, kappa, self._all_modes, math.inf)
             outliers = isolated_outliers(self.objective, state, linear)
+            del linear  # The next one is as large.
             if not any(bool(each.any()) for each in outliers):
                 break
             self.solver.leave_out(outliers)
@@ -243,7 +244,8 @@ class Annealing:
         # Robust weights take a source that is not in the model for an outlier, and a tenth of the
         # light of one of S/N 7 with it.
         robust = self.objective.robust if kappa else math.inf
-        linear, update = self.solver.linear_model(state, kappa, self._all_modes, robust)
+        linear = self.solver.linear_model(state, kappa, self._all_modes, robust)
+        update = self.solver.posterior(state)
         assert update.variance is not None
         deviation = update.variance.sqrt()
         if status is Status.CONVERGED and not self.solver.prior_holds(update):

@@ -250,10 +250,8 @@ class Solver:
         for forward, mask in zip(self.objective.forwards, pixels, strict=True):
             forward.problem.leave_out(mask)
 
-    def linear_model(
-        self, state: State, kappa: float, modes: int, robust: float
-    ) -> tuple[LinearModel, EvidenceUpdate]:
-        """Return the linear model about a state and the errors of all unknowns.
+    def linear_model(self, state: State, kappa: float, modes: int, robust: float) -> LinearModel:
+        """Return the linear model about a state.
 
         Parameters
         ----------
@@ -277,8 +275,8 @@ class Solver:
             del equations
             self._equations = None
             equations = linearise(self.objective, state, kappa, modes, robust)
-        update = self._solve(layout, equations, errors=True)
-        linear = LinearModel(
+            self._equations = equations
+        return LinearModel(
             unknowns=layout.unknowns()[:count],
             frames=equations.frames,
             vector=state.vector[:count],
@@ -286,7 +284,12 @@ class Solver:
             deviation=self.prior_deviation(layout)[:count],
             curvature=equations.curvature,
         )
-        return linear, update
+
+    def posterior(self, state: State) -> EvidenceUpdate:
+        """Return the errors of all unknowns of the last linear model, which is about `state`."""
+        assert self._equations is not None
+        assert self._equations.state is state
+        return self._solve(state.joint, self._equations, errors=True)
 
     def prior_holds(self, update: EvidenceUpdate) -> bool:
         """Whether the fitted modes are probable under a prior with fixed scales."""

@@ -33,6 +33,9 @@ fit has taken a part of it."""
 _NEAR = 2.0
 """Pixels between an outlier and a companion that may be nothing else."""
 
+_BATCH = 256
+"""Number of pixels whose deviations are computed at a time."""
+
 _MOST = 50
 """Largest number of pixels of a frame that are compared, the most deviating first."""
 
@@ -81,9 +84,10 @@ def _deviating(linear: LinearModel, k: int) -> list[tuple[int, int]]:
     cleaned = linear.cleaned[k]
     places = torch.nonzero(cleaned.abs() > _DEVIATES)
     deviations = torch.zeros_like(cleaned)
-    if len(places):
-        explained = _explained(linear, k, _single_pixels(cleaned.shape, places))
-        deviations[places[:, 0], places[:, 1]] = explained.sqrt()
+    for start in range(0, len(places), _BATCH):
+        some = places[start : start + _BATCH]
+        explained = _explained(linear, k, _single_pixels(cleaned.shape, some))
+        deviations[some[:, 0], some[:, 1]] = explained.sqrt()
     peaks = local_maxima(deviations.numpy(), deviations.numpy() > 0, _SIGNIFICANT, size=3)
     return peaks[:_MOST]
 
