@@ -65,7 +65,7 @@ _ALIGNED = 0.05
 _ANNEALING = 0.6
 """Largest ratio of kappa in successive steps."""
 
-_ROUNDS = 3
+_ROUNDS = 6
 """Largest number of searches for bad pixels; a bright one hides fainter ones beside it."""
 
 _STEPS = 4
