@@ -213,6 +213,8 @@ def from_webbpsf(
 
     Examples
     --------
+    This needs stpsf and its data files:
+
     >>> import stpsf  # doctest: +SKIP
     >>> nircam = stpsf.NIRCam()  # doctest: +SKIP
     >>> nircam.filter, nircam.image_mask, nircam.pupil_mask = (  # doctest: +SKIP

@@ -151,6 +151,8 @@ def register(
 
     Examples
     --------
+    With a wavefront map and a `dataset` that pyKLIP has read, which the package does not contain:
+
     >>> import pyklip_diffrender as dr
     >>> dr.register(opd="R2022073003-NRCA3_FP1-1.fits")  # doctest: +SKIP
     >>> klip_dataset(dataset, mode="ADI", algo="diffrender")  # doctest: +SKIP
@@ -207,6 +209,8 @@ def backend(
 
     Examples
     --------
+    With a wavefront map, a `dataset` and a `library` that pyKLIP has read:
+
     >>> with dr.backend(opd="opd.fits"):  # doctest: +SKIP
     ...     klip_dataset(dataset, mode="ADI+RDI", psf_library=library)
     """

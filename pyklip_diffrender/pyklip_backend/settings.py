@@ -118,6 +118,9 @@ class DiffrenderSettings:
     --------
     >>> import pyklip_diffrender as dr
     >>> settings = dr.DiffrenderSettings(opd="opd.fits", fit_pixels=80, seed=1)
+
+    For one `dataset` that pyKLIP has read:
+
     >>> dataset.diffrender = settings  # doctest: +SKIP
     """
 

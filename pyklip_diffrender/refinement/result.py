@@ -114,6 +114,9 @@ class Refinement:
     True
     >>> fit.frames[0].star.shape
     (32, 32)
+
+    This writes to the current folder:
+
     >>> path = fit.write("fit.fits")  # doctest: +SKIP
     >>> fit = dr.Refinement.read(path)  # doctest: +SKIP
     """

@@ -84,6 +84,8 @@ class Observation:
     >>> dr.Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F444W")
     <Observation 'observation': 2 frames of 8 x 8 pixels, F444W, ph, no date>
 
+    From a file, which the package does not contain:
+
     >>> frames = dr.Observation.from_fits("roll1_calints.fits")  # doctest: +SKIP
     """
 

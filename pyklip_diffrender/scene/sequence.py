@@ -50,6 +50,8 @@ class Sequence:
     >>> dr.Sequence("HD 1", (frame,))
     <Sequence: HD 1 in F444W, 1 of the target, 0 of reference stars>
 
+    From a folder of files, which the package does not contain:
+
     >>> dr.Sequence.from_files("calints", target="HD 1")  # doctest: +SKIP
     """
 

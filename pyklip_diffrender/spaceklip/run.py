@@ -121,6 +121,8 @@ def run_obs(
 
     Examples
     --------
+    With a `database` that spaceKLIP has made, and a folder of wavefront maps:
+
     >>> from pyklip_diffrender import spaceklip
     >>> spaceklip.run_obs(database, opd="maps")  # doctest: +SKIP
     """

@@ -80,6 +80,8 @@ def survey(
 
     Examples
     --------
+    With a configuration and the frames that it names, which the package does not contain:
+
     >>> import pyklip_diffrender as dr
     >>> table = dr.survey("survey.toml", "products")  # doctest: +SKIP
     """

@@ -84,6 +84,8 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
 
     Examples
     --------
+    With a folder of maps, which the package does not contain:
+
     >>> from pyklip_diffrender import choose_map
     >>> opd = choose_map("maps", "2022-07-30T12:00", rule="before")  # doctest: +SKIP
     """

@@ -78,6 +78,8 @@ def read_opd(
 
     Examples
     --------
+    With a file from MAST, which the package does not contain:
+
     >>> from pyklip_diffrender import read_opd
     >>> opd = read_opd("R2022081102-NRCA3_FP1-1.fits")  # doctest: +SKIP
     """
