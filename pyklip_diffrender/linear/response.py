@@ -19,6 +19,7 @@ from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.linear.mode_fields import ModeFields
 from pyklip_diffrender.linear.parameter_derivatives import field_derivatives, image_derivatives
+from pyklip_diffrender.optics.batches import batch_of
 from pyklip_diffrender.optics.grid import samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.bases import Basis
@@ -36,10 +37,6 @@ _log = logging.getLogger(__name__)
 _CELLS = 1.9
 """Largest number of cells of the occulter per lambda/D. With this number one cell per pixel is
 enough at all wavelengths of F444W, down to 3.9 um; two cells per pixel take four times as long."""
-
-_BATCH_BYTES = 1e7
-"""Bytes of the fields in the pupil whose propagation is computed at a time, which takes several
-times as much. Larger batches are not faster."""
 
 _ROWS = 128
 """Number of modes whose images are computed at a time."""
@@ -138,9 +135,9 @@ class WavefrontResponse:
         pixels = math.prod(model.detector.shape) * model.detector.oversample**2
         self.size = 8 * len(basis) * pixels * len(bandpass.wavelengths)
         """Number of bytes that are stored."""
-        complex_bytes = 16 if coarse.dtype == torch.float64 else 8
-        samples = math.prod(coarse.entrance.grid.shape)
-        self._batch = max(1, int(_BATCH_BYTES / (complex_bytes * samples) / 2))
+        # Behind the occulter, arrays are padded to twice the size of the image.
+        samples = max(math.prod(coarse.entrance.grid.shape), 4 * pixels)
+        self._batch = batch_of(samples, coarse.dtype.to_complex(), coarse.device)
         small = downsample(opd, coarse.npix)
         self._mode_fields = ModeFields(coarse, basis, small, values)
         self._slopes = field_derivatives(coarse, small, values, names)

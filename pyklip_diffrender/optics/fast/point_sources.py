@@ -19,6 +19,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.optics.batches import batch_of
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.fast.occulter import OcculterLattice
 from pyklip_diffrender.optics.fast.path import LatticeRoute, is_pointwise
@@ -32,9 +33,6 @@ __all__ = ["PointSources"]
 Index = ArrayLike | Tensor
 
 _log = logging.getLogger(__name__)
-
-_BATCH_BYTES = 1.2e7
-"""Bytes of one array of a batch. Larger arrays do not fit into the cache and take twice as long."""
 
 _NEAR = 0.15
 """Fraction of the occulter's radius within which sources are computed in double precision. There
@@ -224,9 +222,11 @@ class PointSources:
 
     def _batch(self, double: bool) -> int:
         if self.route == "lattice":
-            size = max(wave.size for wave in self._waves) * (16 if double else 8)
-            return max(1, int(_BATCH_BYTES / size))
-        return max(1, int(5 * _BATCH_BYTES / (16 * self.model.npix**2)))
+            size = max(wave.size for wave in self._waves)
+        else:
+            size = self.model.npix**2
+        dtype = torch.complex128 if double else torch.complex64
+        return batch_of(size, dtype, torch.device(self.model.device))
 
     def _batch_of_images(self, rows: Tensor, columns: Tensor, double: bool, masked: bool) -> Tensor:
         if self.route == "model":
