@@ -105,6 +105,15 @@ def test_a_pixel_that_the_fit_took_for_a_companion() -> None:
     assert left_out(fit) == [PIXEL]
 
 
+def test_a_bright_companion_of_the_fit_keeps_its_core() -> None:
+    """Its model is wrong by more than the noise, and its own unknowns explain any source there."""
+    planet = here(contrast=1e-4)
+    frame = spoiled(shot(planet), 15.0)
+    fit = fitted(frame, companions=(planet,))
+    assert left_out(fit) == []
+    assert fit.companions[0, 0] == pytest.approx(1e-4, rel=0.1)
+
+
 @pytest.mark.parametrize(
     ("name", "shift", "contrast"),
     [
