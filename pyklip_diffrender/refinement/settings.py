@@ -71,8 +71,9 @@ class GaussNewton:
     tolerance : float
         The fit has converged when a step lowers the penalised chi-squared per pixel by less.
     min_model_error : float
-        Smallest error of the star model that is assumed, as a fraction of the star's light in a
-        pixel. It is added in quadrature to the noise.
+        Smallest error of the star model that is assumed on the way to the solution, as a fraction
+        of the star's light in a pixel. It is added in quadrature to the noise. The errors of the
+        result do not include it where the noise explains the residual.
     relinearise : float
         Relative change of the pupil field (rms; radians for a phase) beyond which the response to
         the wavefront is recomputed, see `pyklip_diffrender.linear.response.Responses`. A step that
@@ -199,9 +200,9 @@ class GaussNewton:
         """Return the settings for real NIRCam frames, for which the model is not exact.
 
         The prior's scales are fixed, the pupil's amplitude is free as well, the alignment has a
-        prior about its values in flight, the model error is at least a percent of the star,
-        outliers are down-weighted, and one companion that is significant after the alignment fit
-        gets its own parameters.
+        prior about its values in flight, the fit allows for a model error of at least a percent of
+        the star, outliers are down-weighted, and one companion that is significant after the
+        alignment fit gets its own parameters.
 
         A wider prior (20 and 18 nm, alignment free) fits real frames a little more closely, but
         by way of a star far off the mask and of a wavefront that outshines the measured one: the

@@ -23,7 +23,7 @@ import argparse
 import contextlib
 import io
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,74 @@ KERNELS: dict[str, list[float]] = {"diag": [], "matern32": [3.0]}
 """Kernels of `FMAstrometry` with their first correlation lengths, as spaceKLIP has them."""
 
 
-class Trial:
+class Planet:
+    """A planet with a guess of its place and flux, and what fits of it return.
+
+    Attributes
+    ----------
+    contrast, separation, angle : float
+        The truth: separation in pixels, position angle in degrees.
+    guess : (float, float, float)
+        Separation, position angle and contrast, up to 0.4 pixel, 1 degree and 40 % off.
+    """
+
+    def __init__(
+        self, rng: np.random.Generator, separation: float, angle: float, contrast: float
+    ) -> None:
+        self.separation, self.angle, self.contrast = separation, angle, contrast
+        self.guess = (
+            separation + rng.uniform(-0.4, 0.4),
+            angle + rng.uniform(-1.0, 1.0),
+            contrast * rng.uniform(0.7, 1.4),
+        )
+
+    def measured_in(self, model: Image, product: Image, center: Image, kernel: str) -> Errors:
+        """What `FMAstrometry` returns, minus the truth, and its errors."""
+        fit = FMAstrometry(*self.guess[:2], fitboxsize=BOX)
+        fit.generate_fm_stamp(model, center, padding=5)
+        fit.generate_data_stamp(product, center, dr=4, exclusion_radius=3 * FWHM)
+        length = KERNELS[kernel]
+        fit.set_kernel(kernel, length, ["l"] * len(length))
+        fit.set_bounds(1.5, 1.5, 1.0, [1.0] * len(length))
+        fit.fit_astrometry(nwalkers=24, nburn=150, nsteps=150, save_chain=False, numthreads=1)
+        values = (fit.raw_flux, fit.raw_RA_offset, fit.raw_Dec_offset)
+        return self.compared([each.bestfit for each in values], [each.error for each in values])
+
+    def in_header(self, header: fits.Header) -> Errors | None:
+        """The same from the header of a product, if it is there."""
+        if "DRFMFLUX" not in header:
+            return None
+        errors = [header[key] for key in ("DRFMFERR", "DRFMRAER", "DRFMDEER")]
+        values = [header[key] for key in ("DRFMFLUX", "DRFMRA", "DRFMDE")]
+        return self.compared(values, errors)
+
+    def compared(self, values: Sequence[float], errors: Sequence[float]) -> Errors:
+        """Contrast over the truth, and x and y in pixels, minus the truth; and their errors."""
+        direction, scales = np.radians(self.angle), np.array([self.guess[2] / self.contrast, 1, 1])
+        place = self.separation * np.array([np.sin(direction), np.cos(direction)])
+        return np.array([scales * values - (1.0, *place), scales * errors])
+
+
+def print_statistics(results: Mapping[str, Sequence[Errors]]) -> None:
+    """Bias, scatter and coverage of every estimate, by name."""
+    for name, each in results.items():
+        away, errors = np.moveaxis(np.array(each), 1, 0)
+        pulls, weights = away / errors, errors**-2.0
+        bias = (weights * away).sum(axis=0) / weights.sum(axis=0)
+        expected = weights.sum(axis=0) ** -0.5
+        print(f"{name}: {len(each)} trials")
+        for k, what in enumerate(("contrast", "x", "y")):
+            print(
+                f"  {what}: bias {bias[k]:+.3f} +- {expected[k]:.3f}, mean pull "
+                f"{pulls[:, k].mean():+.2f} +- {len(pulls) ** -0.5:.2f}, scatter of pulls "
+                f"{pulls[:, k].std(ddof=1):.2f}, within 1 sigma {np.mean(abs(pulls[:, k]) < 1):.0%}"
+                f", within 2 {np.mean(abs(pulls[:, k]) < 2):.0%}, median error "
+                f"{np.median(errors[:, k]):.3f}, unweighted mean {away[:, k].mean():+.3f}, scatter "
+                f"{away[:, k].std(ddof=1):.3f}"
+            )
+
+
+class Trial(Planet):
     """Frames of a star with a planet, and of a reference star.
 
     Parameters
@@ -67,16 +134,10 @@ class Trial:
 
     def __init__(self, seed: int, contrast: float) -> None:
         rng = np.random.default_rng(seed)
-        self.contrast = contrast
+        super().__init__(rng, rng.uniform(9.0, 15.0), rng.uniform(0.0, 360.0), contrast)
         self.measured = dr.random_opd(seed, npix=128)
         drifts = [random_drift(100 * seed + k, h, npix=128).data
                   for k, h in enumerate((DRIFT, REFERENCE_DRIFT))]  # fmt: skip
-        self.separation, self.angle = rng.uniform(9.0, 15.0), rng.uniform(0.0, 360.0)
-        self.guess = (
-            self.separation + rng.uniform(-0.4, 0.4),
-            self.angle + rng.uniform(-1.0, 1.0),
-            contrast * rng.uniform(0.7, 1.4),
-        )
         camera = dr.nircam_coronagraph("F444W", fov_pixels=SIDE, **NUMERICS)
         wave = self.measured.data + drifts[0]
         with torch.no_grad():
@@ -110,20 +171,17 @@ class Trial:
     def fitted(
         self, mode: str, kernels: Sequence[str] = ("diag",), **settings: Any
     ) -> dict[str, Errors]:
-        """Contrast, x and y (pixels) minus the truth, and their errors, (2, 3), by method."""
+        """What `Planet.compared` returns, (2, 3), by method."""
         model, product, header = self.images(self.frames, mode, **settings)
-        values = {kernel: self.measured_in(model, product, kernel) for kernel in kernels}
-        if "DRFMFLUX" in header:
-            errors = [header[key] for key in ("DRFMFERR", "DRFMRAER", "DRFMDEER")]
-            own = [header[key] for key in ("DRFMFLUX", "DRFMRA", "DRFMDE")]
-            values["own"] = self.compared(own, errors)
-        return values
+        values = {name: self.measured_in(model, product, CENTER, name) for name in kernels}
+        own = self.in_header(header)
+        return values if own is None else {**values, "own": own}
 
     def difference(self, **settings: Any) -> dict[str, Errors]:
         """The same in the difference of the products with and without the planet."""
         model, product, _ = self.images(self.frames, "ADI", **settings)
         product = product - self.images(self.empty, "ADI", **settings)[1]
-        return {"diag": self.measured_in(model, product, "diag")}
+        return {"diag": self.measured_in(model, product, CENTER, "diag")}
 
     def images(self, frames: Image, mode: str, **settings: Any) -> tuple[Image, Image, fits.Header]:
         """Forward model, product and its header."""
@@ -172,25 +230,6 @@ class Trial:
             )
             return model, product, fits.getheader(path)
 
-    def measured_in(self, model: Image, product: Image, kernel: str) -> Errors:
-        """What `FMAstrometry` finds, minus the truth, and its errors."""
-        fit = FMAstrometry(*self.guess[:2], fitboxsize=BOX)
-        fit.generate_fm_stamp(model, CENTER, padding=5)
-        fit.generate_data_stamp(product, CENTER, dr=4, exclusion_radius=3 * FWHM)
-        length = KERNELS[kernel]
-        fit.set_kernel(kernel, length, ["l"] * len(length))
-        fit.set_bounds(1.5, 1.5, 1.0, [1.0] * len(length))
-        fit.fit_astrometry(nwalkers=24, nburn=150, nsteps=150, save_chain=False, numthreads=1)
-        found = (fit.raw_flux, fit.raw_RA_offset, fit.raw_Dec_offset)
-        return self.compared([each.bestfit for each in found], [each.error for each in found])
-
-    def compared(self, values: Sequence[float], errors: Sequence[float]) -> Errors:
-        """Flux as a multiple of the guess, and position, minus the truth; and their errors."""
-        direction, scales = np.radians(self.angle), np.array([self.guess[2], 1.0, 1.0])
-        place = self.separation * np.array([np.sin(direction), np.cos(direction)])
-        truth = (self.contrast, *place)
-        return np.array([scales * values - truth, scales * errors])
-
 
 def main() -> None:
     """Run the trials and print a table."""
@@ -213,25 +252,11 @@ def main() -> None:
                 name = f"{reduction}, {kind}"
                 results.setdefault(name, []).append(np.array([(contrast, x, y), errors]))
                 print(
-                    f"{seed} {name}: contrast {contrast / options.contrast:+.3f} +- "
-                    f"{errors[0] / options.contrast:.3f}, x {x:+.3f} +- {errors[1]:.3f}, "
+                    f"{seed} {name}: contrast {contrast:+.3f} +- {errors[0]:.3f}, "
+                    f"x {x:+.3f} +- {errors[1]:.3f}, "
                     f"y {y:+.3f} +- {errors[2]:.3f}", flush=True,
                 )  # fmt: skip
-    for name, each in results.items():
-        away, errors = np.moveaxis(np.array(each), 1, 0)
-        pulls, weights = away / errors, errors**-2.0
-        bias = (weights * away).sum(axis=0) / weights.sum(axis=0)
-        expected = weights.sum(axis=0) ** -0.5
-        print(f"{name}: {len(each)} trials")
-        for k, (what, unit) in enumerate((("contrast", options.contrast), ("x", 1.0), ("y", 1.0))):
-            print(
-                f"  {what}: bias {bias[k] / unit:+.3f} +- {expected[k] / unit:.3f}, mean pull "
-                f"{pulls[:, k].mean():+.2f} +- {len(pulls) ** -0.5:.2f}, scatter of pulls "
-                f"{pulls[:, k].std(ddof=1):.2f}, within 1 sigma {np.mean(abs(pulls[:, k]) < 1):.0%}"
-                f", within 2 {np.mean(abs(pulls[:, k]) < 2):.0%}, median error "
-                f"{np.median(errors[:, k]) / unit:.3f}, unweighted mean "
-                f"{away[:, k].mean() / unit:+.3f}, scatter {away[:, k].std(ddof=1) / unit:.3f}"
-            )
+    print_statistics(results)
 
 
 if __name__ == "__main__":
