@@ -7,12 +7,11 @@ import torch
 __all__ = ["batch_of"]
 
 _CPU_BYTES = 3e6
-"""Bytes of one array of a batch on the CPU. Batches of three times the size take two to three times
-as long: they do not fit into the cache, and the C library returns the memory of each to the
-operating system, which then has to clear it for the next."""
+"""Bytes of one array of a batch on the CPU. Batches of three times the size may take twice as long:
+the C library returns their memory to the operating system, which has to clear it for the next."""
 
 _GPU_BYTES = 1e8
-"""The same on an accelerator, which needs many arrays at a time to be busy."""
+"""The same on an accelerator, which needs many arrays at a time to be busy; not measured."""
 
 
 def batch_of(size: int, dtype: torch.dtype, device: torch.device) -> int:

@@ -222,11 +222,9 @@ class PointSources:
 
     def _batch(self, double: bool) -> int:
         if self.route == "lattice":
-            size = max(wave.size for wave in self._waves)
-        else:
-            size = self.model.npix**2
-        dtype = torch.complex128 if double else torch.complex64
-        return batch_of(size, dtype, torch.device(self.model.device))
+            dtype = torch.complex128 if double else torch.complex64
+            return batch_of(max(wave.size for wave in self._waves), dtype, self.model.device)
+        return batch_of(self.model.npix**2, self.model.dtype.to_complex(), self.model.device)
 
     def _batch_of_images(self, rows: Tensor, columns: Tensor, double: bool, masked: bool) -> Tensor:
         if self.route == "model":
