@@ -93,8 +93,40 @@ def test_shifts_that_do_not_fit_the_frames_are_refused(tmp_path: Path) -> None:
     path = aligned_file(tmp_path / "one.fits")
     with fits.open(path, mode="update") as hdus:
         hdus["IMSHIFTS"].data = SHIFTS[:1]
-    with pytest.raises(ShapeError, match=r"IMSHIFTS: got shape \(1, 2\), expected \(2, 2\)"):
+    with pytest.raises(
+        ShapeError, match=r"shifts of the frames: got shape \(1, 2\)"
+    ):
         dr.Observation.from_fits(path)
+
+
+def test_shifts_of_newer_spaceklip_releases_are_undone(tmp_path: Path) -> None:
+    """The same frames, with the shift recorded in two parts."""
+    old, new = aligned_file(tmp_path / "old.fits"), aligned_file(tmp_path / "new.fits")
+    center = np.tile(SHIFTS[0] + 0.2, (2, 1))
+    with fits.open(new, mode="update") as hdus:
+        del hdus["IMSHIFTS"]
+        hdus.append(fits.ImageHDU(center, name="CENTER_SHIFT"))
+        hdus.append(fits.ImageHDU(SHIFTS - center, name="ALIGN_SHIFT"))
+        hdus[0].header["STARCENX"], hdus[0].header["STARCENY"] = 151.0, 175.0
+    expected, observation = dr.Observation.from_fits(old), dr.Observation.from_fits(new)
+    np.testing.assert_allclose(observation.data, expected.data, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(observation.center, expected.center)
+    assert observation.first_pixel == expected.first_pixel
+
+
+def test_shifts_that_were_not_applied_yet_are_not_undone(tmp_path: Path) -> None:
+    path = aligned_file(tmp_path / "centers.fits")
+    star = np.array([140.3, 187.6])
+    with fits.open(path, mode="update") as hdus:
+        del hdus["IMSHIFTS"]
+        shifts = np.tile((SIDE - 1) / 2 - star, (2, 1))
+        hdus.append(fits.ImageHDU(shifts, name="CENTER_SHIFT"))
+        hdus[0].header["STARCENX"], hdus[0].header["STARCENY"] = star + 1
+        as_written = hdus["SCI"].data.copy()
+    observation = dr.Observation.from_fits(path)
+    np.testing.assert_allclose(observation.data[observation.valid], as_written[observation.valid])
+    np.testing.assert_allclose(observation.center, [star, star])
+    assert observation.first_pixel == (491, 1501)
 
 
 def test_plain_calints_know_their_pixels(tmp_path: Path) -> None:

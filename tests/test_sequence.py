@@ -196,13 +196,13 @@ def test_a_target_that_cannot_be_decided_is_an_error(folder: Path, tmp_path: Pat
         Sequence.from_files(empty)
 
 
-def test_the_position_of_the_mask_is_read(folder: Path) -> None:
+def test_the_position_of_the_star_behind_the_mask_is_read(folder: Path) -> None:
     with fits.open(folder / "a.fits") as hdus:
         hdus.append(fits.ImageHDU(np.array([[0.2, -0.1], [0.4, -0.1]]), name="MASKOFFS"))
         hdus.writeto(folder / "h.fits")
     observation = Observation.from_fits(folder / "h.fits")
     pixel = 0.0039**0.5
-    np.testing.assert_allclose(observation.star_offset, (-0.3 * pixel, 0.1 * pixel), rtol=1e-6)
+    np.testing.assert_allclose(observation.star_offset, (0.3 * pixel, -0.1 * pixel), rtol=1e-6)
 
 
 def test_a_pattern_is_learned_from_another_star() -> None:

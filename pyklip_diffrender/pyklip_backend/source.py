@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import merged_header
-from pyklip_diffrender.scene.detector_pixels import first_pixel
+from pyklip_diffrender.scene.detector_pixels import SHIFTS, first_pixel
 from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
 from pyklip_diffrender.scene.noise import calibrated_errors
 from pyklip_diffrender.scene.observation import Observation
@@ -187,7 +187,7 @@ def _read(path: str, dataset: Any) -> _File:
         error = _cube(hdus["ERR"].data) if "ERR" in hdus else None
         flags = hdus["DQ"].data if "DQ" in hdus else np.uint32(0)
         header = merged_header(primary, science, path)
-        aligned = "IMSHIFTS" in hdus
+        aligned = any(name in hdus for name in SHIFTS)
     flags = np.broadcast_to(flags, data.shape)
     data[(flags & NON_SCIENCE) != 0] = np.nan
     # As pyKLIP finds the centre: the given keywords, else CRPIX, plus the dither if requested.

@@ -1,8 +1,8 @@
 """Undo the shifts of aligned frames, so that their pixels are those of the detector.
 
 A flat-field error belongs to a pixel of the detector. spaceKLIP's alignment moves frames by
-fractions of a pixel (IMSHIFTS), by a Fourier shift, after which a pixel of the array is a mixture
-of pixels of the detector, a different one in every frame. The shift is known and can be undone.
+fractions of a pixel, by a Fourier shift, after which a pixel of the array is a mixture of pixels of
+the detector, a different one in every frame. The shift is recorded and can be undone.
 """
 
 from __future__ import annotations
@@ -19,10 +19,50 @@ from pyklip_diffrender.instrument.masks import filter_shift, mask_center
 from pyklip_diffrender.io.headers import header_number, header_text
 from pyklip_diffrender.io.units import native_float64
 
-__all__ = ["first_pixel", "net_shifts", "shift_frames"]
+__all__ = ["SHIFTS", "first_pixel", "net_shifts", "recorded_shifts", "shift_frames"]
+
+SHIFTS = ("IMSHIFTS", "CENTER_SHIFT", "ALIGN_SHIFT")
+"""Extensions in which spaceKLIP records shifts: the first until release 2.1, the others since."""
+
+_AT_CENTER = 0.01
+"""Pixels within which a star is where a shift moves it."""
 
 _PAD = 5
 """Rows and columns that are mirrored at every edge before a shift, as many as in the alignment."""
+
+
+def recorded_shifts(
+    hdus: fits.HDUList, center: NDArray[np.float64], shape: tuple[int, int]
+) -> NDArray[np.float64] | None:
+    """By how much spaceKLIP has shifted the frames of a file.
+
+    Since release 2.2, CENTER_SHIFT moves the star to the centre of the array, and ALIGN_SHIFT
+    aligns the frames with each other. Both are recorded before the frames are shifted.
+
+    Parameters
+    ----------
+    hdus : HDUList
+    center : ndarray, (2,)
+        x, y of the star in the first frame, 0-indexed.
+    shape : tuple of int
+        Rows and columns of the frames.
+
+    Returns
+    -------
+    ndarray, (frames, 2), or None
+        x, y, pixels; None if the frames were not shifted.
+    """
+    if "IMSHIFTS" in hdus:
+        return native_float64(hdus["IMSHIFTS"].data)
+    parts = [native_float64(hdus[name].data) for name in SHIFTS[1:] if name in hdus]
+    if not parts:
+        return None
+    if "CENTER_SHIFT" in hdus:
+        moved = center + parts[0].reshape(-1, 2)[0]
+        middle = (np.array(shape[::-1]) - 1) / 2
+        if (np.abs(moved - middle) < _AT_CENTER).all():
+            return None  # The star is still where the shift starts.
+    return np.asarray(np.sum(parts, axis=0))
 
 
 def net_shifts(
@@ -30,14 +70,14 @@ def net_shifts(
 ) -> NDArray[np.float64]:
     """How far the light of every frame is from where it fell on the detector.
 
-    A file records by how much its frames were shifted (IMSHIFTS), but not by how many whole pixels
+    A file records by how much its frames were shifted, but not by how many whole pixels
     they were cut or padded afterwards. Those follow from the position of the star, which was within
     half a pixel of the centre of the mask.
 
     Parameters
     ----------
     shifts : array_like, (frames, 2)
-        x, y of IMSHIFTS, pixels.
+        x, y, see `recorded_shifts`.
     center : ndarray, (frames, 2)
         x, y of the star in the array, 0-indexed.
     header : Header

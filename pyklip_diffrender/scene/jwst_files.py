@@ -16,7 +16,13 @@ from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, ShapeE
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import header_date, header_number, header_text, merged_header
 from pyklip_diffrender.io.units import native_float64, require_finite
-from pyklip_diffrender.scene.detector_pixels import first_pixel, net_shifts, shift_frames
+from pyklip_diffrender.scene.detector_pixels import (
+    SHIFTS,
+    first_pixel,
+    net_shifts,
+    recorded_shifts,
+    shift_frames,
+)
 
 __all__ = ["BAD_PIXEL_BITS", "on_detector_pixels", "read_calints"]
 
@@ -34,7 +40,7 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
     arguments : dict
         Arguments of `Observation.from_arrays`.
     shifts : ndarray, (frames, 2), or None
-        IMSHIFTS of spaceKLIP's aligned files.
+        By how much spaceKLIP has shifted the frames, see `recorded_shifts`.
     """
     path = Path(path)
     with open_fits(path) as hdus:
@@ -68,18 +74,21 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
             )
             quality = np.zeros(data.shape, dtype=np.uint32)
         mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
-        shifts = hdus["IMSHIFTS"].data if "IMSHIFTS" in hdus else None
+        details = _details(header, 1 if data.ndim == 2 else len(data), path.name)
+        shifts = recorded_shifts(hdus, np.asarray(details["center"], dtype=float), data.shape[-2:])
+        # A star whose position is stated was moved, unless the file has shifts not yet applied.
+        moved = "STARCENX" in header and not any(name in hdus for name in SHIFTS)
     arguments = {
         "data": data,
         "error": error,
         "valid": (quality.astype(np.uint32) & BAD_PIXEL_BITS) == 0,
-        **_details(header, 1 if data.ndim == 2 else len(data), path.name),
+        **details,
     }
-    if shifts is None and "STARCENX" not in header:
+    if shifts is None and not moved:
         arguments["first_pixel"] = first_pixel(header, np.zeros(2, dtype=np.int64), path.name)
     if mask is not None:
-        # Position of the mask from the star, in pixels, for every integration.
-        offset = -native_float64(mask).reshape(-1, 2).mean(axis=0) * arguments["pixelscale"]
+        # spaceKLIP records the star's position minus the mask's, in pixels, for every integration.
+        offset = native_float64(mask).reshape(-1, 2).mean(axis=0) * arguments["pixelscale"]
         arguments["star_offset"] = (float(offset[0]), float(offset[1]))
     return arguments, shifts
 
@@ -124,7 +133,7 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
 def on_detector_pixels(
     arguments: dict[str, Any], center: NDArray[np.float64], shifts: NDArray[Any]
 ) -> dict[str, Any]:
-    """Undo the shifts (IMSHIFTS) by which frames were aligned, up to whole pixels.
+    """Undo the shifts by which frames were aligned, up to whole pixels.
 
     Parameters
     ----------
@@ -143,10 +152,10 @@ def on_detector_pixels(
     name, header, frames = arguments["name"], arguments["header"], len(center)
     if np.shape(shifts) != (frames, 2):
         raise ShapeError(
-            f"{name}: IMSHIFTS: got shape {np.shape(shifts)}, expected ({frames}, 2), "
+            f"{name}: shifts of the frames: got shape {np.shape(shifts)}, expected ({frames}, 2), "
             "x and y for every frame"
         )
-    require_finite(native_float64(shifts), f"{name}: IMSHIFTS")
+    require_finite(native_float64(shifts), f"{name}: shifts of the frames")
     net = net_shifts(shifts, center, header, name)
     pixels = np.round(net.mean(axis=0)).astype(np.int64)
     data, error, usable = (

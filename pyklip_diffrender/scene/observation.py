@@ -204,9 +204,9 @@ class Observation:
 
         Uses SCI, ERR and DQ, BUNIT, FILTER, DATE-BEG and EXPMID, ROLL_REF and V3I_YANG, the
         aperture's pixel area, and the star's position from STARCENX/Y, else CRPIX1/2 (1-indexed).
-        Of spaceKLIP's aligned files also MASKOFFS, the position of the mask from the star, and
-        IMSHIFTS: the shift is undone, so that the pixels are those of the detector, whose
-        flat-field errors then stay in their pixels.
+        Of spaceKLIP's files also MASKOFFS, the position of the star from the mask, and the shifts
+        of aligned frames (IMSHIFTS, or CENTER_SHIFT and ALIGN_SHIFT): they are undone, so that the
+        pixels are those of the detector, whose flat-field errors then stay in their pixels.
         Errors of NIRCam frames are corrected for the noise that is measured far from the star, see
         `pyklip_diffrender.scene.noise.calibrated_errors`.
 
