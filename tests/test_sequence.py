@@ -205,6 +205,18 @@ def test_the_position_of_the_star_behind_the_mask_is_read(folder: Path) -> None:
     np.testing.assert_allclose(observation.star_offset, (0.3 * pixel, -0.1 * pixel), rtol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["F356W", "F444W"])
+def test_real_stars_are_off_the_mask_by_what_the_files_say(shared_data: Path, name: str) -> None:
+    """The star moves by a third of a pixel, the mask stays on its pixels of the detector."""
+    files = [Observation.from_fits(path) for path in sorted((shared_data / "gto1184").glob("*"))]
+    frames = [each for each in files if each.filter == name]
+    stars = np.array([each.center.mean(axis=0) + each.first_pixel for each in frames])
+    offsets = np.array([each.star_offset for each in frames]) / frames[0].pixelscale
+    assert len(frames) == 6
+    assert np.ptp(stars, axis=0).min() > 0.15
+    assert np.ptp(stars - offsets, axis=0).max() < 0.001
+
+
 def test_a_pattern_is_learned_from_another_star() -> None:
     fit = reference_fit()
     assert fit.chi2_per_pixel > 5
