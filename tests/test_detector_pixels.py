@@ -93,9 +93,7 @@ def test_shifts_that_do_not_fit_the_frames_are_refused(tmp_path: Path) -> None:
     path = aligned_file(tmp_path / "one.fits")
     with fits.open(path, mode="update") as hdus:
         hdus["IMSHIFTS"].data = SHIFTS[:1]
-    with pytest.raises(
-        ShapeError, match=r"shifts of the frames: got shape \(1, 2\)"
-    ):
+    with pytest.raises(ShapeError, match=r"shifts of the frames: got shape \(1, 2\)"):
         dr.Observation.from_fits(path)
 
 

@@ -205,6 +205,35 @@ def test_the_position_of_the_star_behind_the_mask_is_read(folder: Path) -> None:
     np.testing.assert_allclose(observation.star_offset, (0.3 * pixel, -0.1 * pixel), rtol=1e-6)
 
 
+def test_dithers_behind_the_mask_are_read(folder: Path) -> None:
+    without = Observation.from_fits(folder / "a.fits")
+    assert without.star_offset is None
+    for key, value in (("XOFFSET", 0.02), ("YOFFSET", -0.01)):
+        fits.setval(folder / "a.fits", key, value=value)
+    dithered = Observation.from_fits(folder / "a.fits")
+    assert dithered.star_offset == (0.02, -0.01)
+    expected = without.center + np.array([0.02, -0.01]) / without.pixelscale
+    np.testing.assert_allclose(dithered.center, expected)
+    # A star that was moved out from behind the mask.
+    fits.setval(folder / "a.fits", "XOFFSET", value=1.5)
+    away = Observation.from_fits(folder / "a.fits")
+    assert away.star_offset is None
+    np.testing.assert_array_equal(away.center, without.center)
+
+
+def test_a_dithered_star_is_fitted_where_the_file_says() -> None:
+    offset = (0.02, -0.01)
+    seen = simulate(model(), Scene(star_offset=offset), opd(), seed=4)
+    scale = model().detector.pixelscale
+    known = replace(seen, star_offset=offset, center=seen.center + np.divide(offset, scale))
+    settings = replace(SETTINGS, deviations={"star_offset": 0.001})
+    fits_ = [refine(model(), each, opd(), settings=settings) for each in (seen, known)]
+    away = [np.abs(fit.frames[0].values["star_offset"] - offset).max() for fit in fits_]
+    assert away[1] < 1e-5
+    assert away[0] > 3 * away[1]
+    assert fits_[1].chi2_per_pixel < 1.1
+
+
 @pytest.mark.parametrize("name", ["F356W", "F444W"])
 def test_real_stars_are_off_the_mask_by_what_the_files_say(shared_data: Path, name: str) -> None:
     """The star moves by a third of a pixel, the mask stays on its pixels of the detector."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import merged_header
 from pyklip_diffrender.scene.detector_pixels import SHIFTS, first_pixel
-from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, dither
 from pyklip_diffrender.scene.noise import calibrated_errors
 from pyklip_diffrender.scene.observation import Observation
 
@@ -210,7 +210,8 @@ def _read(path: str, dataset: Any) -> _File:
                 (scale, scale), Path(path).name,
             ).astype(np.float32)  # fmt: skip
             error[~known] = 0.0
-        return _File(header, data, error, usable, centers, origin, None, as_read, center)
+        dithered = None if moved else dither(header, Path(path).name)
+        return _File(header, data, error, usable, centers, origin, dithered, as_read, center)
     # The shift of the alignment is undone, so that flat-field errors are in their pixels again.
     back = Observation.from_fits(path)
     stated = [

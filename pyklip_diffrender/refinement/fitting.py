@@ -162,10 +162,13 @@ def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start
 
 def _with_position(model: OpticalSystem, observation: Observation, start: Start) -> dict[str, Any]:
     """Add the position of the star, if the observation has one, to the starting values."""
-    if observation.star_offset is not None and "star_offset" in model.parameters:
-        start = {"star_offset": observation.star_offset, **start}
     ny, nx = observation.shape
     displacement = observation.center[0] - np.array([(nx - 1) / 2, (ny - 1) / 2])
-    if "detector_shift" in start or np.abs(displacement).max() <= 1e-9:
+    axis = displacement * np.array(model.detector.pixelscale)
+    if observation.star_offset is not None and "star_offset" in model.parameters:
+        start = {"star_offset": observation.star_offset, **start}
+        # The optical axis goes through the occulter, and the star's image is beside it.
+        axis -= observation.star_offset
+    if "detector_shift" in start or np.abs(axis).max() <= 1e-10:
         return dict(start)
-    return {**start, "detector_shift": displacement * np.array(model.detector.pixelscale)}
+    return {**start, "detector_shift": axis}

@@ -24,12 +24,15 @@ from pyklip_diffrender.scene.detector_pixels import (
     shift_frames,
 )
 
-__all__ = ["BAD_PIXEL_BITS", "on_detector_pixels", "read_calints"]
+__all__ = ["BAD_PIXEL_BITS", "dither", "on_detector_pixels", "read_calints"]
 
 BAD_PIXEL_BITS = 1 | 2 | 512 | 1024
 """JWST data-quality bits that take a pixel out of the fit: DO_NOT_USE, SATURATED, NON_SCIENCE,
 DEAD. A jump (4) that the ramp fit has repaired, or a hot pixel (2048) that was dark-subtracted,
 may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
+
+_BEHIND_THE_MASK = 0.1
+"""Largest dither, arcsec, that leaves a star behind the mask; small-grid dithers are of 0.02."""
 
 
 def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[Any] | None]:
@@ -90,7 +93,34 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
         # spaceKLIP records the star's position minus the mask's, in pixels, for every integration.
         offset = native_float64(mask).reshape(-1, 2).mean(axis=0) * arguments["pixelscale"]
         arguments["star_offset"] = (float(offset[0]), float(offset[1]))
+    elif not moved:
+        offset = dither(header, path.name)
+        if offset is not None:
+            arguments["star_offset"] = offset
+            if arguments["center"] is not None:
+                arguments["center"] += np.divide(offset, arguments["pixelscale"])
     return arguments, shifts
+
+
+def dither(header: fits.Header, name: str) -> tuple[float, float] | None:
+    """Position of a dithered star relative to the mask.
+
+    Dithers on a small grid (XOFFSET, YOFFSET) move the star behind the mask, and on the detector,
+    from the position that CRPIX states.
+
+    Parameters
+    ----------
+    header : Header
+    name : str
+        The file's, for messages.
+
+    Returns
+    -------
+    tuple of float or None
+        x, y, arcsec; None without a dither, or with one that takes the star off the mask.
+    """
+    x, y = (header_number(header, key, name) or 0.0 for key in ("XOFFSET", "YOFFSET"))
+    return (x, y) if 0 < np.hypot(x, y) < _BEHIND_THE_MASK else None
 
 
 def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:

@@ -203,7 +203,8 @@ class Observation:
         """Read a JWST stage-2 coronagraphic file (calints).
 
         Uses SCI, ERR and DQ, BUNIT, FILTER, DATE-BEG and EXPMID, ROLL_REF and V3I_YANG, the
-        aperture's pixel area, and the star's position from STARCENX/Y, else CRPIX1/2 (1-indexed).
+        aperture's pixel area, and the star's position from STARCENX/Y, else CRPIX1/2 (1-indexed)
+        with the dither behind the mask, XOFFSET and YOFFSET.
         Of spaceKLIP's files also MASKOFFS, the position of the star from the mask, and the shifts
         of aligned frames (IMSHIFTS, or CENTER_SHIFT and ALIGN_SHIFT): they are undone, so that the
         pixels are those of the detector, whose flat-field errors then stay in their pixels.
