@@ -145,6 +145,14 @@ def test_frames_that_spaceklip_shifted_are_put_back(
     assert np.nanmax(np.abs(dataset.output)) < 0.02 * 1000
 
 
+def test_a_dithered_star_is_behind_the_mask_where_the_header_says(files: list[str]) -> None:
+    fits.setval(files[0], "XOFFSET", value=0.02)
+    (pointing,) = gathered(JWSTData([files[0]])).pointings
+    expected = Observation.from_fits(files[0])
+    assert pointing.observation.star_offset == expected.star_offset == (0.02, 0.0)
+    np.testing.assert_allclose(pointing.observation.center, expected.center)
+
+
 @pytest.mark.parametrize(
     ("cards", "message"),
     [

@@ -15,7 +15,12 @@ from scipy.ndimage import fourier_shift, gaussian_filter
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, ShapeError
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    IncompatibleSetupError,
+    NonFiniteError,
+    ShapeError,
+)
 from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.refinement.learning import (
     MeasuredPattern,
@@ -93,7 +98,7 @@ def test_shifts_that_do_not_fit_the_frames_are_refused(tmp_path: Path) -> None:
     path = aligned_file(tmp_path / "one.fits")
     with fits.open(path, mode="update") as hdus:
         hdus["IMSHIFTS"].data = SHIFTS[:1]
-    with pytest.raises(ShapeError, match=r"shifts of the frames: got shape \(1, 2\)"):
+    with pytest.raises(ShapeError, match=r"IMSHIFTS: got shape \(1, 2\), expected \(2, 2\)"):
         dr.Observation.from_fits(path)
 
 
@@ -110,6 +115,19 @@ def test_shifts_of_newer_spaceklip_releases_are_undone(tmp_path: Path) -> None:
     np.testing.assert_allclose(observation.data, expected.data, rtol=0, atol=1e-9)
     np.testing.assert_allclose(observation.center, expected.center)
     assert observation.first_pixel == expected.first_pixel
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((1, 2)), np.zeros(3), np.full((2, 2), np.nan)])
+def test_shifts_of_newer_releases_that_make_no_sense_are_refused(
+    tmp_path: Path, wrong: NDArray[np.float64]
+) -> None:
+    path = aligned_file(tmp_path / "wrong.fits")
+    with fits.open(path, mode="update") as hdus:
+        del hdus["IMSHIFTS"]
+        hdus.append(fits.ImageHDU(SHIFTS, name="CENTER_SHIFT"))
+        hdus.append(fits.ImageHDU(wrong, name="ALIGN_SHIFT"))
+    with pytest.raises((ShapeError, NonFiniteError), match="ALIGN_SHIFT"):
+        dr.Observation.from_fits(path)
 
 
 def test_shifts_that_were_not_applied_yet_are_not_undone(tmp_path: Path) -> None:

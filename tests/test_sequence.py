@@ -214,6 +214,13 @@ def test_dithers_behind_the_mask_are_read(folder: Path) -> None:
     assert dithered.star_offset == (0.02, -0.01)
     expected = without.center + np.array([0.02, -0.01]) / without.pixelscale
     np.testing.assert_allclose(dithered.center, expected)
+    # Where somebody has measured the star, the dither is in its position already.
+    for key, value in (("STARCENX", 13.3), ("STARCENY", 11.8)):
+        fits.setval(folder / "b.fits", key, value=value)
+    fits.setval(folder / "b.fits", "XOFFSET", value=0.02)
+    stated = Observation.from_fits(folder / "b.fits")
+    assert stated.star_offset is None
+    np.testing.assert_allclose(stated.center[0], (12.3, 10.8))
     # A star that was moved out from behind the mask.
     fits.setval(folder / "a.fits", "XOFFSET", value=1.5)
     away = Observation.from_fits(folder / "a.fits")

@@ -14,10 +14,10 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from scipy.ndimage import fourier_shift
 
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.instrument.masks import filter_shift, mask_center
 from pyklip_diffrender.io.headers import header_number, header_text
-from pyklip_diffrender.io.units import native_float64
+from pyklip_diffrender.io.units import native_float64, require_finite
 
 __all__ = ["SHIFTS", "first_pixel", "net_shifts", "recorded_shifts", "shift_frames"]
 
@@ -32,7 +32,7 @@ _PAD = 5
 
 
 def recorded_shifts(
-    hdus: fits.HDUList, center: NDArray[np.float64], shape: tuple[int, int]
+    hdus: fits.HDUList, center: NDArray[np.float64], shape: tuple[int, ...], name: str
 ) -> NDArray[np.float64] | None:
     """By how much spaceKLIP has shifted the frames of a file.
 
@@ -45,24 +45,38 @@ def recorded_shifts(
     center : ndarray, (2,)
         x, y of the star in the first frame, 0-indexed.
     shape : tuple of int
-        Rows and columns of the frames.
+        Number of frames, rows and columns.
+    name : str
+        The file's, for messages.
 
     Returns
     -------
     ndarray, (frames, 2), or None
         x, y, pixels; None if the frames were not shifted.
+
+    Raises
+    ------
+    ShapeError, NonFiniteError
+        If there are not two finite numbers for every frame.
     """
-    if "IMSHIFTS" in hdus:
-        return native_float64(hdus["IMSHIFTS"].data)
-    parts = [native_float64(hdus[name].data) for name in SHIFTS[1:] if name in hdus]
-    if not parts:
-        return None
-    if "CENTER_SHIFT" in hdus:
-        moved = center + parts[0].reshape(-1, 2)[0]
-        middle = (np.array(shape[::-1]) - 1) / 2
-        if (np.abs(moved - middle) < _AT_CENTER).all():
+    shifts = {}
+    for key in SHIFTS:
+        if key in hdus:
+            data = hdus[key].data
+            if np.shape(data) != (shape[0], 2):
+                raise ShapeError(
+                    f"{name}: {key}: got shape {np.shape(data)}, expected ({shape[0]}, 2), "
+                    "x and y for every frame"
+                )
+            shifts[key] = native_float64(data)
+            require_finite(shifts[key], f"{name}: {key}")
+    if not shifts or "IMSHIFTS" in shifts:
+        return shifts.get("IMSHIFTS")
+    if "CENTER_SHIFT" in shifts:
+        middle = (np.array(shape[:0:-1]) - 1) / 2
+        if (np.abs(center + shifts["CENTER_SHIFT"][0] - middle) < _AT_CENTER).all():
             return None  # The star is still where the shift starts.
-    return np.asarray(np.sum(parts, axis=0))
+    return np.asarray(sum(shifts.values()))
 
 
 def net_shifts(

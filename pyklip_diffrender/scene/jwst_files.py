@@ -12,10 +12,10 @@ from astropy.io import fits
 from astropy.time import Time
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, ShapeError, UnitError
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, UnitError
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import header_date, header_number, header_text, merged_header
-from pyklip_diffrender.io.units import native_float64, require_finite
+from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.scene.detector_pixels import (
     SHIFTS,
     first_pixel,
@@ -78,9 +78,11 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
             quality = np.zeros(data.shape, dtype=np.uint32)
         mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
         details = _details(header, 1 if data.ndim == 2 else len(data), path.name)
-        shifts = recorded_shifts(hdus, np.asarray(details["center"], dtype=float), data.shape[-2:])
+        frames = data.reshape(-1, *data.shape[-2:]).shape
+        shifts = recorded_shifts(hdus, np.asarray(details["center"], float), frames, path.name)
         # A star whose position is stated was moved, unless the file has shifts not yet applied.
-        moved = "STARCENX" in header and not any(name in hdus for name in SHIFTS)
+        records = any(name in hdus for name in SHIFTS)
+        moved = "STARCENX" in header and not records
     arguments = {
         "data": data,
         "error": error,
@@ -93,7 +95,7 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
         # spaceKLIP records the star's position minus the mask's, in pixels, for every integration.
         offset = native_float64(mask).reshape(-1, 2).mean(axis=0) * arguments["pixelscale"]
         arguments["star_offset"] = (float(offset[0]), float(offset[1]))
-    elif not moved:
+    elif not moved and not records:
         offset = dither(header, path.name)
         if offset is not None:
             arguments["star_offset"] = offset
@@ -180,12 +182,6 @@ def on_detector_pixels(
         The attributes of the observation that change.
     """
     name, header, frames = arguments["name"], arguments["header"], len(center)
-    if np.shape(shifts) != (frames, 2):
-        raise ShapeError(
-            f"{name}: shifts of the frames: got shape {np.shape(shifts)}, expected ({frames}, 2), "
-            "x and y for every frame"
-        )
-    require_finite(native_float64(shifts), f"{name}: shifts of the frames")
     net = net_shifts(shifts, center, header, name)
     pixels = np.round(net.mean(axis=0)).astype(np.int64)
     data, error, usable = (
