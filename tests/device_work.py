@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
-from pyklip_diffrender.linear.response import Responses
+from pyklip_diffrender.linear.responses import Responses
 from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -160,10 +160,9 @@ def response(device: Any, **changes: object) -> list[Array]:
     with torch.no_grad():
         fields = model.fields(start, **values)
     names = ("star_offset", "lyot_shift", "blur")
-    near = responses.near(start, values, names)
+    near = responses.near(start, values)
     slopes = (
         near.image(fields, values, amplitude_modes=3),
-        near.parameters(fields, values),
         responses.parameters(start, values, names, fields),
     )
     return [each.cpu().numpy().ravel() for each in slopes]

@@ -623,7 +623,7 @@ def test_derivatives_from_far_away_do_not_end_a_fit(monkeypatch: pytest.MonkeyPa
     """Steps that fail, and the last one, are repeated with accurate derivatives.
 
     A bright star, and a wavefront that is far from the map. Without the repetition chi-squared ends
-    at 1.24 instead of 0.94.
+    at 1.02 instead of 0.94.
     """
     basis = default_basis(3.0)
     system = nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=64, fov_pixels=32)
@@ -638,7 +638,7 @@ def test_derivatives_from_far_away_do_not_end_a_fit(monkeypatch: pytest.MonkeyPa
     exact = []
 
     def recorded(*arguments: Any, **options: Any) -> NormalEquations:
-        exact.append(options["exact"])
+        exact.append(options.get("exact", False))
         return linearise(*arguments, **options)
 
     monkeypatch.setattr(gauss_newton, "linearise", recorded)

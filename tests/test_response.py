@@ -12,14 +12,11 @@ from scipy.stats import multivariate_normal
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.linear.last_pupil import LastPupil
 from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
-from pyklip_diffrender.linear.response import (
-    Responses,
-    WavefrontResponse,
-    coarse_copy,
-    downsample,
-)
+from pyklip_diffrender.linear.response import WavefrontResponse, coarse_copy, downsample
+from pyklip_diffrender.linear.responses import Responses
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
@@ -139,6 +136,77 @@ def test_responses_that_are_not_stored_are_the_same(
         for image, expected in zip(others, every[0], strict=True):
             assert float((image - expected).norm() / expected.norm()) < 1e-6
     assert float((every[0][0] - every[0][1]).norm() / every[0][0].norm()) > 0.01
+
+
+def relative(fields: list[torch.Tensor], expected: list[torch.Tensor], edge: int = 0) -> float:
+    """Relative difference of fields, without so many pixels at the edges."""
+    inside = slice(edge, -edge or None)
+    parts = [
+        ((a - b)[..., inside, inside].norm(), b[..., inside, inside].norm())
+        for a, b in zip(fields, expected, strict=True)
+    ]
+    return float(sum(p[0] ** 2 for p in parts) ** 0.5 / sum(p[1] ** 2 for p in parts) ** 0.5)
+
+
+MOVES = {
+    "si_zernikes": 20e-9 * np.cos(3.0 * np.arange(36)),
+    "detector_shift": (0.012, -0.015),
+    "star_offset": (0.012, -0.01),
+}
+
+
+@pytest.mark.parametrize("name", [*MOVES, "all"])
+@pytest.mark.parametrize("route", ["lattice", "planes"])
+def test_derivatives_follow_changes_in_the_last_pupil(
+    opd: torch.Tensor, values: dict[str, torch.Tensor], name: str, route: str
+) -> None:
+    """Against derivatives that are computed anew; the errors are those of the field's edges."""
+    model = system(npix=64, fov_pixels=(44, 48), route=route)
+    start = downsample(opd, 64)
+    before = {**values, "si_zernikes": torch.zeros(36, dtype=torch.float64),
+              "detector_shift": torch.tensor([0.02, 0.01], dtype=torch.float64)}  # fmt: skip
+    after = dict(before)
+    for each in MOVES if name == "all" else (name,):
+        after[each] = before[each] + torch.as_tensor(MOVES[each])
+    kept, anew = (WavefrontResponse(model, BASIS, start, at, npix=64) for at in (before, after))
+    old, expected = kept._changes(slice(0, None)), anew._changes(slice(0, None))
+    old = [each.clone() for each in old]
+    last = LastPupil(kept.coarse)
+    assert 0.05 < last.change(before, after) < 1
+    kept.follow(last, after)
+    followed = kept._changes(slice(0, None))
+    assert relative(followed, expected) < 0.35 * relative(old, expected)
+    assert relative(followed, expected, 12) < 0.2 * relative(old, expected, 12)
+    kept.follow(last, before)
+    assert relative(kept._changes(slice(0, None)), old) < 1e-5
+
+
+def test_frames_share_derivatives_that_follow(
+    opd: torch.Tensor, values: dict[str, torch.Tensor]
+) -> None:
+    """Two frames a few mas apart need one response; a star far from there needs its own."""
+    model, start = system(npix=64, fov_pixels=(44, 48)), downsample(opd, 64)
+    basis = FourierModes(3)
+    responses = Responses(model, basis, npix=64, keep=3)
+    moved = {**values, "star_offset": values["star_offset"] + torch.tensor([0.008, 0.0])}
+    far = {**values, "star_offset": values["star_offset"] + torch.tensor([0.05, 0.0])}
+    first = responses.near(start, values)
+    before = [each.clone() for each in first._changes(slice(0, None))]
+    assert responses.near(start, moved) is first
+    assert relative(first._changes(slice(0, None)), before) > 0.05
+    assert 0.01 < responses.farthest < 0.05
+    assert responses.near(start, far) is not first
+    assert responses.near(start, values) is first
+    assert relative(first._changes(slice(0, None)), before) < 1e-5
+    names = ("star_offset", "blur")
+    fields = model.fields(start, **moved)
+    slopes = responses.parameters(start, values, names, model.fields(start, **values))
+    assert slopes.shape == (3, 44, 48)
+    again = responses.parameters(start, moved, names, fields)
+    anew = parameter_jacobian(model, start, moved, names, fields)
+    assert float((again - anew).norm() / anew.norm()) < 0.5 * float(
+        (slopes - anew).norm() / anew.norm()
+    )
 
 
 @pytest.mark.hard

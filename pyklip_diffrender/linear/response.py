@@ -16,16 +16,14 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.io.progress import ProgressBar
-from pyklip_diffrender.io.units import ARCSEC
+from pyklip_diffrender.linear.last_pupil import LastPupil
 from pyklip_diffrender.linear.mode_fields import ModeFields
-from pyklip_diffrender.linear.parameter_derivatives import field_derivatives, image_derivatives
 from pyklip_diffrender.optics.batches import batch_of
 from pyklip_diffrender.optics.grid import samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.bases import Basis
 
 __all__ = [
-    "Responses",
     "WavefrontResponse",
     "coarse_copy",
     "coarse_npix",
@@ -101,8 +99,6 @@ class WavefrontResponse:
         Wavefront about which to linearise, m.
     values : dict of Tensor
         Values of the model's other parameters.
-    names : tuple of str
-        Other parameters whose derivatives are stored as well.
     npix : int
         Pupil samples of the coarse copy that does the propagations.
     wavelengths : int
@@ -121,13 +117,12 @@ class WavefrontResponse:
         opd: Tensor,
         values: dict[str, Tensor],
         *,
-        names: tuple[str, ...] = (),
         npix: int = 128,
         wavelengths: int = 4,
         stored: bool = True,
         progress: bool = False,
     ) -> None:
-        self.model, self.basis, self.names = model, basis, names
+        self.model, self.basis = model, basis
         self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
         self.coarse = coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
         self._progress = progress
@@ -138,9 +133,8 @@ class WavefrontResponse:
         # Behind the occulter, arrays are padded to twice the size of the image.
         samples = max(math.prod(coarse.entrance.grid.shape), 4 * pixels)
         self._batch = batch_of(samples, coarse.dtype.to_complex(), coarse.device)
-        small = downsample(opd, coarse.npix)
-        self._mode_fields = ModeFields(coarse, basis, small, values)
-        self._slopes = field_derivatives(coarse, small, values, names)
+        self._opd, self._values = downsample(opd, coarse.npix), values
+        self._mode_fields: ModeFields | None = None
         if stored:
             self.store()
 
@@ -163,8 +157,14 @@ class WavefrontResponse:
                 for kept, change in zip(fields, self._changes(part), strict=True):
                     kept[part] = change
                 bar.update(part.stop - start)
-        self._fields = fields
+        self._fields, self._mode_fields = fields, None
         _log.debug("response of %d modes at %d pupil samples", count, self.coarse.npix)
+
+    def follow(self, last_pupil: LastPupil, values: dict[str, Tensor]) -> None:
+        """Follow a change of parameters that `LastPupil.multiply` can follow."""
+        if self._fields is not None:
+            last_pupil.multiply(self._fields, self._values, values)
+        self._values, self._mode_fields = values, None
 
     def forget(self) -> None:
         """Free the memory of the derivatives."""
@@ -174,6 +174,8 @@ class WavefrontResponse:
         """Derivatives of the field with respect to some modes, for each wavelength."""
         if self._fields is not None:
             return [kept[part] for kept in self._fields]
+        if self._mode_fields is None:
+            self._mode_fields = ModeFields(self.coarse, self.basis, self._opd, self._values)
         return self._mode_fields.changes(part)
 
     def image(
@@ -220,10 +222,6 @@ class WavefrontResponse:
                 wanted.copy_(detector.image(parts[: len(wanted)].contiguous(), values))
         return images
 
-    def parameters(self, fields: Sequence[Tensor], values: dict[str, Tensor]) -> Tensor:
-        """Derivative of the image with respect to the other parameters, (components, ny, nx)."""
-        return image_derivatives(self.coarse, self._kept(fields), values, self.names, self._slopes)
-
     def _kept(self, fields: Sequence[Tensor]) -> list[Tensor]:
         """The star's fields at the wavelengths of the response."""
         return [fields[k] for k in self._kept_wavelengths]
@@ -238,146 +236,3 @@ def _weighted_sum(changes: Sequence[Tensor], weights: Sequence[Tensor]) -> Tenso
         for change, weight in zip(changes, weights, strict=True):
             total[piece] += change[piece] * weight
     return total
-
-
-_OPENINGS = 20.0
-"""Relative change of the field for a shift of the Lyot stop by one pupil diameter. The openings of
-the stop are about a twentieth of a diameter wide."""
-
-
-class Responses:
-    """Cache of wavefront responses, which are used again where the field is nearly the same.
-
-    Parameters
-    ----------
-    model : OpticalSystem
-    basis : Basis
-    npix : int
-        Pupil samples of the coarse copy that does the propagations.
-    wavelengths : int
-        Largest number of wavelengths at which derivatives are computed.
-    relinearise : float
-        Relative change of the field (radians for a phase), rms over the pupil, above which the
-        response is computed again. With a response computed at a distance of 0.2 (15 mas in the
-        star's position), the stated error of the star's position is half the correct one, and
-        the position is off by four times that error.
-    keep : int
-        Number of responses to store: one for each frame, because star positions differ.
-    memory : float
-        Number of bytes of responses to store. Those that do not fit are computed again whenever
-        they are needed, the oldest first, about the same wavefront.
-    progress : bool
-        Show progress bars.
-
-    Attributes
-    ----------
-    farthest : float
-        Largest change of the field at which a response was used; set it to 0 to begin anew.
-    """
-
-    def __init__(
-        self,
-        model: OpticalSystem,
-        basis: Basis,
-        *,
-        npix: int = 128,
-        wavelengths: int = 4,
-        relinearise: float = 0.05,
-        keep: int = 1,
-        memory: float = math.inf,
-        progress: bool = False,
-    ) -> None:
-        self.keep = keep
-        self.model, self.basis, self.npix, self.wavelengths = model, basis, npix, wavelengths
-        self.relinearise, self.memory, self.progress = relinearise, memory, progress
-        self._kept: list[tuple[Tensor, dict[str, Tensor], WavefrontResponse]] = []
-        self._slopes: tuple[Tensor, dict[str, Tensor], dict[str, list[Tensor]]] | None = None
-        self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
-        self._coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
-        self.farthest = 0.0
-
-    def parameters(
-        self,
-        opd: Tensor,
-        values: dict[str, Tensor],
-        names: tuple[str, ...],
-        fields: Sequence[Tensor],
-    ) -> Tensor:
-        """Derivative of the image with respect to named parameters, (components, ny, nx).
-
-        Parameters
-        ----------
-        opd : Tensor, (npix, npix)
-            On the model's grid, m.
-        values : dict of Tensor
-        names : tuple of str
-        fields : sequence of Tensor
-            The star's field at each wavelength.
-        """
-        inside = opd[self.model.entrance.lit]
-        kept = self._slopes
-        if kept is None or self._change(inside - kept[0], values, kept[1]) > self.relinearise:
-            coarse = downsample(opd, self._coarse.npix)
-            slopes = field_derivatives(self._coarse, coarse, values, names)
-            kept = self._slopes = (inside, dict(values), slopes)
-        own = [fields[k] for k in self._kept_wavelengths]
-        return image_derivatives(self._coarse, own, values, names, kept[2])
-
-    def near(
-        self, opd: Tensor, values: dict[str, Tensor], names: tuple[str, ...] = ()
-    ) -> WavefrontResponse:
-        """Return the stored response for nearly the same field, or compute it."""
-        inside = opd[self.model.entrance.lit]
-        for opd_then, values_then, response in reversed(self._kept):
-            change = self._change(inside - opd_then, values, values_then)
-            if change <= self.relinearise:
-                self.farthest = max(self.farthest, change)
-                return response
-            del response  # Or its memory could not be freed.
-        # Memory is freed first, because the new response is as large as the old one.
-        del self._kept[: max(0, len(self._kept) + 1 - self.keep)]
-        response = WavefrontResponse(
-            self.model,
-            self.basis,
-            opd,
-            values,
-            names=names,
-            npix=self.npix,
-            wavelengths=self.wavelengths,
-            stored=False,
-            progress=self.progress,
-        )
-        if response.size <= self.memory:
-            self._make_room(response.size)
-            response.store()
-        self._kept.append((inside, dict(values), response))
-        return response
-
-    def _make_room(self, size: int) -> None:
-        """Free the oldest responses until as many bytes can be stored."""
-        stored = [response for _, _, response in self._kept if response.stored]
-        while stored and sum(each.size for each in stored) + size > self.memory:
-            stored.pop(0).forget()
-
-    def _change(self, moved: Tensor, values: dict[str, Tensor], others: dict[str, Tensor]) -> float:
-        """Relative change of the field, rms over the pupil."""
-
-        def difference(name: str) -> Tensor:
-            zero = torch.zeros((), dtype=torch.float64)
-            return values.get(name, zero).cpu() - others.get(name, zero).cpu()
-
-        wavenumber = 2 * math.pi / min(self.model.bandpass.wavelengths)
-        # The rms of a tilt over a disc is a quarter of its diameter times the angle.
-        lever = wavenumber * ARCSEC * self.model.diameter / 4
-        x, y = (difference("star_offset") * ARCSEC).expand(2).tolist()
-        pupil = self.model.entrance
-        tilt = (y * pupil.full.y[:, None] - x * pupil.full.x[None, :])[pupil.lit.cpu()]
-        total = (wavenumber * (moved + tilt.to(moved.device)).abs()).square().mean()
-        for name, sensitivity in (
-            ("detector_shift", lever),
-            ("si_zernikes", wavenumber),
-            ("lyot_shift", _OPENINGS),
-            ("lyot_rotation", _OPENINGS * math.radians(1) / 4),
-        ):
-            total = total + (sensitivity * difference(name)).square().sum().to(total.device)
-        return float(total.sqrt())

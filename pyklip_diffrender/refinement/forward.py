@@ -9,12 +9,8 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.linear.mode_fields import NANOMETRE
-from pyklip_diffrender.linear.response import (
-    Responses,
-    WavefrontResponse,
-    coarse_copy,
-    downsample,
-)
+from pyklip_diffrender.linear.response import coarse_copy, downsample
+from pyklip_diffrender.linear.responses import Responses
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.frame_layout import FrameLayout
@@ -151,13 +147,9 @@ class Forward:
             count = unknowns.where("modes").start + modes
         # One array, filled in place: it is the largest of the fit.
         rows = torch.empty(count, *point.image.shape, dtype=torch.float32)
-        response = self._response_at(point) if modes else None
+        response = self.responses.near(point.opd, values) if modes else None
         if unknowns.optical:
-            slopes = (
-                response.parameters(point.fields, values)
-                if response is not None
-                else self.responses.parameters(point.opd, values, unknowns.optical, point.fields)
-            )
+            slopes = self.responses.parameters(point.opd, values, unknowns.optical, point.fields)
             rows[: len(slopes)] = (flux * gain * slopes).cpu()
         if "flux" in unknowns.linear:
             rows[unknowns.where("flux")] = (gain * point.image).float().cpu()
@@ -249,8 +241,3 @@ class Forward:
                 behind = self.coarse(opd, **{**values, "star_offset": offset - step})
             slopes.append((ahead.double() - behind.double()).cpu() / (2 * _DIFFERENCE))
         return torch.stack(slopes)
-
-    def _response_at(self, point: Point) -> WavefrontResponse:
-        """The response of the field, computed at nearly the same wavefront."""
-        values = point.unknowns.values(point.vector)
-        return self.responses.near(point.opd, values, point.unknowns.optical)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.linear.response import Responses
+from pyklip_diffrender.linear.responses import Responses
 from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.refinement.joint_layout import JointLayout
@@ -34,15 +34,17 @@ _TRIES = 7
 _RESPONSES = 4e9
 """Largest number of bytes of stored derivatives."""
 
-_ACCURATE = 0.05
-"""Value of `GaussNewton.relinearise` with which a step is repeated if it fails or is the last. With
-derivatives from farther away, fits of bright stars stopped at a chi-squared that was up to a fifth
-too large. The gradient of a repeated step is that of the model itself: near the minimum, the error
-of the coarse copy's gradient is as large as the gradient."""
+_CLOSE = 0.05
+"""Value of `GaussNewton.relinearise` above which steps that fail, gain little or are the last are
+repeated with accurate derivatives. Without that, fits of bright stars stopped at a chi-squared that
+was up to a fifth too large."""
 
-_WORTHWHILE = 0.002
-"""Gain in chi-squared per pixel of a repeated step below which, with this model error, no further
-step is repeated. Where the model cannot explain the data, steps gain little for many iterations."""
+_ACCURATE = 0.025
+"""Value of `GaussNewton.relinearise` of repeated steps. Their gradient is that of the model itself:
+near the minimum, the error of the coarse copy's gradient is as large as the gradient."""
+
+_POOR = 0.5
+"""Ratio of the actual to the expected gain of a step below which its derivatives are poor."""
 
 _IMPROBABLE = 1.5
 """Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
@@ -122,7 +124,7 @@ class Solver:
             scales += [own_prior.scales[name] for name in basis.groups]
         self.scales = torch.tensor(scales, dtype=torch.float64)
         self.damping = 0.0
-        self._exhausted = math.nan
+        self._exact = math.nan
         self._equations: NormalEquations | None = None
 
     def first_layout(self) -> JointLayout:
@@ -191,30 +193,31 @@ class Solver:
         gain : float
             Decrease, or expected decrease, of the penalised chi-squared per pixel.
         """
-        taken = self._try_step(state, kappa, modes, repeats=kappa != self._exhausted)
+        exact = kappa == self._exact
+        repeats = modes > 0 and not exact and self.settings.relinearise > _CLOSE
+        taken = self._try_step(state, kappa, modes, exact, repeats=repeats)
         if taken is None:
-            allowed, self._responses.relinearise = self._responses.relinearise, _ACCURATE
-            taken = self._try_step(state, kappa, modes, repeats=False, exact=True)
-            self._responses.relinearise = allowed
-            assert taken is not None
-            if taken[1] < _WORTHWHILE:
-                self._exhausted = kappa
+            self._exact, self.damping = kappa, 0.0
+            taken = self._try_step(state, kappa, modes, exact=True, repeats=False)
+        assert taken is not None
         return taken
 
     def _try_step(
-        self, state: State, kappa: float, modes: int, *, repeats: bool, exact: bool = False
+        self, state: State, kappa: float, modes: int, exact: bool, *, repeats: bool
     ) -> tuple[State, float] | None:
         """Take a step; `exact` as for `linearise`.
 
-        None if it fails, or is the last, with derivatives from far away, and may be repeated.
+        None if it fails, or is the last, and may be repeated with better derivatives.
         """
         layout, objective = state.joint, self.objective
         self._equations = None  # The next ones are as large.
-        self._responses.farthest = 0.0
+        allowed = self._responses.relinearise
+        if exact:
+            self._responses.relinearise = min(allowed, _ACCURATE)
         equations = self._equations = linearise(
             objective, state, kappa, modes, objective.robust, exact=exact
         )
-        far = repeats and self._responses.farthest > _ACCURATE
+        self._responses.relinearise = allowed
         weights = objective.weights(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else self.damping
@@ -222,7 +225,7 @@ class Solver:
         self.scales = update.scales
         expected = self._predicted_gain(layout, equations, update.step)
         if expected < self.settings.tolerance * objective.pixels:
-            if far:
+            if repeats:
                 return None
             # The gain is too small for another linearisation.
             return state, expected / objective.pixels
@@ -237,9 +240,13 @@ class Solver:
             trial = objective.at(layout, layout.clamped(vector))
             after = self._cost(trial, weights)
             if after < before:
-                self._relax((before - after) / expected)
+                ratio = (before - after) / expected
+                if repeats and ratio < _POOR:
+                    self._exact, self.damping = kappa, 0.0
+                else:
+                    self._relax(ratio)
                 return trial, (before - after) / objective.pixels
-            if far:
+            if repeats:
                 return None
             self.damping = max(6 * self.damping, 0.05)
         return state, 0.0

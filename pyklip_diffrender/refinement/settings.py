@@ -242,7 +242,7 @@ class GaussNewton:
             robust=3.0,
             min_model_error=0.01,
             max_iterations=40,
-            relinearise=0.3,
+            relinearise=0.1,
             tolerance=5e-4,
         )
         # Parameters that are not free need no prior.
