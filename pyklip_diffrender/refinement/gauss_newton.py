@@ -35,13 +35,13 @@ _RESPONSES = 4e9
 """Largest number of bytes of stored derivatives."""
 
 _CLOSE = 0.05
-"""Value of `GaussNewton.relinearise` above which steps that fail, gain little or are the last are
-repeated with accurate derivatives. Without that, fits of bright stars stopped at a chi-squared that
-was up to a fifth too large."""
+"""Value of `GaussNewton.relinearise` above which a step that fails, gains less than expected or is
+the last is repeated with accurate derivatives. Without that, fits of bright stars stopped at a
+chi-squared that was up to a fifth too large."""
 
 _ACCURATE = 0.025
-"""Value of `GaussNewton.relinearise` of repeated steps. Their gradient is that of the model itself:
-near the minimum, the error of the coarse copy's gradient is as large as the gradient."""
+"""Value of `GaussNewton.relinearise` for accurate derivatives. The gradient is then that of the
+model itself: near the minimum, the error of the coarse copy's is as large as the gradient."""
 
 _POOR = 0.5
 """Ratio of the actual to the expected gain of a step below which its derivatives are poor."""
@@ -124,7 +124,10 @@ class Solver:
             scales += [own_prior.scales[name] for name in basis.groups]
         self.scales = torch.tensor(scales, dtype=torch.float64)
         self.damping = 0.0
-        self._exact = math.nan
+        # A step that needs them has accurate derivatives, or new ones in the end.
+        precise = (_ACCURATE, 0.0) if settings.relinearise > _CLOSE else ()
+        self._allowed = (settings.relinearise, *precise)
+        self._kappa, self._level = math.nan, 0
         self._equations: NormalEquations | None = None
 
     def first_layout(self) -> JointLayout:
@@ -193,31 +196,31 @@ class Solver:
         gain : float
             Decrease, or expected decrease, of the penalised chi-squared per pixel.
         """
-        exact = kappa == self._exact
-        repeats = modes > 0 and not exact and self.settings.relinearise > _CLOSE
-        taken = self._try_step(state, kappa, modes, exact, repeats=repeats)
-        if taken is None:
-            self._exact, self.damping = kappa, 0.0
-            taken = self._try_step(state, kappa, modes, exact=True, repeats=False)
-        assert taken is not None
-        return taken
+        if kappa != self._kappa:
+            self._kappa, self._level = kappa, 0
+        # Without the wavefront, derivatives are cheap and always accurate.
+        last = len(self._allowed) - 1 if modes else 0
+        while True:
+            level = self._level = min(self._level, last)
+            taken = self._try_step(state, kappa, modes, may_improve=level < last)
+            if taken is not None:
+                # After new derivatives, the next step is near enough to use them again.
+                self._level = min(self._level, 1)
+                return taken
+            self._level, self.damping = level + 1, 0.0
 
     def _try_step(
-        self, state: State, kappa: float, modes: int, exact: bool, *, repeats: bool
+        self, state: State, kappa: float, modes: int, *, may_improve: bool
     ) -> tuple[State, float] | None:
-        """Take a step; `exact` as for `linearise`.
-
-        None if it fails, or is the last, and may be repeated with better derivatives.
-        """
-        layout, objective = state.joint, self.objective
+        """Take a step; None if it is to be repeated with better derivatives."""
+        layout, objective, responses = state.joint, self.objective, self._responses
         self._equations = None  # The next ones are as large.
-        allowed = self._responses.relinearise
-        if exact:
-            self._responses.relinearise = min(allowed, _ACCURATE)
+        responses.relinearise, responses.farthest = self._allowed[self._level], 0.0
         equations = self._equations = linearise(
-            objective, state, kappa, modes, objective.robust, exact=exact
+            objective, state, kappa, modes, objective.robust, exact=self._level > 0
         )
-        self._responses.relinearise = allowed
+        may_improve = may_improve and (self._level == 0 or responses.farthest > 0)
+        is_first = may_improve and self._level == 0
         weights = objective.weights(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else self.damping
@@ -225,7 +228,7 @@ class Solver:
         self.scales = update.scales
         expected = self._predicted_gain(layout, equations, update.step)
         if expected < self.settings.tolerance * objective.pixels:
-            if repeats:
+            if is_first:
                 return None
             # The gain is too small for another linearisation.
             return state, expected / objective.pixels
@@ -241,15 +244,15 @@ class Solver:
             after = self._cost(trial, weights)
             if after < before:
                 ratio = (before - after) / expected
-                if repeats and ratio < _POOR:
-                    self._exact, self.damping = kappa, 0.0
+                if is_first and ratio < _POOR:
+                    self._level, self.damping = self._level + 1, 0.0
                 else:
                     self._relax(ratio)
                 return trial, (before - after) / objective.pixels
-            if repeats:
+            if is_first:
                 return None
             self.damping = max(6 * self.damping, 0.05)
-        return state, 0.0
+        return None if may_improve else (state, 0.0)
 
     def leave_out(self, pixels: Sequence[Tensor]) -> None:
         """Leave out pixels from now on; a mask, (ny, nx), for every frame."""
@@ -281,6 +284,7 @@ class Solver:
         ):
             del equations
             self._equations = None
+            self._responses.relinearise = min(self._allowed[0], _CLOSE)
             equations = linearise(self.objective, state, kappa, modes, robust)
             self._equations = equations
         return LinearModel(

@@ -75,9 +75,10 @@ class GaussNewton:
         of the star's light in a pixel. It is added in quadrature to the noise. The errors of the
         result do not include it where the noise explains the residual.
     relinearise : float
-        Relative change of the pupil field (rms; radians for a phase) beyond which the response to
-        the wavefront is recomputed, see `pyklip_diffrender.linear.response.Responses`. A step that
-        fails, or is the last, is repeated with a response from within 0.05.
+        Relative error of derivatives (radians of phase, rms over the pupil) beyond which the
+        response to the wavefront is recomputed, see `pyklip_diffrender.linear.responses.Responses`.
+        With more than 0.05, a step that fails, gains less than expected or is the last is repeated
+        with derivatives from within 0.025 and the gradient of the model itself.
     robust : float
         Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain
         least squares.
