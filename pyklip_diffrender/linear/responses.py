@@ -165,7 +165,7 @@ class Responses:
         # Unknowns whose effects nearly cancel need derivatives of the same field.
         self._slopes.clear()
         # Memory is freed first, because the new response is as large as the old one.
-        del near, self._kept[: max(0, len(self._kept) + 1 - self.keep)]
+        del self._kept[: max(0, len(self._kept) + 1 - self.keep)]
         response = WavefrontResponse(
             self.model,
             self.basis,
@@ -230,6 +230,8 @@ class Responses:
             ("star_offset", tilt * lever),
             ("lyot_shift", _OPENINGS),
             ("lyot_rotation", _OPENINGS * math.radians(1) / 4),
+            # Where the aberration is in another pupil, derivatives cannot follow it.
+            ("si_zernikes", 0.0 if self._last_pupil.zernikes else wavenumber),
         ):
             parts.append(sensitivity * float(difference(name).norm()))
         return math.hypot(*parts)
