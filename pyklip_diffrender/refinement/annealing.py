@@ -65,9 +65,6 @@ _ALIGNED = 0.05
 _ANNEALING = 0.6
 """Largest ratio of kappa in successive steps."""
 
-_FAST = 0.3
-"""The same where the step gained little."""
-
 _ROUNDS = 6
 """Largest number of searches for bad pixels; a bright one hides fainter ones beside it."""
 
@@ -165,7 +162,7 @@ class Annealing:
             if settled and kappa <= floor and modes == len(self.basis):
                 status = _status_of(chi2)
                 break
-            kappa = min((_ANNEALING if gain > _ALIGNED else _FAST) * kappa, error / 2)
+            kappa = min(_ANNEALING * kappa, error / 2)
             if kappa < max(_NEGLIGIBLE, floor):
                 kappa = floor
             modes = self._modes_for(kappa)
