@@ -1,4 +1,4 @@
-"""The gradient of a fit through the model itself, of which the coarse copy gives the curvature."""
+"""Derivatives of a fit through the model itself, and accurate steps with them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from torch import Tensor
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.refinement import GaussNewton, Systematics
+from pyklip_diffrender.refinement import accurate_step as accurate
+from pyklip_diffrender.refinement.accurate_step import accurate_step, conjugate_gradients
 from pyklip_diffrender.refinement.gauss_newton import Solver
-from pyklip_diffrender.refinement.normal_equations import linearise
+from pyklip_diffrender.refinement.normal_equations import curve, linearise
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.wavefront.bases import default_basis
@@ -94,16 +96,104 @@ def test_the_gradient_is_that_of_chi_squared(frames: int) -> None:
             assert abs(float(coarse @ direction) - slope) > 1e-2 * abs(slope)
 
 
-def test_where_the_copy_is_the_model_both_gradients_are_the_same() -> None:
-    """But for single precision, in which the derivatives of the copy are stored."""
-    solver, state = solver_of(1)
-    same = Solver(
+def of_the_model_itself(solver: Solver) -> Solver:
+    """A solver whose coarse copy is the model."""
+    return Solver(
         [forward.problem for forward in solver.objective.forwards],
         replace(solver.settings, response_npix=NPIX, response_wavelengths=3),
         BASIS,
         progress=False,
     )
+
+
+def test_where_the_copy_is_the_model_both_gradients_are_the_same() -> None:
+    """But for single precision, in which the derivatives of the copy are stored."""
+    solver, state = solver_of(1)
+    same = of_the_model_itself(solver)
     exact, copied = (gradient(same, state, exact=value) for value in (True, False))
     scale = same.prior_deviation(state.joint).clamp(max=1e6)
     error = ((exact - copied) * scale).norm() / (exact * scale).norm()
     assert error < 1e-4
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> None:
+    """Against the equations of a copy that is the model; those of a coarse one are far from it."""
+    solver, state = solver_of(frames)
+    assert solver.objective.shares_pattern == (frames > 1)
+    same = of_the_model_itself(solver)
+    rng = np.random.default_rng(6)
+    unit = solver.prior_deviation(state.joint)
+    unit = torch.where(torch.isfinite(unit), unit, state.vector.abs()).clamp(max=1e6)
+    step = 0.01 * unit * torch.from_numpy(rng.normal(size=len(unit)))
+    curved, products = [], []
+    for each in (solver, same):
+        weights = each.objective.weights(state, 0.01, 4.0)
+        equations = linearise(each.objective, state, 0.01, len(BASIS), 4.0)
+        curved.append(unit * curve(each.objective, equations, weights, step))
+        products.append(unit * (equations.curvature @ step))
+    expected = products[1]
+    assert (curved[0] - expected).norm() < 2e-3 * expected.norm()
+    assert (curved[1] - expected).norm() < 2e-3 * expected.norm()
+    assert (products[0] - expected).norm() > 0.1 * expected.norm()
+
+
+def test_an_accurate_step_ends_where_that_of_the_model_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In as many iterations as are needed, whatever the coarse copy that preconditions them."""
+    monkeypatch.setattr(accurate, "_ITERATIONS", 60)
+    monkeypatch.setattr(accurate, "_SUFFICIENT", 0.0)
+    solver, state = solver_of(1)
+    same = of_the_model_itself(solver)
+    weights = solver.objective.weights(state, 0.01, 4.0)
+    deviation = solver.prior_deviation(state.joint)
+    coarse, fine = (
+        linearise(each.objective, state, 0.01, len(BASIS), 4.0, exact=True)
+        for each in (solver, same)
+    )
+    step = accurate_step(solver.objective, coarse, weights, deviation, enough=0.0)
+    direct = same._solve(state.joint, fine).step - fine.current
+    too_coarse = solver._solve(state.joint, coarse).step - coarse.current
+    errors = same._solve(state.joint, fine, errors=True).variance.sqrt()
+    assert (direct / errors).norm() > 10
+    assert ((step - direct) / errors).norm() < 0.2
+    assert ((too_coarse - direct) / errors).norm() > 10
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 3])
+def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(
+    wrong: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of that many directions the preconditioner says far too little; two more iterations end."""
+    monkeypatch.setattr(accurate, "_SUFFICIENT", 0.0)
+    rng = np.random.default_rng(8)
+    vectors = torch.from_numpy(np.linalg.qr(rng.normal(size=(20, 20)))[0])
+    powers = torch.logspace(0, 6, 20, dtype=torch.float64)
+    stated = powers.clone()
+    stated[:wrong] /= 10.0 ** (2 + torch.arange(wrong))
+    products = []
+
+    def product(x: Tensor) -> Tensor:
+        products.append(x)
+        return vectors @ (powers * (vectors.T @ x))
+
+    gradient = torch.from_numpy(rng.normal(size=20))
+    x = conjugate_gradients(
+        product, lambda x: vectors @ ((vectors.T @ x) / stated), gradient, enough=1e-8
+    )
+    expected = vectors @ ((vectors.T @ gradient) / powers)
+    torch.testing.assert_close(x, expected, rtol=1e-6, atol=1e-8)
+    assert len(products) <= wrong + 2
+
+
+def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner() -> None:
+    """And end without a step where there is nothing to gain."""
+    rng = np.random.default_rng(9)
+    matrix = torch.from_numpy(rng.normal(size=(30, 30)))
+    matrix = matrix @ matrix.T
+    gradient = torch.from_numpy(rng.normal(size=30))
+    x = conjugate_gradients(lambda x: matrix @ x, lambda x: 1e6 * x, gradient)
+    assert float(x @ matrix @ x - 2 * gradient @ x) < 0
+    zero = torch.zeros(30, dtype=torch.float64)
+    assert not conjugate_gradients(lambda x: matrix @ x, lambda x: x, zero).any()

@@ -66,7 +66,8 @@ _ANNEALING = 0.6
 """Largest ratio of kappa in successive steps."""
 
 _ROUNDS = 6
-"""Largest number of searches for bad pixels; a bright one hides fainter ones beside it."""
+"""Largest number of searches for bad pixels at one state, because a bright one hides fainter ones
+beside it, and of states that are searched."""
 
 _STEPS = 4
 """Largest number of steps after each. With robust weights, bad pixels have done little harm."""
@@ -176,19 +177,26 @@ class Annealing:
     def _without_outliers(self, state: State) -> State:
         """Leave out bad pixels that stand alone, and go on without them."""
         for _ in range(_ROUNDS):
-            kappa = self._unexplained(state)
-            linear = self.solver.linear_model(state, kappa, self._all_modes, math.inf)
-            outliers = isolated_outliers(self.objective, state, linear)
-            del linear  # The next one is as large.
-            if not any(bool(each.any()) for each in outliers):
+            if not self._leave_out_outliers(state):
                 break
-            self.solver.leave_out(outliers)
             kappa = max(self._unexplained(state), self.settings.min_model_error)
             for _ in range(_STEPS):
                 state, gain = self.solver.step(state, kappa, self._all_modes)
                 if gain < self.settings.tolerance:
                     break
         return state
+
+    def _leave_out_outliers(self, state: State) -> bool:
+        """Leave out bad pixels that stand alone; False if there are none."""
+        for k in range(_ROUNDS):
+            kappa = self._unexplained(state)
+            linear = self.solver.linear_model(state, kappa, self._all_modes, math.inf, final=False)
+            outliers = isolated_outliers(self.objective, state, linear)
+            del linear  # The next one is as large.
+            if not any(bool(each.any()) for each in outliers):
+                return k > 0
+            self.solver.leave_out(outliers)
+        return True
 
     @property
     def _all_modes(self) -> int:

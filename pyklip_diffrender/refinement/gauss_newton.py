@@ -1,8 +1,10 @@
 """Damped Gauss-Newton steps on the unknowns of a fit.
 
-One step solves the linearised problem with Gaussian priors. If it does not lower the penalised
-chi-squared, it is repeated with Levenberg-Marquardt damping. The schedule of a fit, with a model
-error that decreases from step to step, is in `annealing`.
+A quick step solves the linearised problem with Gaussian priors. If it does not lower the penalised
+chi-squared, it is repeated with Levenberg-Marquardt damping. Its derivatives are those of a coarse
+copy of the model at an earlier point. Where they are not sufficient, an accurate step follows: by
+conjugate gradients, with derivatives of the model itself along every direction. The schedule of a
+fit, with a model error that decreases from step to step, is in `annealing`.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from torch import Tensor
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.linear.responses import Responses
+from pyklip_diffrender.refinement.accurate_step import accurate_step
 from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.refinement.joint_layout import JointLayout
@@ -34,14 +37,19 @@ _TRIES = 7
 _RESPONSES = 4e9
 """Largest number of bytes of stored derivatives."""
 
-_CLOSE = 0.05
-"""Value of `GaussNewton.relinearise` above which a step that fails, gains less than expected or is
-the last is repeated with accurate derivatives. Without that, fits of bright stars stopped at a
-chi-squared that was up to a fifth too large."""
+_ACCURATE = 0.05
+"""Value of `GaussNewton.relinearise` above which a quick step that fails, gains less than expected
+or is the last is followed by accurate ones, and largest error of the derivatives that precondition
+these. Without them, fits of bright stars stopped at a chi-squared that was up to a fifth too large:
+along directions in which the effects of unknowns cancel, the curvature of the coarse copy was 20
+times too small."""
 
-_ACCURATE = 0.025
-"""Value of `GaussNewton.relinearise` for accurate derivatives. The gradient is then that of the
-model itself: near the minimum, the error of the coarse copy's is as large as the gradient."""
+_FINAL = 0.01
+"""Error of derivatives above which the linear model of such a fit gets new ones. With 0.05, limits
+were up to 10 % too shallow near the occulter."""
+
+_PARTS = (1.0, 0.4, 0.16, 0.064)
+"""Parts of an accurate step that are tried until one lowers the penalised chi-squared."""
 
 _POOR = 0.5
 """Ratio of the actual to the expected gain of a step below which its derivatives are poor."""
@@ -124,10 +132,8 @@ class Solver:
             scales += [own_prior.scales[name] for name in basis.groups]
         self.scales = torch.tensor(scales, dtype=torch.float64)
         self.damping = 0.0
-        # A step that needs them has accurate derivatives, or new ones in the end.
-        precise = (_ACCURATE, 0.0) if settings.relinearise > _CLOSE else ()
-        self._allowed = (settings.relinearise, *precise)
-        self._kappa, self._level = math.nan, 0
+        self._has_accurate_steps = settings.relinearise > _ACCURATE
+        self._kappa, self._needs_accurate = math.nan, False
         self._equations: NormalEquations | None = None
 
     def first_layout(self) -> JointLayout:
@@ -197,30 +203,26 @@ class Solver:
             Decrease, or expected decrease, of the penalised chi-squared per pixel.
         """
         if kappa != self._kappa:
-            self._kappa, self._level = kappa, 0
+            self._kappa, self._needs_accurate = kappa, False
         # Without the wavefront, derivatives are cheap and always accurate.
-        last = len(self._allowed) - 1 if modes else 0
-        while True:
-            level = self._level = min(self._level, last)
-            taken = self._try_step(state, kappa, modes, may_improve=level < last)
+        may_repeat = self._has_accurate_steps and modes > 0
+        if not (may_repeat and self._needs_accurate):
+            taken = self._quick_step(state, kappa, modes, may_repeat)
             if taken is not None:
-                # After new derivatives, the next step is near enough to use them again.
-                self._level = min(self._level, 1)
                 return taken
-            self._level, self.damping = level + 1, 0.0
+            self._needs_accurate, self.damping = True, 0.0
+        return self._accurate_step(state, kappa, modes)
 
-    def _try_step(
-        self, state: State, kappa: float, modes: int, *, may_improve: bool
+    def _quick_step(
+        self, state: State, kappa: float, modes: int, may_repeat: bool
     ) -> tuple[State, float] | None:
-        """Take a step; None if it is to be repeated with better derivatives."""
-        layout, objective, responses = state.joint, self.objective, self._responses
-        self._equations = None  # The next ones are as large.
-        responses.relinearise, responses.farthest = self._allowed[self._level], 0.0
-        equations = self._equations = linearise(
-            objective, state, kappa, modes, objective.robust, exact=self._level > 0
+        """Take a step with the derivatives that there are; None if it needs better ones."""
+        layout, objective = state.joint, self.objective
+        equations = self._linearise(
+            state, kappa, modes, objective.robust, self.settings.relinearise
         )
-        may_improve = may_improve and (self._level == 0 or responses.farthest > 0)
-        is_first = may_improve and self._level == 0
+        # New derivatives that fail show that the model is not linear.
+        is_stale = may_repeat and self._responses.farthest > 0
         weights = objective.weights(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else self.damping
@@ -228,31 +230,65 @@ class Solver:
         self.scales = update.scales
         expected = self._predicted_gain(layout, equations, update.step)
         if expected < self.settings.tolerance * objective.pixels:
-            if is_first:
-                return None
             # The gain is too small for another linearisation.
-            return state, expected / objective.pixels
+            return None if may_repeat else (state, expected / objective.pixels)
         before = self._cost(state, weights)
         for _ in range(_TRIES):
             if self.damping != damping:
                 damping = self.damping
                 update = self._solve(layout, equations, damping=self.damping)
                 expected = self._predicted_gain(layout, equations, update.step)
-            vector = state.vector.clone()
-            vector[: len(update.step)] += update.step - equations.current
-            trial = objective.at(layout, layout.clamped(vector))
+            trial = self._moved(state, update.step - equations.current)
             after = self._cost(trial, weights)
             if after < before:
                 ratio = (before - after) / expected
-                if is_first and ratio < _POOR:
-                    self._level, self.damping = self._level + 1, 0.0
+                if is_stale and ratio < _POOR:
+                    self._needs_accurate = True
                 else:
                     self._relax(ratio)
                 return trial, (before - after) / objective.pixels
-            if is_first:
+            if is_stale:
                 return None
             self.damping = max(6 * self.damping, 0.05)
-        return None if may_improve else (state, 0.0)
+        return None if may_repeat else (state, 0.0)
+
+    def _accurate_step(self, state: State, kappa: float, modes: int) -> tuple[State, float]:
+        """Take a step, or a part of it, with derivatives of the model itself."""
+        objective = self.objective
+        equations = self._linearise(state, kappa, modes, objective.robust, _ACCURATE, exact=True)
+        weights = objective.weights(state, kappa, objective.robust)
+        deviation = self.prior_deviation(state.joint)[: len(equations.current)]
+        enough = self.settings.tolerance * objective.pixels / 2
+        step = accurate_step(objective, equations, weights, deviation, enough)
+        before = self._cost(state, weights)
+        for part in _PARTS:
+            trial = self._moved(state, part * step)
+            after = self._cost(trial, weights)
+            if after < before:
+                return trial, (before - after) / objective.pixels
+        return state, 0.0
+
+    def _linearise(
+        self,
+        state: State,
+        kappa: float,
+        modes: int,
+        robust: float,
+        allowed: float,
+        *,
+        exact: bool = False,
+    ) -> NormalEquations:
+        """Linearise about a state, with derivatives whose error is at most `allowed`."""
+        self._equations = None  # The next ones are as large.
+        self._responses.relinearise, self._responses.farthest = allowed, 0.0
+        self._equations = linearise(self.objective, state, kappa, modes, robust, exact=exact)
+        return self._equations
+
+    def _moved(self, state: State, step: Tensor) -> State:
+        """The state after a step of the leading unknowns, within the bounds of all parameters."""
+        vector = state.vector.clone()
+        vector[: len(step)] += step
+        return self.objective.at(state.joint, state.joint.clamped(vector))
 
     def leave_out(self, pixels: Sequence[Tensor]) -> None:
         """Leave out pixels from now on; a mask, (ny, nx), for every frame."""
@@ -260,7 +296,9 @@ class Solver:
         for forward, mask in zip(self.objective.forwards, pixels, strict=True):
             forward.problem.leave_out(mask)
 
-    def linear_model(self, state: State, kappa: float, modes: int, robust: float) -> LinearModel:
+    def linear_model(
+        self, state: State, kappa: float, modes: int, robust: float, *, final: bool = True
+    ) -> LinearModel:
         """Return the linear model about a state.
 
         Parameters
@@ -273,20 +311,22 @@ class Solver:
         robust : float
             Residual, in standard deviations, of half weight; inf for the full weights of all
             pixels.
+        final : bool
+            Whether errors will be computed from it, for which derivatives must be accurate.
         """
         layout, equations = state.joint, self._equations
         count = layout.unknowns_with(modes)
+        allowed = _FINAL if final else _ACCURATE
+        allowed = allowed if self._has_accurate_steps else self.settings.relinearise
         if (
             equations is None
+            or self._responses.farthest > allowed
             or equations.state is not state
             or (equations.kappa, equations.robust) != (kappa, robust)
             or len(equations.current) != count
         ):
             del equations
-            self._equations = None
-            self._responses.relinearise = min(self._allowed[0], _CLOSE)
-            equations = linearise(self.objective, state, kappa, modes, robust)
-            self._equations = equations
+            equations = self._linearise(state, kappa, modes, robust, allowed)
         return LinearModel(
             unknowns=layout.unknowns()[:count],
             frames=equations.frames,

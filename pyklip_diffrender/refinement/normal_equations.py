@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,10 @@ from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
 from pyklip_diffrender.linear.frames import LinearFrame, summed_rows
-from pyklip_diffrender.refinement.objective import Objective, State
+from pyklip_diffrender.refinement.forward import Forward, Point
+from pyklip_diffrender.refinement.objective import Objective, State, Weights
 
-__all__ = ["NormalEquations", "linearise"]
+__all__ = ["NormalEquations", "curve", "linearise"]
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,10 @@ class NormalEquations:
     current: Tensor
     frames: tuple[LinearFrame, ...]
 
+
+_DIFFERENCE = 0.01
+"""Part of a step between the images whose difference is a derivative. Their curvature matters less
+than the rounding errors of single precision."""
 
 _PIXELS = 1024
 """Number of pixels whose Jacobian is converted to double precision at a time."""
@@ -103,11 +109,10 @@ def linearise(
     gradient = torch.zeros(size, dtype=torch.float64)
     frames = []
     weights = objective.weights(state, kappa, robust)
-    whitened = objective.whitened_residuals(state, weights)
+    residuals = objective.residuals(state)
+    whitened = objective.whiten(residuals, weights)
     for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
-        residual, weight, common = (
-            each.cpu() for each in (objective.residual(k, point), *weights[k])
-        )
+        residual, weight, common = (each.cpu() for each in (residuals[k], *weights[k]))
         rendered = forward.jacobian(point, modes)
         first = point.unknowns.where("modes").start
         rows = joint.rows(k)[: len(rendered)]
@@ -117,10 +122,7 @@ def linearise(
             rendered.flatten(1), weight.flatten(), whitened[k].cpu().flatten()
         )
         if exact and modes:
-            slopes = forward.slopes(point, weights[k].weight * whitened[k])
-            for name, slope in slopes.items():
-                places = point.unknowns.where(name)
-                pulled[places] = slope[: len(pulled[places])]
+            _put_slopes(pulled, forward, point, weights[k].weight * whitened[k])
         if len(state.points) == 1:
             curvature, gradient = product, pulled
             continue
@@ -135,3 +137,48 @@ def linearise(
         curvature -= _accumulate(rows, ones, ones)[0]
     gradient = gradient + curvature @ current
     return NormalEquations(state, kappa, robust, curvature, gradient, current, tuple(frames))
+
+
+def curve(
+    objective: Objective, equations: NormalEquations, weights: Sequence[Weights], step: Tensor
+) -> Tensor:
+    """Product of the curvature with a step, by derivatives of the model itself.
+
+    The curvature of the equations is that of a coarse copy, whose derivatives are those of another
+    point. Where the effects of several unknowns cancel, it may be wrong by an order of magnitude.
+
+    Parameters
+    ----------
+    objective : Objective
+    equations : NormalEquations
+    weights : sequence of Weights
+        Of the equations.
+    step : Tensor, (unknowns,)
+
+    Returns
+    -------
+    Tensor, (unknowns,)
+    """
+    state = equations.state
+    moved = state.vector.clone()
+    moved[: len(step)] += _DIFFERENCE * step
+    images = [
+        (ahead.total - point.total) / _DIFFERENCE
+        for ahead, point in zip(objective.at(state.joint, moved).points, state.points, strict=True)
+    ]
+    total = torch.zeros_like(step)
+    whitened = objective.whiten(images, weights)
+    for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
+        frame = equations.frames[k]
+        pixels = weights[k].weight * whitened[k]
+        on_rows = (frame.jacobian.flatten(1) @ pixels.cpu().flatten().float()).double()
+        _put_slopes(on_rows, forward, point, pixels)
+        total += frame.onto_unknowns(on_rows, len(step))
+    return total
+
+
+def _put_slopes(on_rows: Tensor, forward: Forward, point: Point, pixels: Tensor) -> None:
+    """Replace derivatives by the optical parameters and the wavefront by accurate ones."""
+    for name, slope in forward.slopes(point, pixels).items():
+        places = point.unknowns.where(name)
+        on_rows[places] = slope[: len(on_rows[places])]

@@ -146,33 +146,37 @@ class Objective:
         problem = self.forwards[frame].problem
         return torch.where(problem.valid, problem.data - point.total, 0.0)
 
+    def residuals(self, state: State) -> list[Tensor]:
+        """Data minus model of all frames."""
+        return [self.residual(k, point) for k, point in enumerate(state.points)]
+
     def chi2(self, state: State, weights: Sequence[Weights]) -> float:
         """Chi-squared of all frames, with the pattern that they share marginalised."""
-        residuals = [self.residual(k, point) for k, point in enumerate(state.points)]
+        residuals = self.residuals(state)
         total = sum(
             float(((each.weight * residual) ** 2).sum())
             for each, residual in zip(weights, residuals, strict=True)
         )
         return total - float((self._summed(residuals, weights) ** 2).sum())
 
-    def whitened_residuals(self, state: State, weights: Sequence[Weights]) -> list[Tensor]:
-        """Minus half the derivative of chi-squared by the rendered pixels, over the weights.
+    def whiten(self, images: Sequence[Tensor], weights: Sequence[Weights]) -> list[Tensor]:
+        """Images of all frames over their errors, with the pattern that they share marginalised.
 
-        For frames without a common pattern these are the residuals over their errors.
+        Those of the residuals, times the weights, are minus half the derivative of chi-squared by
+        the rendered pixels.
         """
-        residuals = [self.residual(k, point) for k, point in enumerate(state.points)]
-        summed = self._summed(residuals, weights)
+        summed = self._summed(images, weights)
         return [
-            each.weight * (residual - each.common * summed)
-            for each, residual in zip(weights, residuals, strict=True)
+            each.weight * (image - each.common * summed)
+            for each, image in zip(weights, images, strict=True)
         ]
 
-    def _summed(self, residuals: Sequence[Tensor], weights: Sequence[Weights]) -> Tensor:
-        """What the residuals say of the pattern that the frames share; 0 if there is none."""
-        total = torch.zeros_like(residuals[0])
+    def _summed(self, images: Sequence[Tensor], weights: Sequence[Weights]) -> Tensor:
+        """What the images say of the pattern that the frames share; 0 if there is none."""
+        total = torch.zeros_like(images[0])
         if self.shares_pattern:
-            for each, residual in zip(weights, residuals, strict=True):
-                total += each.weight**2 * each.common * residual
+            for each, image in zip(weights, images, strict=True):
+                total += each.weight**2 * each.common * image
         return total
 
     def chi2_per_pixel(self, state: State) -> float:

@@ -77,8 +77,9 @@ class GaussNewton:
     relinearise : float
         Relative error of derivatives (radians of phase, rms over the pupil) beyond which the
         response to the wavefront is recomputed, see `pyklip_diffrender.linear.responses.Responses`.
-        With more than 0.05, a step that fails, gains less than expected or is the last is repeated
-        with derivatives from within 0.025 and the gradient of the model itself.
+        With more than 0.05, a step that fails, gains less than expected or is the last is followed
+        by steps with derivatives of the model itself, see
+        `pyklip_diffrender.refinement.accurate_step`.
     robust : float
         Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain
         least squares.
