@@ -105,10 +105,12 @@ def conjugate_gradients(
     direction = precondition(remaining)
     power, total = float(remaining @ direction), 0.0
     for _ in range(_ITERATIONS):
+        # The decrease if the preconditioner were right; it understates the curvature, if anything.
+        if power <= enough:
+            break
         pulled = product(direction)
         curvature = float(direction @ pulled)
-        # Rounding errors near the minimum.
-        if min(power, curvature) <= 0:
+        if curvature <= 0:  # By rounding errors.
             break
         x += power / curvature * direction
         remaining -= power / curvature * pulled
