@@ -79,7 +79,7 @@ class GaussNewton:
         response to the wavefront is recomputed, see `pyklip_diffrender.linear.responses.Responses`.
         With more than 0.05, a step that fails, gains less than expected or is the last is followed
         by steps with derivatives of the model itself, see
-        `pyklip_diffrender.refinement.accurate_step`.
+        ``pyklip_diffrender.refinement.accurate_step``.
     robust : float
         Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain
         least squares.
