@@ -12,7 +12,7 @@ from numpydoc.xref import DEFAULT_LINKS
 
 import pyklip_diffrender
 from pyklip_diffrender import cli, errors
-from pyklip_diffrender.parameters import FLUX_AND_BACKGROUND, OPTICAL_PARAMETERS
+from pyklip_diffrender.parameters import LEVELS, OPTICAL_PARAMETERS
 
 project = "pyklip_diffrender"
 author = "pyklip_diffrender developers"
@@ -107,7 +107,7 @@ def _write_tables(app):
     folder.mkdir(exist_ok=True)
     with open(folder / "parameters.csv", "w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
-        for each in (*OPTICAL_PARAMETERS, *FLUX_AND_BACKGROUND):
+        for each in (*OPTICAL_PARAMETERS, *LEVELS):
             size = f"{each.name} ({each.size})" if each.size > 1 else each.name
             rows.writerow(
                 [size, each.unit, f"{each.start:g}", f"{each.lower:g} to {each.upper:g}",

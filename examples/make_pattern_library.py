@@ -18,9 +18,9 @@ from pyklip_diffrender.refinement.learning import (
     MeasuredPattern,
     combine_patterns,
     measure_patterns,
-    pattern_pedestal,
 )
 from pyklip_diffrender.refinement.library import write_patterns
+from pyklip_diffrender.refinement.pedestal import pattern_pedestal
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +64,8 @@ def main() -> None:
             others = [fit for other, fit in first.items() if other != star]
             known = measure_patterns(others, pedestal)
             second.append(fit_of(star, name, files, options.opd, known))
+        pedestal = pattern_pedestal(second)
+        log.info("%s: pedestal %.3g", name, pedestal)
         library += measure_patterns(second, pedestal)
         write_patterns(library, options.output)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import inf
 
-__all__ = ["FLUX_AND_BACKGROUND", "OPTICAL_PARAMETERS", "Parameter", "parameter"]
+__all__ = ["LEVELS", "OPTICAL_PARAMETERS", "Parameter", "parameter"]
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ OPTICAL_PARAMETERS = (
 )  # fmt: skip
 """Free parameters of the optics of a coronagraph, besides the OPD."""
 
-FLUX_AND_BACKGROUND = (
+LEVELS = (
     Parameter(
         "flux", "", 1, 1.0, 1.0, 0.0, inf, inf,
         "light of the star collected by the pupil, in the unit of the image",
@@ -84,6 +84,11 @@ FLUX_AND_BACKGROUND = (
     Parameter(
         "background", "", 1, 0.0, 0.0, -inf, inf, inf,
         "uniform background per pixel, in units of the image",
+    ),
+    Parameter(
+        "pedestal", "", 1, 0.0, 0.0, -inf, inf, inf,
+        "light per pixel that the pattern of the model's error multiplies besides the star, in "
+        "units of the image",
     ),
 )  # fmt: skip
 """Free parameters of an observation, besides those of the optics."""
@@ -97,7 +102,7 @@ def parameter(name: str) -> Parameter:
     KeyError
         If the table has no such name.
     """
-    entries = {p.name: p for p in (*OPTICAL_PARAMETERS, *FLUX_AND_BACKGROUND)}
+    entries = {p.name: p for p in (*OPTICAL_PARAMETERS, *LEVELS)}
     if name not in entries:
         raise KeyError(f"{name!r} is not a parameter; expected one of {', '.join(entries)}")
     return entries[name]

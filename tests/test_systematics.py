@@ -17,7 +17,10 @@ from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, Systematics
-from pyklip_diffrender.refinement.learning import learn_systematics, pattern_pedestal
+from pyklip_diffrender.refinement.learning import (
+    learn_systematics,
+)
+from pyklip_diffrender.refinement.pedestal import pattern_pedestal
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.scene.objects import Planet
@@ -270,37 +273,60 @@ def test_the_pattern_multiplies_the_pedestal(tmp_path: Path) -> None:
     measured = Systematics.read(measured.write(tmp_path / "systematics.fits"))
     assert measured.pedestal == pedestal
     frames, settings = rolls(pedestal), GaussNewton(basis=BASIS, response_npix=NPIX)
-    fits = [
+    exact, none, low = (
         dr.refine(model(), frames, before(), settings=settings, systematics=each)
-        for each in (measured, replace(measured, pedestal=0.0))
-    ]
-    assert fits[0].reduced_chi2 == pytest.approx(1.0, abs=0.1)
-    assert fits[1].reduced_chi2 > 2
+        for each in (
+            measured,
+            replace(measured, pedestal=0.0),
+            replace(measured, pedestal=0.6 * pedestal),
+        )
+    )
+    assert exact.reduced_chi2 == pytest.approx(1.0, abs=0.1)
+    assert none.reduced_chi2 > 2
+    # A fit has a pedestal of its own in every frame.
+    assert low.reduced_chi2 == pytest.approx(exact.reduced_chi2, abs=0.02)
+    for frame in low.frames:
+        error = frame.errors["pedestal"][0]
+        assert error < 0.05 * pedestal
+        assert abs(frame.values["pedestal"][0] - pedestal) < 4 * error
+    again = dr.Refinement.read(low.write(tmp_path / "fit.fits"))
+    assert again.frames[1].values["pedestal"] == low.frames[1].values["pedestal"]
+
+
+def fit_of(
+    star: np.ndarray, error: np.ndarray, pedestal: float, seed: int, stated: float = 0.05
+) -> SimpleNamespace:
+    """Two frames of a star with a pattern on star and pedestal, and noise of 0.05."""
+    rng = np.random.default_rng(seed)
+    frames = []
+    for _ in range(2):
+        data = star + error * (star + pedestal) + 0.05 * rng.normal(size=star.shape)
+        observation = Observation.from_arrays(
+            data, np.full(data.shape, stated), pixelscale=0.063, first_pixel=(600, 1600)
+        )
+        frames.append(
+            SimpleNamespace(
+                observation=replace(observation, name=f"star {seed}"),
+                star=star,
+                gain=np.ones(star.shape),
+                companion_image=np.zeros(star.shape),
+                values={"background": np.zeros(1), "pedestal": np.zeros(1)},
+            )
+        )
+    return SimpleNamespace(frames=tuple(frames), status=Status.CONVERGED)
+
+
+def halo(size: int = 100) -> np.ndarray:
+    y, x = np.indices((size, size)) - (size - 1) / 2
+    return 30.0 / (1 + (np.hypot(x, y) / 8) ** 3)
 
 
 def test_the_pedestal_makes_the_pattern_equally_strong_everywhere() -> None:
     """Two frames of a bright star with a pattern of 3 % on star and pedestal."""
-    size, pedestal, noise = 100, 1.5, 0.05
-    rng = np.random.default_rng(9)
-    y, x = np.indices((size, size)) - (size - 1) / 2
-    star = 30.0 / (1 + (np.hypot(x, y) / 8) ** 3)
-    error = 0.03 * rng.normal(size=(size, size))
-    frames = []
-    for _ in range(2):
-        data = star + error * (star + pedestal) + noise * rng.normal(size=(size, size))
-        observation = Observation.from_arrays(
-            data, np.full(data.shape, noise), pixelscale=0.063, first_pixel=(600, 1600)
-        )
-        frames.append(
-            SimpleNamespace(
-                observation=observation,
-                star=star,
-                gain=np.ones((size, size)),
-                companion_image=np.zeros((size, size)),
-                values={"background": np.zeros(1)},
-            )
-        )
-    fit = SimpleNamespace(frames=tuple(frames), systematics=None, status=Status.CONVERGED)
+    size, pedestal, noise, star = 100, 1.5, 0.05, halo()
+    error = 0.03 * np.random.default_rng(9).normal(size=(size, size))
+    fit = fit_of(star, error, pedestal, 10)
+    frames = fit.frames
     assert pattern_pedestal([fit]) == pytest.approx(pedestal, rel=0.15)
     known = learn_systematics([fit])
     assert known.pedestal == pattern_pedestal([fit])
@@ -312,6 +338,31 @@ def test_the_pedestal_makes_the_pattern_equally_strong_everywhere() -> None:
     elsewhere = replace(frames[1].observation, first_pixel=None)
     lost = SimpleNamespace(**{**vars(frames[1]), "observation": elsewhere})
     assert pattern_pedestal([SimpleNamespace(**{**vars(fit), "frames": (frames[0], lost)})]) == 0
+
+
+def test_stars_of_different_brightness_tell_the_pedestal_wherever_the_pattern_is_weak() -> None:
+    """The pattern is half as strong near the star, as where the wavefront has taken a part."""
+    star = halo()
+    error = 0.03 * np.random.default_rng(3).normal(size=star.shape)
+    error[star > 5] /= 2
+    fits = [fit_of(star, error, 1.5, 11), fit_of(star / 3, error, 1.5, 12)]
+    assert pattern_pedestal(fits[:1]) > 2.5
+    assert pattern_pedestal(fits) == pytest.approx(1.5, rel=0.1)
+    # Stars of the same brightness do not.
+    equal = [fits[0], fit_of(star, error, 1.5, 13)]
+    assert pattern_pedestal(equal) > 2.5
+
+
+def test_a_pattern_is_not_shrunk_by_errors_that_are_too_large() -> None:
+    star = halo()
+    error = 0.03 * np.random.default_rng(4).normal(size=star.shape)
+    far = star < 1
+    for stated in (0.05, 0.08):
+        fits = [fit_of(star, error, 1.5, 20, stated), fit_of(star / 3, error, 1.5, 21, stated)]
+        pattern = learn_systematics(fits).pattern
+        # The slope of the truth against the pattern is 1 if it is shrunk as it should be.
+        slope = (error * pattern)[far].sum() / (pattern**2)[far].sum()
+        assert slope == pytest.approx(1.0, abs=0.05)
 
 
 def test_the_recipe_does_not_take_a_pattern() -> None:

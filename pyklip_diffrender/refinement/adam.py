@@ -52,7 +52,11 @@ def adam(problem: Problem, settings: Adam, *, seed: int, progress: bool) -> Refi
         star = flux * problem.model(best, **values).double() + background
     noise = ((problem.data - star) / problem.sigma)[problem.valid]
     fitted = {name: value.detach().cpu().numpy() for name, value in values.items()}
-    fitted |= {"flux": np.array([flux]), "background": np.array([background])}
+    fitted |= {
+        "flux": np.array([flux]),
+        "background": np.array([background]),
+        "pedestal": np.zeros(1),
+    }
     frame = FrameFit(
         model=problem.model,
         observation=problem.observation,

@@ -54,6 +54,11 @@ class Point:
     star: Tensor
     total: Tensor
 
+    @property
+    def multiplied(self) -> Tensor:
+        """Light that the pattern of the model's error multiplies, (ny, nx)."""
+        return self.light + self.unknowns.level("pedestal", self.vector)
+
 
 class Forward:
     """Renders points, and linearises about them.
@@ -101,7 +106,8 @@ class Forward:
         with torch.no_grad():
             fields = self.model.fields(opd, **values)
             image = self.model.image_of(fields, values).double()
-        light = flux * self.problem.gain * image + self.problem.fixed_pattern
+        gain = self.problem.gain
+        light = flux * gain * image + unknowns.level("pedestal", vector) * (gain - 1)
         star = light + unknowns.level("background", vector)
         total = star
         if unknowns.shows_companions and len(unknowns.companions):
@@ -155,6 +161,8 @@ class Forward:
             rows[unknowns.where("flux")] = (gain * point.image).float().cpu()
         if "background" in unknowns.linear:
             rows[unknowns.where("background")] = 1.0
+        if "pedestal" in unknowns.linear:
+            rows[unknowns.where("pedestal")] = (gain - 1).float().cpu()
         companions = unknowns.where("companions")
         if not unknowns.shows_companions:
             rows[companions] = 0.0

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.parameters import FLUX_AND_BACKGROUND, parameter
+from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.scene.objects import Planet
 
 __all__ = ["COMPANION_PRIOR", "FrameLayout"]
 
-_LINEAR = tuple(p.name for p in FLUX_AND_BACKGROUND)
+_LINEAR = tuple(p.name for p in LEVELS)
 
 COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 """Prior standard deviations of a companion's contrast, x and y (arcsec) about its start."""
@@ -22,7 +22,7 @@ COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 
 @dataclass
 class FrameLayout:
-    """Layout of the vector: optical parameters, flux, background, companions, amplitude, wavefront.
+    """Layout of the vector: optical parameters, levels, companions, amplitude, wavefront.
 
     Units are those of the parameter table; a companion is (contrast, x, y) with x, y in arcsec
     from the star, image orientation; modes are in nm.
@@ -30,10 +30,10 @@ class FrameLayout:
     Attributes
     ----------
     names : tuple of str
-        Free optical parameters, flux and background.
+        Free optical parameters and levels: flux, background and pedestal.
     start : dict of str to Tensor
         Values of all optical parameters that are not at their defaults, free or not, and of
-        flux and background.
+        the levels.
     modes : int
         Wavefront modes.
     amplitude_modes : int
@@ -64,7 +64,7 @@ class FrameLayout:
 
     @property
     def linear(self) -> tuple[str, ...]:
-        """Which of flux and background are free, in this order."""
+        """Levels that are free, in the order of the parameter table."""
         return tuple(name for name in _LINEAR if name in self.names)
 
     @property
@@ -101,7 +101,7 @@ class FrameLayout:
         return values
 
     def level(self, name: str, vector: Tensor) -> float:
-        """Flux or background."""
+        """Flux, background or pedestal."""
         value = vector[self.where(name)] if name in self.linear else self.start[name]
         return float(value[0])
 

@@ -48,6 +48,9 @@ _FINAL = 0.01
 """Error of derivatives above which the linear model of such a fit gets new ones. With 0.05, limits
 were up to 10 % too shallow near the occulter."""
 
+_PEDESTAL = 0.5
+"""Relative prior deviation of the pedestal of a known pattern."""
+
 _PARTS = (1.0, 0.4, 0.16, 0.064)
 """Parts of an accurate step that are tried until one lowers the penalised chi-squared."""
 
@@ -144,16 +147,21 @@ class Solver:
             self._frame_layout(problem, forward, problem.observation.roll_from(origin))
             for problem, forward in zip(problems, self.objective.forwards, strict=True)
         )
-        return JointLayout(frames, self.settings.own if len(frames) > 1 else (), self.drift)
+        own = (*self.settings.own, "pedestal") if len(frames) > 1 else ()
+        return JointLayout(frames, own, self.drift)
 
     def _frame_layout(self, problem: Problem, forward: Forward, roll: float) -> FrameLayout:
-        free = self.settings.free
+        free, deviations = self.settings.free, dict(self.settings.deviations)
         start = problem.optical_start(tuple(n for n in free if n in problem.model.parameters))
+        if problem.has_free_pedestal:
+            free = (*free, "pedestal")
+            deviations["pedestal"] = _PEDESTAL * problem.pedestal
         zero = torch.zeros(1, dtype=torch.float64)
+        levels = {"flux": zero, "background": zero, "pedestal": zero + problem.pedestal}
         # The unknowns and their algebra stay on the CPU, wherever the model renders.
         layout = FrameLayout(
             free,
-            {**{n: v.cpu() for n, v in start.items()}, "flux": zero, "background": zero},
+            {**{n: v.cpu() for n, v in start.items()}, **levels},
             len(self.basis),
             len(self.amplitude_deviation),
             list(self.settings.companions),
@@ -163,14 +171,13 @@ class Solver:
         image = forward.at(layout, layout.initial()).image
         # With photon-noise weights the faint pixels would dominate this first estimate.
         flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
-        deviations = dict(self.settings.deviations)
         is_known = "flux" in deviations
         if is_known and "flux" not in problem.start:
             raise IncompatibleSetupError(
                 "deviations has 'flux', but start does not: how bright is the star? Give "
                 "start={'flux': ...} in the unit of the frames"
             )
-        unknown = tuple(name for name in layout.linear if not (is_known and name == "flux"))
+        unknown = tuple(n for n in self.settings.free if not (is_known and n == "flux"))
         flux, level = problem.flux_and_background(problem.gain * image, flat, unknown)
         if is_known:
             deviations["flux"] *= flux

@@ -8,10 +8,15 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement.frame_fit import FrameFit
+from pyklip_diffrender.refinement.pedestal import (
+    light_and_residual,
+    median_variance,
+    pattern_pedestal,
+    rings_about,
+)
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.systematics import Systematics
 
@@ -20,23 +25,12 @@ __all__ = [
     "combine_patterns",
     "learn_systematics",
     "measure_patterns",
-    "pattern_pedestal",
 ]
 
 Image = NDArray[np.float64]
 
-_RING = 4.0
-"""Width in pixels of the rings in which scatters are estimated."""
-
-_FIRST_RING = 2
-"""First ring from which the pedestal is estimated: closer to the star, residuals are
-also those of the wavefront."""
-
 _FEW = 50
 """Number of pixels below which a ring is not used for that."""
-
-_RING_TO_RING = 0.2
-"""Relative error of a ring's mean product, because the pattern is not the same in all of them."""
 
 _OUTLIER = 4.0
 """Standard deviations from the median of the frames beyond which a pixel of a frame is left out:
@@ -82,12 +76,12 @@ def learn_systematics(
 ) -> Systematics:
     """Learn the pattern that the star model misses from fits of other stars.
 
-    In every frame the residual is divided by the sum of the star and a pedestal, with which the
-    pattern is as strong far from the star as it is near it, see `pattern_pedestal`. The ratios are
-    averaged with inverse variances, which are those of the data's noise and of the scatter between
-    frames beyond that noise; a zero-mean Gaussian prior, as wide as the ratios scatter over the
-    pixels of a ring, shrinks pixels that were not measured well. The error of the pattern for
-    another frame is that of this average and the scatter between frames.
+    In every frame the residual is divided by the sum of the star and a pedestal, the same in all of
+    them, see ``refinement.pedestal.pattern_pedestal``. The ratios are averaged with inverse
+    variances, which are those of the data's noise and of the scatter between frames beyond that
+    noise; a zero-mean Gaussian prior, as wide as the ratios scatter over the pixels of a ring,
+    shrinks pixels that were not measured well. The error of the pattern for another frame is that
+    of this average and the scatter between frames.
 
     Parameters
     ----------
@@ -141,63 +135,7 @@ def measure_patterns(
     usable = [fit for fit in several if fit.status.usable]
     if pedestal is None:
         pedestal = pattern_pedestal(usable)
-    return [_measured(frame, fit, pedestal) for fit in usable for frame in fit.frames]
-
-
-def pattern_pedestal(fits: Sequence[Refinement]) -> float:
-    """Estimate the pedestal with which one pattern holds near the star and far from it.
-
-    Frames have a fixed pattern that does not become fainter with the distance from the star. The
-    product of the residuals of two frames of the same pixels, averaged over a ring, is
-    m^2 (s_1 + B) (s_2 + B) for a pattern of rms m, stars s and a pedestal B. A least-squares fit to
-    all rings gives m and B.
-
-    Returns
-    -------
-    float
-        In the unit of the frames; 0 where no two frames of a fit show the same pixels.
-    """
-    rings = [ring for fit in fits for ring in _products(fit)]
-    if not rings:
-        return 0.0
-    product, first, second, error = np.array(rings).T
-
-    def misfit(pedestal: float) -> float:
-        shape = (first + pedestal) * (second + pedestal)
-        strength = (shape * product / error**2).sum() / ((shape / error) ** 2).sum()
-        return float((((product - strength * shape) / error) ** 2).sum())
-
-    brightest = float(np.sqrt((first * second).max()))
-    return float(minimize_scalar(misfit, bounds=(0.0, brightest), method="bounded").x)
-
-
-def _products(fit: Refinement) -> list[tuple[float, float, float, float]]:
-    """Mean product of the residuals of two frames, mean stars, and error, for every ring."""
-    rings = []
-    for a, b in combinations(fit.frames, 2):
-        pixel = a.observation.first_pixel
-        if pixel is None or pixel != b.observation.first_pixel:
-            continue
-        (light, left, noise, valid), (light_b, left_b, noise_b, valid_b) = (
-            _light_and_residual(frame, fit) for frame in (a, b)
-        )
-        x, y = a.observation.center[0]
-        ring = _rings(light.shape, (float(x), float(y)))
-        for k in range(_FIRST_RING, ring.max() + 1):
-            inside = (ring == k) & valid & valid_b
-            products = (left * left_b)[inside]
-            if len(products) < _FEW:
-                continue
-            # Clipped, because companions and outliers are no part of the pattern.
-            variances = [_median_variance(each[inside]) for each in (left, left_b)]
-            limit = _OUTLIER * np.sqrt(np.prod(variances))
-            mean = float(np.clip(products, -limit, limit).mean())
-            scatter = float(np.sqrt((noise**2).mean() * (noise_b**2).mean() / len(products)))
-            rings.append(
-                (mean, float(light[inside].mean()), float(light_b[inside].mean()),
-                 float(np.hypot(scatter, _RING_TO_RING * mean)))
-            )  # fmt: skip
-    return rings
+    return [_measured(frame, pedestal) for fit in usable for frame in fit.frames]
 
 
 def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = None) -> Systematics:
@@ -220,8 +158,9 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
             f"systematics: got patterns of {sorted(map(str, filters))}, expected one filter"
         )
     values, variances, center, first_pixel = _on_common_pixels(patterns)
-    ring = _rings(values[0].shape, center)
+    ring = rings_about(values[0].shape, center)
     stars = [pattern.star for pattern in patterns]
+    variances = variances * _noise_ratio(values, variances, ring)
     scatter = _scatter_between_frames(values, variances, stars, ring)
     variances = np.where(_outliers(values, variances + scatter**2), np.inf, variances)
     width = _prior_width(values, variances, ring)
@@ -248,31 +187,13 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
     )
 
 
-def _median_variance(values: Image) -> float:
-    """Variance about 0 from the median square, which companions and outliers hardly change."""
-    # 0.4549 is the median square of a unit normal variable.
-    return float(np.median(values**2)) / 0.4549
-
-
 def _text(value: object) -> str | None:
     return value if isinstance(value, str) else None
 
 
-def _light_and_residual(
-    frame: FrameFit, fit: Refinement
-) -> tuple[Image, Image, Image, NDArray[np.bool_]]:
-    """Star without the known pattern, what the frame shows beyond it, noise, and valid pixels."""
-    combined = frame.observation.combined()
-    background = float(frame.values["background"][0])
-    known = 0.0 if fit.systematics is None else fit.systematics.pedestal
-    light = (frame.star - background + known) / frame.gain - known
-    left = combined.data[0] - background - frame.companion_image - light
-    return light, left, combined.error[0], combined.valid[0]
-
-
-def _measured(frame: FrameFit, fit: Refinement, pedestal: float) -> MeasuredPattern:
+def _measured(frame: FrameFit, pedestal: float) -> MeasuredPattern:
     observation = frame.observation
-    light, left, error, valid = _light_and_residual(frame, fit)
+    light, left, error, valid = light_and_residual(frame)
     multiplied = light + pedestal
     usable = valid & (multiplied > 0)
     safe = np.where(usable, multiplied, 1.0)
@@ -332,13 +253,6 @@ def _on_common_pixels(
     )
 
 
-def _rings(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[np.int64]:
-    """Number of the ring about the star that every pixel lies in."""
-    y, x = np.indices(shape)
-    distance = np.hypot(x - center[0], y - center[1])
-    return (distance / _RING).astype(np.int64)
-
-
 def _by_ring(variance: NDArray[np.float64], ring: NDArray[np.int64]) -> Image:
     """Standard deviations by ring, from variances that may be negative, on the pixels."""
     return np.sqrt(np.maximum(variance, 0.0))[ring]
@@ -364,11 +278,32 @@ def _scatter_between_frames(
             inside = known & (ring == k)
             if not inside.any():
                 continue
-            spread = _median_variance(difference[inside])
+            spread = median_variance(difference[inside])
             share = 1 / np.median(noise[inside]) ** 2
             excess[k] += share * (spread - np.median(noise[inside]))
             weight[k] += share
     return _by_ring(np.divide(excess, 2 * weight, where=weight > 0, out=np.zeros(count)), ring)
+
+
+def _noise_ratio(values: Image, variances: Image, ring: NDArray[np.int64]) -> Image:
+    """Ratio of the noise's variance in a ring to the stated one, if below 1, on the pixels.
+
+    The noise of resampled frames is correlated between neighbours. Errors are such that they hold
+    for an image of several pixels, and the noise of a single pixel is less.
+    """
+    count = ring.max() + 1
+    total, weight = np.zeros(count), np.zeros(count)
+    for a, b in combinations(range(len(values)), 2):
+        noise = variances[a] + variances[b]
+        for k in range(count):
+            inside = np.isfinite(noise) & (ring == k)
+            if inside.sum() < _FEW:
+                continue
+            deviations = (values[a] - values[b])[inside] / np.sqrt(noise[inside])
+            total[k] += inside.sum() * median_variance(deviations)
+            weight[k] += inside.sum()
+    ratio = np.divide(total, weight, where=weight > 0, out=np.ones(count))
+    return np.minimum(ratio, 1.0)[ring]
 
 
 def _outliers(values: Image, variances: Image) -> NDArray[np.bool_]:

@@ -100,11 +100,7 @@ class Objective:
     def noise(self, frame: int, point: Point) -> Tensor:
         """Noise of the data and, in quadrature, the error of the systematics."""
         problem = self.forwards[frame].problem
-        return torch.hypot(problem.sigma, problem.gain_error * self._multiplied(frame, point))
-
-    def _multiplied(self, frame: int, point: Point) -> Tensor:
-        """Light that the pattern of the model's error multiplies."""
-        return point.light + self.forwards[frame].problem.pedestal
+        return torch.hypot(problem.sigma, problem.gain_error * point.multiplied)
 
     def whitened(self, frame: int, point: Point, sigma: Tensor) -> Tensor:
         """Residual over `sigma`; 0 where masked."""
@@ -136,7 +132,7 @@ class Objective:
         if not self.shares_pattern:
             return weights
         error = self.forwards[0].problem.gain_error
-        light = [self._multiplied(k, point) for k, point in enumerate(state.points)]
+        light = [point.multiplied for point in state.points]
         seen = sum((each.weight * s) ** 2 for each, s in zip(weights, light, strict=True))
         scale = error / torch.sqrt(1 + error**2 * seen)
         return [Weights(each.weight, s * scale) for each, s in zip(weights, light, strict=True)]

@@ -35,7 +35,8 @@ from other stars: the pattern's own error is counted apart."""
 
 _TYPICAL_PATTERN = 0.03
 _TYPICAL_PEDESTAL = 1.9
-"""Rms of the pattern, and pedestal in MJy/sr, of the library's stars in both of its filters."""
+"""Rms of the pattern, and pedestal in MJy/sr, that describe the residuals of the library's stars at
+all separations."""
 
 
 @dataclass(frozen=True, eq=False)

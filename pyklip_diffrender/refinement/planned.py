@@ -176,14 +176,15 @@ def _on_full_model(
     with torch.no_grad():
         image = model(torch.from_numpy(np.ascontiguousarray(opd)).to(model.device), **values)
     image = problem.gain * image.double()
+    fixed = float(frame.values["pedestal"][0]) * (problem.gain - 1)
     # Flux and background for which the full model is closest to the fitted star.
     before = torch.from_numpy(frame.star).to(model.device)
     linear = tuple(name for name in ("flux", "background") if name in free)
     start = {name: float(frame.values[name][0]) for name in ("flux", "background")}
     flux, level = problem.flux_and_background(
-        image, problem.sigma, linear, data=before - problem.fixed_pattern, start=start
+        image, problem.sigma, linear, data=before - fixed, start=start
     )
-    star = flux * image + level + problem.fixed_pattern
+    star = flux * image + level + fixed
     difference = ((star - before) / problem.sigma)[problem.valid].abs()
     error = ModelError(float(difference.square().mean().sqrt()), float(difference.max()))
     fitted = {**frame.values, "flux": np.array([flux]), "background": np.array([level])}

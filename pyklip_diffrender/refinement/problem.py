@@ -107,9 +107,9 @@ class Problem:
         return replace(self, model=model, full_model=self.full_model or self.model)
 
     @property
-    def fixed_pattern(self) -> Tensor:
-        """What the pattern adds to the frame where there is no star, (ny, nx)."""
-        return (self.gain - 1) * self.pedestal
+    def has_free_pedestal(self) -> bool:
+        """Whether the known pattern tells how much light it multiplies besides the star."""
+        return self.pedestal > 0 and bool((self.gain != 1).any())
 
     @property
     def pixels(self) -> int:

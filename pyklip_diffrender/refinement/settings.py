@@ -31,7 +31,8 @@ class GaussNewton:
     Attributes
     ----------
     free : tuple of str
-        Free parameters besides the wavefront, from the parameter table.
+        Free parameters besides the wavefront, from the parameter table. The pedestal of a known
+        pattern is always free, see `pyklip_diffrender.Systematics`.
     own : tuple of str
         Free parameters of which every frame has a value of its own when several frames are fitted
         together; the others are shared.
