@@ -310,7 +310,8 @@ def fit_of(
                 star=star,
                 gain=np.ones(star.shape),
                 companion_image=np.zeros(star.shape),
-                values={"background": np.zeros(1), "pedestal": np.zeros(1)},
+                values={"background": np.zeros(1)},
+                pedestal=0.0,
             )
         )
     return SimpleNamespace(frames=tuple(frames), status=Status.CONVERGED)

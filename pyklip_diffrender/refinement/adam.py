@@ -52,11 +52,7 @@ def adam(problem: Problem, settings: Adam, *, seed: int, progress: bool) -> Refi
         star = flux * problem.model(best, **values).double() + background
     noise = ((problem.data - star) / problem.sigma)[problem.valid]
     fitted = {name: value.detach().cpu().numpy() for name, value in values.items()}
-    fitted |= {
-        "flux": np.array([flux]),
-        "background": np.array([background]),
-        "pedestal": np.zeros(1),
-    }
+    fitted |= {"flux": np.array([flux]), "background": np.array([background])}
     frame = FrameFit(
         model=problem.model,
         observation=problem.observation,

@@ -263,7 +263,8 @@ class Annealing:
             layout = point.unknowns
             own = deviation[state.joint.rows(k)[: len(linear.frames[k].rows)]]
             values = {n: v.cpu().numpy() for n, v in layout.values(point.vector).items()}
-            for name in ("flux", "background", "pedestal"):
+            levels = ("flux", "background", *(["pedestal"] if problem.systematics else []))
+            for name in levels:
                 values[name] = layout.start[name].numpy()
             errors = {name: math.nan * value for name, value in values.items()}
             for name in layout.ordered:

@@ -71,6 +71,11 @@ class FrameFit:
         return float(self.values["flux"][0])
 
     @property
+    def pedestal(self) -> float:
+        """Light per pixel that the pattern multiplies besides the star; 0 without a pattern."""
+        return float(self.values["pedestal"][0]) if "pedestal" in self.values else 0.0
+
+    @property
     def residual(self) -> Image:
         """Data minus star, (frames, ny, nx); NaN where the data are masked.
 

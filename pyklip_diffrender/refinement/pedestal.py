@@ -158,7 +158,7 @@ def light_and_residual(frame: FrameFit) -> tuple[Image, Image, Image, NDArray[np
     """Star without the known pattern, what the frame shows beyond it, noise, and valid pixels."""
     combined = frame.observation.combined()
     background = float(frame.values["background"][0])
-    known = float(frame.values["pedestal"][0])
+    known = frame.pedestal
     light = (frame.star - background + known) / frame.gain - known
     left = combined.data[0] - background - frame.companion_image - light
     return light, left, combined.error[0], combined.valid[0]

@@ -176,7 +176,7 @@ def _on_full_model(
     with torch.no_grad():
         image = model(torch.from_numpy(np.ascontiguousarray(opd)).to(model.device), **values)
     image = problem.gain * image.double()
-    fixed = float(frame.values["pedestal"][0]) * (problem.gain - 1)
+    fixed = frame.pedestal * (problem.gain - 1)
     # Flux and background for which the full model is closest to the fitted star.
     before = torch.from_numpy(frame.star).to(model.device)
     linear = tuple(name for name in ("flux", "background") if name in free)
