@@ -53,9 +53,13 @@ def known_systematics(
     --------
     >>> import numpy as np
     >>> import pyklip_diffrender as dr
-    >>> frame = dr.Observation.from_arrays(np.ones((8, 8)), np.ones((8, 8)), pixelscale=0.06)
+    >>> ones = np.ones((80, 80))
+    >>> header = {"DETECTOR": "NRCALONG", "CORONMSK": "MASKA335R"}
+    >>> frame = dr.Observation.from_arrays(
+    ...     ones, ones, pixelscale=0.063, filter="F444W", header=header
+    ... )
     >>> print(dr.known_systematics(frame))
-    None
+    <Systematics 'HIP17695, G-7-34': F444W, 80 x 80 pixels>
     """
     library = _library_for(observation)
     pedestal = library[0].pedestal if library else None
