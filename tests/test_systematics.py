@@ -20,7 +20,7 @@ from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, 
 from pyklip_diffrender.refinement.learning import (
     learn_systematics,
 )
-from pyklip_diffrender.refinement.pedestal import pattern_pedestal
+from pyklip_diffrender.refinement.pedestal import light_and_residual, pattern_pedestal
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.scene.objects import Planet
@@ -289,6 +289,11 @@ def test_the_pattern_multiplies_the_pedestal(tmp_path: Path) -> None:
         error = frame.errors["pedestal"][0]
         assert error < 0.05 * pedestal
         assert abs(frame.values["pedestal"][0] - pedestal) < 4 * error
+    # What a pattern is learned from is what the frames show beyond the star without any pattern.
+    for frame in exact.frames:
+        light, left, _, valid = light_and_residual(frame)
+        expected = (0.5 * pattern() * (light + pedestal))[valid]
+        assert (left[valid] @ expected) / (expected @ expected) == pytest.approx(1.0, abs=0.05)
     again = dr.Refinement.read(low.write(tmp_path / "fit.fits"))
     assert again.frames[1].values["pedestal"] == low.frames[1].values["pedestal"]
 
