@@ -304,6 +304,32 @@ def test_a_prior_that_is_held_too_narrow_is_noticed(world: World) -> None:
         assert fit.status.calibrated == (factor == 1.0)
 
 
+@pytest.mark.parametrize("amplitude", [0.0, 0.3])
+def test_a_prior_that_is_held_too_narrow_is_widened(world: World, amplitude: float) -> None:
+    observation = world.observed(world.expected(), 4)
+    likely = world.fitted(4)
+    narrow = {name: scale / 3 for name, scale in likely.scales.items()}
+    held = WavefrontPrior(
+        narrow, fit_scales=False, amplitude_cycles=4.0, amplitude_scale=amplitude
+    )  # fmt: skip
+    fit = world.refined(observation, prior=held, widen_prior=True)
+    assert fit.status is Status.CONVERGED
+    ratios = {name: fit.scales[name] / narrow[name] for name in narrow}
+    # Towards the most probable scales, of every group that is too narrow.
+    assert 1.5 < ratios["texture"] < 3.5
+    assert all(1.0 <= ratio < 3.5 for ratio in ratios.values())
+    assert isinstance(fit.settings, GaussNewton)
+    assert fit.settings.prior.scales == pytest.approx(fit.scales)
+    # The pupil's amplitude is as it was assumed to be.
+    assert amplitude <= fit.settings.prior.amplitude_scale <= 1.2 * amplitude
+    assert len(fit.history) > len(likely.history) / 2
+    # A prior that holds is left alone.
+    kept = world.refined(
+        observation, prior=WavefrontPrior(likely.scales, fit_scales=False), widen_prior=True
+    )
+    assert kept.scales == pytest.approx(likely.scales)
+
+
 def test_a_planet_does_not_make_the_noise_larger(world: World) -> None:
     planet = FAINT
     quiet, fit = world.fitted(5), world.fitted(5, planet)

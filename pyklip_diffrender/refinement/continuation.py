@@ -1,4 +1,4 @@
-"""Fits that continue earlier ones, with more modes or with other settings."""
+"""Fits that continue earlier ones, with more modes, a wider prior or other settings."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import torch
+
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton
+from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.wavefront.bases import default_basis
-from pyklip_diffrender.wavefront.priors import WavefrontPrior
+from pyklip_diffrender.wavefront.priors import WavefrontPrior, scale_ratios
 
-__all__ = ["continue_from", "fit_with_growing_basis"]
+__all__ = ["continue_from", "fit_in_stages"]
 
 _log = logging.getLogger(__name__)
 
@@ -26,6 +29,9 @@ _STRUCTURE = 1.15
 _FOREIGN = 5.0
 """Reduced chi-squared above which more modes would not help, because the frame shows more than the
 star."""
+
+_WIDENINGS = 3
+"""Largest number of times that a prior is widened. Two were enough for all real frames."""
 
 
 def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Unknown, float]]:
@@ -71,7 +77,7 @@ def _with_scales(prior: WavefrontPrior, scales: Mapping[str, float], label: str)
     )
 
 
-def fit_with_growing_basis(
+def fit_in_stages(
     problems: Sequence[Problem],
     settings: GaussNewton,
     warm: Mapping[Unknown, float] | None = None,
@@ -81,7 +87,8 @@ def fit_with_growing_basis(
 ) -> Refinement:
     """Refine with the basis of the settings, or the first default basis that explains the data.
 
-    The `cycles` of the result's settings begin with those of the last basis.
+    With `GaussNewton.widen_prior`, a prior that turns out to be too narrow is widened. The `cycles`
+    of the result's settings begin with those of the last basis.
 
     Parameters
     ----------
@@ -95,6 +102,57 @@ def fit_with_growing_basis(
     progress : bool
         Show progress bars.
     """
+    fit = _fit_with_growing_basis(problems, settings, warm, seed=seed, progress=progress)
+    for _ in range(_WIDENINGS if settings.widen_prior else 0):
+        if fit.status is not Status.PRIOR_MISMATCH:
+            break
+        prior = _widened_prior(fit)
+        _log.info("the wavefront is improbable under its prior, which is widened: %s", prior)
+        adapted, warm = continue_from(fit, prior=prior)
+        assert fit.basis is not None
+        again = Annealing(problems, adapted, fit.basis, warm, progress).run(seed)
+        if not again.status.usable:
+            break
+        fit = _with_history_of(fit, again)
+    return fit
+
+
+def _widened_prior(fit: Refinement) -> WavefrontPrior:
+    """The prior of a fit with scales that are nearer to those of the highest evidence."""
+    assert fit.linear is not None
+    assert fit.basis is not None
+    assert isinstance(fit.settings, GaussNewton)
+    linear, prior = fit.linear, fit.settings.prior
+    fitted = linear.vector + linear.step - linear.mean
+    variance = linear.covariance.diagonal()
+
+    def ratios(name: str, group: torch.Tensor) -> list[float]:
+        mine = torch.tensor([unknown.name == name for unknown in linear.unknowns])
+        found = scale_ratios(fitted[mine], variance[mine], linear.deviation[mine], group)
+        return found.clamp(min=1.0).tolist()
+
+    wider = zip(fit.basis.groups, ratios("modes", fit.basis.group_index), strict=True)
+    scales = prior.scales | {name: prior.scales[name] * ratio for name, ratio in wider}
+    count = prior.amplitude_modes(fit.basis)
+    amplitude = ratios("amplitude", torch.zeros(count, dtype=torch.int64))[0] if count else 1.0
+    return replace(prior, scales=scales, amplitude_scale=prior.amplitude_scale * amplitude)
+
+
+def _with_history_of(earlier: Refinement, fit: Refinement) -> Refinement:
+    """A fit with the time and the iterations of the one that it continues."""
+    return replace(
+        fit, seconds=fit.seconds + earlier.seconds, history=earlier.history + fit.history
+    )
+
+
+def _fit_with_growing_basis(
+    problems: Sequence[Problem],
+    settings: GaussNewton,
+    warm: Mapping[Unknown, float] | None,
+    *,
+    seed: int,
+    progress: bool,
+) -> Refinement:
     pupil = problems[0].model.entrance
     if settings.basis is not None or not settings.cycles:
         basis = settings.basis or default_basis(pupil=pupil)
@@ -112,11 +170,7 @@ def fit_with_growing_basis(
         earlier = fit
         fit = Annealing(problems, adapted, default_basis(cycles, pupil), warm, progress).run(seed)
         if earlier is not None:
-            fit = replace(
-                fit,
-                seconds=fit.seconds + earlier.seconds,
-                history=earlier.history + fit.history,
-            )
+            fit = _with_history_of(earlier, fit)
         if not fit.status.usable or not _STRUCTURE < fit.reduced_chi2 < _FOREIGN:
             break
     assert fit is not None

@@ -19,7 +19,7 @@ from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import ModelError, Plan, plan
 from pyklip_diffrender.refinement.breakdown import breakdown_explained
-from pyklip_diffrender.refinement.continuation import continue_from, fit_with_growing_basis
+from pyklip_diffrender.refinement.continuation import continue_from, fit_in_stages
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
@@ -129,13 +129,13 @@ def fit_problems(
         Show progress bars.
     """
     if planned is None:
-        return fit_with_growing_basis(problems, settings, warm, seed=seed, progress=progress)
+        return fit_in_stages(problems, settings, warm, seed=seed, progress=progress)
     began = time.perf_counter()
     cheap = [problem.with_model(planned.model) for problem in problems]
     adapted = settings
     if settings.basis is None and warm is None:
         adapted = replace(settings, cycles=planned.refine_options["cycles"])
-    fit = fit_with_growing_basis(cheap, adapted, warm, seed=seed, progress=progress)
+    fit = fit_in_stages(cheap, adapted, warm, seed=seed, progress=progress)
     finished = [_on_full_model(fit, k, each, settings.free) for k, each in enumerate(problems)]
     error = ModelError.largest(change for _, change in finished)
     if planned.allows(error) or not fit.status.usable:
@@ -152,7 +152,7 @@ def fit_problems(
         error.worst,
         planned.budget,
     )
-    exact = fit_with_growing_basis(problems, *continue_from(fit), seed=seed, progress=progress)
+    exact = fit_in_stages(problems, *continue_from(fit), seed=seed, progress=progress)
     return replace(
         exact,
         plan=replace(planned, final_error=error, abandoned=True),

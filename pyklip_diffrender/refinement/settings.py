@@ -51,6 +51,9 @@ class GaussNewton:
         the star's known brightness, as the light that the pupil collects in the unit of the frames.
     prior : WavefrontPrior
         Prior on the wavefront's change from the starting map.
+    widen_prior : bool
+        Where a prior with fixed scales makes the fitted wavefront improbable (status
+        `PRIOR_MISMATCH`), move its scales towards the highest evidence and continue the fit.
     drift : WavefrontPrior, optional
         Prior on the difference between the wavefronts of several frames. By default all frames
         share one wavefront.
@@ -113,6 +116,7 @@ class GaussNewton:
     basis: Basis | None = None
     deviations: Mapping[str, float] = field(default_factory=dict)
     prior: WavefrontPrior = field(default_factory=WavefrontPrior)
+    widen_prior: bool = False
     drift: WavefrontPrior | None = None
     drift_cycles: float = 8.0
     companions: tuple[Planet, ...] = ()
@@ -202,10 +206,10 @@ class GaussNewton:
     def nircam(cls, **changes: Any) -> GaussNewton:
         """Return the settings for real NIRCam frames, for which the model is not exact.
 
-        The prior's scales are fixed, the pupil's amplitude is free as well, the alignment has a
-        prior about its values in flight, the fit allows for a model error of at least a percent of
-        the star, outliers are down-weighted, and one companion that is significant after the
-        alignment fit gets its own parameters.
+        The prior's scales are fixed unless they are much too small, the pupil's amplitude is free
+        as well, the alignment has a prior about its values in flight, the fit allows for a model
+        error of at least a percent of the star, outliers are down-weighted, and one companion that
+        is significant after the alignment fit gets its own parameters.
 
         A wider prior (20 and 18 nm, alignment free) fits real frames a little more closely, but
         by way of a star far off the mask and of a wavefront that outshines the measured one: the
@@ -237,6 +241,7 @@ class GaussNewton:
                 amplitude_scale=2.0,
                 amplitude_slope=0.5,
             ),
+            widen_prior=True,
             # To 2.5 arcsec; finer modes cost time and leave chi-squared within 3 %.
             cycles=(18.0,),
             deviations={"star_offset": 0.003, "lyot_shift": 0.004, "lyot_rotation": 0.2},
