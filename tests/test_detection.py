@@ -315,14 +315,14 @@ def test_a_prior_that_is_held_too_narrow_is_widened(world: World, amplitude: flo
     fit = world.refined(observation, prior=held, widen_prior=True)
     assert fit.status is Status.CONVERGED
     ratios = {name: fit.scales[name] / narrow[name] for name in narrow}
-    # Towards the most probable scales, of every group that is too narrow.
-    assert 1.5 < ratios["texture"] < 3.5
-    assert all(1.0 <= ratio < 3.5 for ratio in ratios.values())
+    # Towards the most probable scale. Too few modes of the texture are determined.
+    assert 2 < ratios["segment"] < 3.5
+    assert 1.0 <= ratios["texture"] < 3.5
     assert isinstance(fit.settings, GaussNewton)
     assert fit.settings.prior.scales == pytest.approx(fit.scales)
     # The pupil's amplitude is as it was assumed to be.
     assert amplitude <= fit.settings.prior.amplitude_scale <= 1.2 * amplitude
-    assert len(fit.history) > len(likely.history) / 2
+    assert sum(record["iteration"] == 0 for record in fit.history) > 1
     # A prior that holds is left alone.
     kept = world.refined(
         observation, prior=WavefrontPrior(likely.scales, fit_scales=False), widen_prior=True
