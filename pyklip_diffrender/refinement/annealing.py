@@ -69,6 +69,9 @@ _ROUNDS = 6
 """Largest number of searches for bad pixels at one state, because a bright one hides fainter ones
 beside it, and of states that are searched."""
 
+_IMPROBABLE = 1.5
+"""Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
+
 _STEPS = 4
 """Largest number of steps after each. With robust weights, bad pixels have done little harm."""
 
@@ -256,7 +259,9 @@ class Annealing:
         update = self.solver.posterior(state)
         assert update.variance is not None
         deviation = update.variance.sqrt()
-        if status is Status.CONVERGED and not self.solver.prior_holds(update):
+        ratios = self.solver.prior_ratios(update)
+        of_wavefront = [ratios[name] for name in self.solver.scale_names if ratios]
+        if status is Status.CONVERGED and max(of_wavefront, default=0.0) >= _IMPROBABLE:
             status = Status.PRIOR_MISMATCH
         frames = []
         for k, (problem, point) in enumerate(zip(self.problems, state.points, strict=True)):
@@ -298,6 +303,7 @@ class Annealing:
             companions=first.unknowns.sources(first.vector).numpy(),
             companion_errors=deviation[rows].reshape(-1, 3).numpy(),
             scales=dict(zip(self.solver.scale_names, self.solver.scales.tolist(), strict=True)),
+            prior_ratios=ratios,
             effective_parameters=update.effective,
             log_evidence=update.log_evidence,
             linear=linear,

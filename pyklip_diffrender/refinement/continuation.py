@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import torch
-
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.annealing import Annealing
@@ -17,7 +15,7 @@ from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.wavefront.bases import default_basis
-from pyklip_diffrender.wavefront.priors import WavefrontPrior, scale_ratios
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = ["continue_from", "fit_in_stages"]
 
@@ -31,7 +29,7 @@ _FOREIGN = 5.0
 star."""
 
 _WIDENINGS = 3
-"""Largest number of times that a prior is widened. Two were enough for all real frames."""
+"""Largest number of times that a prior is widened. Two rolls of HIP 17695 in F444W needed two."""
 
 
 def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Unknown, float]]:
@@ -106,9 +104,8 @@ def fit_in_stages(
     for _ in range(_WIDENINGS if settings.widen_prior else 0):
         if fit.status is not Status.PRIOR_MISMATCH:
             break
-        prior = _widened_prior(fit)
-        _log.info("the wavefront is improbable under its prior, which is widened: %s", prior)
-        adapted, warm = continue_from(fit, prior=prior)
+        _log.info("the wavefront is improbable under its prior, by factors %s", fit.prior_ratios)
+        adapted, warm = _with_wider_prior(fit)
         assert fit.basis is not None
         again = Annealing(problems, adapted, fit.basis, warm, progress).run(seed)
         if not again.status.usable:
@@ -117,25 +114,14 @@ def fit_in_stages(
     return fit
 
 
-def _widened_prior(fit: Refinement) -> WavefrontPrior:
-    """The prior of a fit with scales that are nearer to those of the highest evidence."""
-    assert fit.linear is not None
-    assert fit.basis is not None
-    assert isinstance(fit.settings, GaussNewton)
-    linear, prior = fit.linear, fit.settings.prior
-    fitted = linear.vector + linear.step - linear.mean
-    variance = linear.covariance.diagonal()
-
-    def ratios(name: str, group: torch.Tensor) -> list[float]:
-        mine = torch.tensor([unknown.name == name for unknown in linear.unknowns])
-        found = scale_ratios(fitted[mine], variance[mine], linear.deviation[mine], group)
-        return found.clamp(min=1.0).tolist()
-
-    wider = zip(fit.basis.groups, ratios("modes", fit.basis.group_index), strict=True)
-    scales = prior.scales | {name: prior.scales[name] * ratio for name, ratio in wider}
-    count = prior.amplitude_modes(fit.basis)
-    amplitude = ratios("amplitude", torch.zeros(count, dtype=torch.int64))[0] if count else 1.0
-    return replace(prior, scales=scales, amplitude_scale=prior.amplitude_scale * amplitude)
+def _with_wider_prior(fit: Refinement) -> tuple[GaussNewton, dict[Unknown, float]]:
+    """Settings and starting values of a fit, with scales raised towards the highest evidence."""
+    wider = {name: max(ratio, 1.0) for name, ratio in fit.prior_ratios.items()}
+    scales = {name: scale * wider[name] for name, scale in fit.scales.items()}
+    settings, warm = continue_from(replace(fit, scales=scales))
+    amplitude = settings.prior.amplitude_scale * wider["amplitude"]
+    prior = replace(settings.prior, amplitude_scale=amplitude)
+    return replace(settings, prior=prior), warm
 
 
 def _with_history_of(earlier: Refinement, fit: Refinement) -> Refinement:

@@ -57,9 +57,6 @@ _PARTS = (1.0, 0.4, 0.16, 0.064)
 _POOR = 0.5
 """Ratio of the actual to the expected gain of a step below which its derivatives are poor."""
 
-_IMPROBABLE = 1.5
-"""Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
-
 
 def count_modes_below(basis: Basis, cycles: float) -> int:
     """Count the leading modes of a basis whose spatial frequency is at most `cycles`."""
@@ -349,15 +346,17 @@ class Solver:
         assert self._equations.state is state
         return self._solve(state.joint, self._equations, errors=True)
 
-    def prior_holds(self, update: EvidenceUpdate) -> bool:
-        """Whether the fitted modes are probable under a prior with fixed scales."""
+    def prior_ratios(self, update: EvidenceUpdate) -> dict[str, float]:
+        """Size of the fitted modes relative to their prior, by group; empty with fitted scales."""
         settings = self.settings
         if settings.prior.fit_scales or not settings.wavefront or update.variance is None:
-            return True
-        deviation = self.scales[self.group] * self.shape
+            return {}
+        amplitude = self.amplitude_deviation
+        deviation = torch.cat([amplitude, self.scales[self.group] * self.shape])
+        group = torch.cat([torch.zeros(len(amplitude), dtype=torch.int64), self.group + 1])
         last = slice(-len(deviation), None)
-        ratios = scale_ratios(update.step[last], update.variance[last], deviation, self.group)
-        return bool((ratios < _IMPROBABLE).all())
+        ratios = scale_ratios(update.step[last], update.variance[last], deviation, group)
+        return dict(zip(["amplitude", *self.scale_names], ratios.tolist(), strict=True))
 
     def _solve(
         self,

@@ -54,6 +54,7 @@ _PLAIN = (
     "model_error",
     *_ARRAYS,
     "scales",
+    "prior_ratios",
     "effective_parameters",
     "log_evidence",
     "history",
@@ -87,6 +88,10 @@ class Refinement:
         frame, arcsec.
     scales : dict of str to float
         Final scales of the prior, nm.
+    prior_ratios : dict of str to float
+        Size of the fitted modes and of the amplitude relative to a prior with fixed scales, by
+        group: about 1 where the prior holds; 1 where too few modes are determined. Empty if the
+        scales were fitted.
     effective_parameters : float
         Number of wavefront parameters that the data determine; NaN if unknown.
     log_evidence : float
@@ -131,6 +136,7 @@ class Refinement:
     companions: Image = field(default_factory=lambda: np.zeros((0, 3)))
     companion_errors: Image = field(default_factory=lambda: np.zeros((0, 3)))
     scales: dict[str, float] = field(default_factory=dict)
+    prior_ratios: dict[str, float] = field(default_factory=dict)
     effective_parameters: float = math.nan
     log_evidence: float = math.nan
     linear: LinearModel | None = None
@@ -318,6 +324,7 @@ class Refinement:
                 for k, about in enumerate(facts["frames"])
             )
             label, sha256, date = facts["initial"]
+            facts = {"prior_ratios": {}} | facts  # Files of version 0.1 do not have it.
             plain: dict[str, Any] = {key: facts[key] for key in _PLAIN}
             plain |= {key: np.reshape(facts[key], (-1, 3)).astype(float) for key in _ARRAYS}
             return cls(

@@ -53,7 +53,8 @@ class GaussNewton:
         Prior on the wavefront's change from the starting map.
     widen_prior : bool
         Where a prior with fixed scales makes the fitted wavefront improbable (status
-        `PRIOR_MISMATCH`), move its scales towards the highest evidence and continue the fit.
+        `PRIOR_MISMATCH`), raise its scales, and those of `drift`, towards the highest evidence and
+        continue the fit, up to three times.
     drift : WavefrontPrior, optional
         Prior on the difference between the wavefronts of several frames. By default all frames
         share one wavefront.
