@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +14,13 @@ from torch import Tensor
 import pyklip_diffrender as dr
 from pyklip_diffrender.refinement import GaussNewton, Systematics
 from pyklip_diffrender.refinement import accurate_step as accurate
-from pyklip_diffrender.refinement.accurate_step import accurate_step, conjugate_gradients
+from pyklip_diffrender.refinement.accurate_step import (
+    ModelDerivatives,
+    accurate_step,
+    conjugate_gradients,
+)
 from pyklip_diffrender.refinement.gauss_newton import Solver
-from pyklip_diffrender.refinement.normal_equations import curve, linearise
+from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.wavefront.bases import default_basis
@@ -64,7 +70,10 @@ def solver_of(frames: int, **changes: object) -> tuple[Solver, State]:
 
 def gradient(solver: Solver, state: State, *, exact: bool) -> Tensor:
     """Minus half the derivative of chi-squared."""
-    equations = linearise(solver.objective, state, 0.01, len(BASIS), 4.0, exact=exact)
+    if exact:
+        weights = solver.objective.weights(state, 0.01, 4.0)
+        return ModelDerivatives(solver.objective, state, weights).gradient()
+    equations = linearise(solver.objective, state, 0.01, len(BASIS), 4.0)
     return equations.gradient - equations.curvature @ equations.current
 
 
@@ -130,7 +139,7 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> No
     for each in (solver, same):
         weights = each.objective.weights(state, 0.01, 4.0)
         equations = linearise(each.objective, state, 0.01, len(BASIS), 4.0)
-        curved.append(unit * curve(each.objective, equations, weights, step))
+        curved.append(unit * ModelDerivatives(each.objective, state, weights).product(step))
         products.append(unit * (equations.curvature @ step))
     expected = products[1]
     assert (curved[0] - expected).norm() < 2e-3 * expected.norm()
@@ -149,15 +158,25 @@ def test_an_accurate_step_ends_where_that_of_the_model_does(
     weights = solver.objective.weights(state, 0.01, 4.0)
     deviation = solver.prior_deviation(state.joint)
     coarse, fine = (
-        linearise(each.objective, state, 0.01, len(BASIS), 4.0, exact=True)
-        for each in (solver, same)
+        linearise(each.objective, state, 0.01, len(BASIS), 4.0) for each in (solver, same)
     )
-    step = accurate_step(solver.objective, coarse, weights, deviation, enough=0.0)
+    derivatives = ModelDerivatives(solver.objective, state, weights)
+    # Equations of the starting values precondition as well.
+    start = solver.objective.at(state.joint, state.joint.initial())
+    earlier = linearise(solver.objective, start, 0.1, len(BASIS), 4.0)
     direct = same._solve(state.joint, fine).step - fine.current
+    steps = []
+    for equations in (coarse, earlier):
+        step, settled = accurate_step(
+            derivatives, equations.curvature, fine.current, deviation, enough=0.0
+        )
+        assert not settled  # Every iteration lowers it, if only by a little.
+        steps.append(step)
     too_coarse = solver._solve(state.joint, coarse).step - coarse.current
     errors = same._solve(state.joint, fine, errors=True).variance.sqrt()
     assert (direct / errors).norm() > 10
-    assert ((step - direct) / errors).norm() < 0.2
+    for step in steps:
+        assert ((step - direct) / errors).norm() < 0.2
     assert ((too_coarse - direct) / errors).norm() > 10
 
 
@@ -179,10 +198,11 @@ def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(
         return vectors @ (powers * (vectors.T @ x))
 
     gradient = torch.from_numpy(rng.normal(size=20))
-    x = conjugate_gradients(
+    x, settled = conjugate_gradients(
         product, lambda x: vectors @ ((vectors.T @ x) / stated), gradient, enough=1e-8
     )
     expected = vectors @ ((vectors.T @ gradient) / powers)
+    assert settled
     torch.testing.assert_close(x, expected, rtol=1e-6, atol=1e-8)
     assert len(products) <= wrong + 2
 
@@ -193,7 +213,94 @@ def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner(
     matrix = torch.from_numpy(rng.normal(size=(30, 30)))
     matrix = matrix @ matrix.T
     gradient = torch.from_numpy(rng.normal(size=30))
-    x = conjugate_gradients(lambda x: matrix @ x, lambda x: 1e6 * x, gradient)
+    x, settled = conjugate_gradients(lambda x: matrix @ x, lambda x: 1e6 * x, gradient)
+    assert not settled
     assert float(x @ matrix @ x - 2 * gradient @ x) < 0
     zero = torch.zeros(30, dtype=torch.float64)
-    assert not conjugate_gradients(lambda x: matrix @ x, lambda x: x, zero).any()
+    x, settled = conjugate_gradients(lambda x: matrix @ x, lambda x: x, zero)
+    assert settled
+    assert not x.any()
+
+
+def count_linearisations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A list that grows with every set of normal equations; 1 for known Jacobians, else 0."""
+    calls: list[int] = []
+
+    def counted(*arguments: Any) -> NormalEquations:
+        calls.append(int(bool(arguments[5])))
+        return linearise(*arguments)
+
+    monkeypatch.setattr("pyklip_diffrender.refinement.gauss_newton.linearise", counted)
+    return calls
+
+
+def test_accurate_steps_keep_their_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until conjugate gradients need more iterations than there are, and until a companion."""
+    calls = count_linearisations(monkeypatch)
+    solver, state = solver_of(1, relinearise=0.1, robust=4.0)
+    # Of the model itself: one iteration is enough with equations of nearly the same state.
+    solver = of_the_model_itself(solver)
+    weights = solver.objective.weights(state, 0.01, 4.0)
+    before = solver._cost(state, weights)
+    after, _ = solver._accurate_step(state, 0.01, len(BASIS))
+    assert solver._cost(after, weights) < 0.9 * before
+    solver._accurate_step(after, 0.01, len(BASIS))
+    assert calls == [0]
+    solver._has_poor_equations = True
+    solver._accurate_step(after, 0.01, len(BASIS))
+    assert calls == [0, 0]
+    grown = solver.objective.at(
+        *after.joint.with_companions([dr.Planet(1e-4, 0.3, 20.0)], after.vector)
+    )
+    solver._accurate_step(grown, 0.01, len(BASIS))
+    assert calls == [0, 0, 0]
+
+
+def test_equations_that_lead_nowhere_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    solver, state = solver_of(1, relinearise=0.1, robust=4.0)
+    solver = of_the_model_itself(solver)
+    after, _ = solver._accurate_step(state, 0.01, len(BASIS))
+    calls = count_linearisations(monkeypatch)
+    right = accurate_step
+
+    def wrong(*arguments: Any, **options: Any) -> tuple[Tensor, bool]:
+        step, settled = right(*arguments, **options)
+        return (step if calls else -step), settled
+
+    monkeypatch.setattr("pyklip_diffrender.refinement.gauss_newton.accurate_step", wrong)
+    last, gain = solver._accurate_step(after, 0.01, len(BASIS))
+    assert calls == [0]
+    assert gain > 0
+    assert last is not after
+
+
+def test_other_weights_need_no_new_jacobian(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither for the errors of all pixels nor where a pixel is left out; the model is the same."""
+    calls = count_linearisations(monkeypatch)
+    models = []
+    for _ in range(2):
+        solver, state = solver_of(2, relinearise=0.1)
+        if not models:  # The second solver begins where the first one ends.
+            solver.linear_model(state, 0.01, len(BASIS), 4.0, final=False)
+        mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+        mask[7, 9] = True
+        if not models:
+            solver.linear_model(state, 0.0, len(BASIS), math.inf, final=False)
+        solver.leave_out([mask, ~mask & mask])
+        models.append(solver.linear_model(state, 0.0, len(BASIS), math.inf, final=False))
+    assert calls == [0, 1, 1, 0]
+    torch.testing.assert_close(models[0].curvature, models[1].curvature, rtol=1e-6, atol=0.0)
+    assert models[0].frames[0].weight[7, 9] == 0
+
+
+def test_derivatives_by_a_frame_become_those_by_all_unknowns() -> None:
+    """The adjoint of `of_frame`, with modes that drift between the frames."""
+    solver, state = solver_of(2, drift=WavefrontPrior(SCALES, fit_scales=False))
+    assert solver.drift > 0
+    rng = np.random.default_rng(10)
+    joint = torch.from_numpy(rng.normal(size=state.joint.size))
+    for k in range(2):
+        own = torch.from_numpy(rng.normal(size=len(state.points[k].vector)))
+        there = state.joint.of_frame(k, joint) @ own
+        back = joint @ state.joint.onto_unknowns(k, own)
+        assert float(there) == pytest.approx(float(back))

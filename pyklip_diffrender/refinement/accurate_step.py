@@ -2,7 +2,8 @@
 
 Normal equations of a coarse copy of the model are wrong where the effects of several unknowns
 cancel, and steps along such directions are too long. Products of the model's own curvature with a
-vector take as long as three images. The coarse copy's equations precondition them.
+vector take as long as three images. The coarse copy's equations precondition them, and may be those
+of an earlier step.
 """
 
 from __future__ import annotations
@@ -12,10 +13,9 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.refinement.normal_equations import NormalEquations, curve
-from pyklip_diffrender.refinement.objective import Objective, Weights
+from pyklip_diffrender.refinement.objective import Objective, State, Weights
 
-__all__ = ["accurate_step", "conjugate_gradients"]
+__all__ = ["ModelDerivatives", "accurate_step", "conjugate_gradients"]
 
 _ITERATIONS = 6
 _SUFFICIENT = 0.05
@@ -24,23 +24,78 @@ _SUFFICIENT = 0.05
 _ROUNDING = 1e-12
 """Relative error of the curvature's elements."""
 
+_DIFFERENCE = 0.01
+"""Part of a step between the images whose difference is a derivative. Their curvature matters less
+than the rounding errors of single precision."""
 
-def accurate_step(
-    objective: Objective,
-    equations: NormalEquations,
-    weights: Sequence[Weights],
-    deviation: Tensor,
-    enough: float,
-) -> Tensor:
-    """Compute the step to the minimum of the linearised penalised chi-squared.
+
+class ModelDerivatives:
+    """Gradient and curvature of chi-squared, by derivatives of the model itself.
 
     Parameters
     ----------
     objective : Objective
-    equations : NormalEquations
-        With the gradient of the model itself.
+    state : State
     weights : sequence of Weights
-        Of the equations.
+        Of all frames.
+    """
+
+    def __init__(self, objective: Objective, state: State, weights: Sequence[Weights]) -> None:
+        self._objective, self._state, self._weights = objective, state, weights
+        self._levels = [
+            forward.levels(point).double()
+            for forward, point in zip(objective.forwards, state.points, strict=True)
+        ]
+
+    def gradient(self) -> Tensor:
+        """Minus half the derivative of chi-squared, (unknowns,)."""
+        return self._pull(self._objective.residuals(self._state))
+
+    def product(self, step: Tensor) -> Tensor:
+        """Product of the curvature with a step, (unknowns,)."""
+        state = self._state
+        ahead = self._objective.at(state.joint, state.vector + _DIFFERENCE * step)
+        images = [
+            (after.total - before.total) / _DIFFERENCE
+            for after, before in zip(ahead.points, state.points, strict=True)
+        ]
+        return self._pull(images)
+
+    def _pull(self, images: Sequence[Tensor]) -> Tensor:
+        """Product of the whitened Jacobian with images of all frames, which it whitens as well."""
+        objective, joint = self._objective, self._state.joint
+        total = torch.zeros(joint.size, dtype=torch.float64)
+        whitened = objective.whiten(images, self._weights)
+        for k, (forward, point) in enumerate(
+            zip(objective.forwards, self._state.points, strict=True)
+        ):
+            pixels = self._weights[k].weight * whitened[k]
+            layout, levels = point.unknowns, self._levels[k]
+            of_frame = torch.zeros(len(point.vector), dtype=torch.float64)
+            last = layout.where("companions").stop
+            of_frame[last - len(levels) : last] = levels.flatten(1) @ pixels.cpu().flatten()
+            for name, slopes in forward.slopes(point, pixels).items():
+                of_frame[layout.where(name)] = slopes
+            total += joint.onto_unknowns(k, of_frame)
+        return total
+
+
+def accurate_step(
+    derivatives: ModelDerivatives,
+    curvature: Tensor,
+    offset: Tensor,
+    deviation: Tensor,
+    enough: float,
+) -> tuple[Tensor, bool]:
+    """Compute the step to the minimum of the linearised penalised chi-squared.
+
+    Parameters
+    ----------
+    derivatives : ModelDerivatives
+    curvature : Tensor, (some, some)
+        Approximate curvature by the leading unknowns, the only ones that the step changes.
+    offset : Tensor, (unknowns,)
+        Unknowns of the state minus the means of their priors.
     deviation : Tensor, (unknowns,)
         Prior standard deviations.
     enough : float
@@ -48,25 +103,30 @@ def accurate_step(
 
     Returns
     -------
-    Tensor, (unknowns,)
+    step : Tensor, (unknowns,)
+    settled : bool
+        Whether another iteration would hardly have lowered chi-squared.
     """
-    curvature, current = equations.curvature, equations.current
-    precision = deviation**-2
+    count = len(curvature)
+    precision = deviation[:count] ** -2
     # Unknowns differ by many powers of ten, so the system is solved in scaled units.
     unit = (curvature.diagonal() + precision).clamp(min=1e-300) ** -0.5
     system = (curvature * unit[:, None]).mul_(unit)
     system.diagonal().mul_(1 + _ROUNDING).add_(precision * unit**2)
     factor = torch.linalg.cholesky(system)
+    step = torch.zeros_like(offset)
 
     def product(scaled: Tensor) -> Tensor:
-        step = unit * scaled
-        return unit * (curve(objective, equations, weights, step) + precision * step)
+        step[:count] = unit * scaled
+        return unit * (derivatives.product(step)[:count] + precision * step[:count])
 
     def precondition(scaled: Tensor) -> Tensor:
         return torch.cholesky_solve(scaled[:, None], factor)[:, 0]
 
-    gradient = equations.gradient - curvature @ current - precision * current
-    return unit * conjugate_gradients(product, precondition, unit * gradient, enough)
+    gradient = derivatives.gradient()[:count] - precision * offset[:count]
+    scaled, settled = conjugate_gradients(product, precondition, unit * gradient, enough)
+    step[:count] = unit * scaled
+    return step, settled
 
 
 def conjugate_gradients(
@@ -74,8 +134,8 @@ def conjugate_gradients(
     precondition: Callable[[Tensor], Tensor],
     gradient: Tensor,
     enough: float = 0.0,
-) -> Tensor:
-    """Minimise x A x - 2 g x approximately, (n,).
+) -> tuple[Tensor, bool]:
+    """Minimise x A x - 2 g x approximately.
 
     Every iteration lowers it, however poor the preconditioner is; a few are sufficient where that
     is wrong in a few directions only. SciPy's `cg` ends by the size of the gradient, which says
@@ -92,13 +152,19 @@ def conjugate_gradients(
     enough : float
         Decrease below which that of one iteration is the last.
 
+    Returns
+    -------
+    x : Tensor, (n,)
+    settled : bool
+        Whether another iteration would hardly have lowered it.
+
     Examples
     --------
     >>> import torch
     >>> from pyklip_diffrender.refinement.accurate_step import conjugate_gradients
     >>> matrix = torch.tensor([[2.0, 1.0], [1.0, 3.0]])
     >>> conjugate_gradients(lambda x: matrix @ x, lambda x: x, torch.tensor([3.0, 4.0]))
-    tensor([1.0000, 1.0000])
+    (tensor([1.0000, 1.0000]), True)
     """
     x = torch.zeros_like(gradient)
     remaining = gradient.clone()
@@ -107,18 +173,18 @@ def conjugate_gradients(
     for _ in range(_ITERATIONS):
         # The decrease if the preconditioner were right; it understates the curvature, if anything.
         if power <= enough:
-            break
+            return x, True
         pulled = product(direction)
         curvature = float(direction @ pulled)
         if curvature <= 0:  # By rounding errors.
-            break
+            return x, True
         x += power / curvature * direction
         remaining -= power / curvature * pulled
         decrease = power**2 / curvature
         total += decrease
         if decrease < max(_SUFFICIENT * total, enough):
-            break
+            return x, True
         ahead = precondition(remaining)
         power, before = float(remaining @ ahead), power
         direction = ahead + power / before * direction
-    return x
+    return x, False

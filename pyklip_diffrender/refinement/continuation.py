@@ -1,4 +1,4 @@
-"""Fits that continue earlier ones, with more modes, a wider prior or other settings."""
+"""Fits that continue earlier ones, with more modes or other settings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton
-from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
@@ -27,9 +26,6 @@ _STRUCTURE = 1.15
 _FOREIGN = 5.0
 """Reduced chi-squared above which more modes would not help, because the frame shows more than the
 star."""
-
-_WIDENINGS = 3
-"""Largest number of times that a prior is widened. Two rolls of HIP 17695 in F444W needed two."""
 
 
 def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Unknown, float]]:
@@ -85,8 +81,7 @@ def fit_in_stages(
 ) -> Refinement:
     """Refine with the basis of the settings, or the first default basis that explains the data.
 
-    With `GaussNewton.widen_prior`, a prior that turns out to be too narrow is widened. The `cycles`
-    of the result's settings begin with those of the last basis.
+    The `cycles` of the result's settings begin with those of the last basis.
 
     Parameters
     ----------
@@ -100,45 +95,6 @@ def fit_in_stages(
     progress : bool
         Show progress bars.
     """
-    fit = _fit_with_growing_basis(problems, settings, warm, seed=seed, progress=progress)
-    for _ in range(_WIDENINGS if settings.widen_prior else 0):
-        if fit.status is not Status.PRIOR_MISMATCH:
-            break
-        _log.info("the wavefront is improbable under its prior, by factors %s", fit.prior_ratios)
-        adapted, warm = _with_wider_prior(fit)
-        assert fit.basis is not None
-        again = Annealing(problems, adapted, fit.basis, warm, progress).run(seed)
-        if not again.status.usable:
-            break
-        fit = _with_history_of(fit, again)
-    return fit
-
-
-def _with_wider_prior(fit: Refinement) -> tuple[GaussNewton, dict[Unknown, float]]:
-    """Settings and starting values of a fit, with scales raised towards the highest evidence."""
-    wider = {name: max(ratio, 1.0) for name, ratio in fit.prior_ratios.items()}
-    scales = {name: scale * wider[name] for name, scale in fit.scales.items()}
-    settings, warm = continue_from(replace(fit, scales=scales))
-    amplitude = settings.prior.amplitude_scale * wider["amplitude"]
-    prior = replace(settings.prior, amplitude_scale=amplitude)
-    return replace(settings, prior=prior), warm
-
-
-def _with_history_of(earlier: Refinement, fit: Refinement) -> Refinement:
-    """A fit with the time and the iterations of the one that it continues."""
-    return replace(
-        fit, seconds=fit.seconds + earlier.seconds, history=earlier.history + fit.history
-    )
-
-
-def _fit_with_growing_basis(
-    problems: Sequence[Problem],
-    settings: GaussNewton,
-    warm: Mapping[Unknown, float] | None,
-    *,
-    seed: int,
-    progress: bool,
-) -> Refinement:
     pupil = problems[0].model.entrance
     if settings.basis is not None or not settings.cycles:
         basis = settings.basis or default_basis(pupil=pupil)
@@ -156,7 +112,8 @@ def _fit_with_growing_basis(
         earlier = fit
         fit = Annealing(problems, adapted, default_basis(cycles, pupil), warm, progress).run(seed)
         if earlier is not None:
-            fit = _with_history_of(earlier, fit)
+            seconds, history = earlier.seconds + fit.seconds, earlier.history + fit.history
+            fit = replace(fit, seconds=seconds, history=history)
         if not fit.status.usable or not _STRUCTURE < fit.reduced_chi2 < _FOREIGN:
             break
     assert fit is not None

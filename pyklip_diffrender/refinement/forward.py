@@ -146,34 +146,20 @@ class Forward:
         Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront.
         """
         unknowns, vector = point.unknowns, point.vector
-        values, opd = unknowns.values(vector), self.coarse_opd(point)
+        values = unknowns.values(vector)
         flux, gain = unknowns.level("flux", vector), self.problem.gain
+        levels = self.levels(point)
         count = unknowns.where("companions").stop
         if modes:
             count = unknowns.where("modes").start + modes
         # One array, filled in place: it is the largest of the fit.
         rows = torch.empty(count, *point.image.shape, dtype=torch.float32)
         response = self.responses.near(point.opd, values) if modes else None
+        first = unknowns.where("companions").stop - len(levels)
+        rows[first : first + len(levels)] = levels
         if unknowns.optical:
             slopes = self.responses.parameters(point.opd, values, unknowns.optical, point.fields)
-            rows[: len(slopes)] = (flux * gain * slopes).cpu()
-        if "flux" in unknowns.linear:
-            rows[unknowns.where("flux")] = (gain * point.image).float().cpu()
-        if "background" in unknowns.linear:
-            rows[unknowns.where("background")] = 1.0
-        if "pedestal" in unknowns.linear:
-            rows[unknowns.where("pedestal")] = (gain - 1).float().cpu()
-        companions = unknowns.where("companions")
-        if not unknowns.shows_companions:
-            rows[companions] = 0.0
-        for k, source in enumerate(unknowns.sources(vector) if unknowns.shows_companions else ()):
-            source_values = self._towards(values, unknowns.turn @ source[1:])
-            first = companions.start + 3 * k
-            with torch.no_grad():
-                rows[first] = (flux * self.coarse(opd, **source_values)).cpu()
-            moved = self._position_slopes(opd, source_values)
-            turned = torch.tensordot(unknowns.turn.T, moved, dims=1)
-            rows[first + 1 : first + 3] = flux * source[0] * turned
+            rows[:first] = (flux * gain * slopes).cpu()
         if response is not None:
             amplitude = unknowns.where("amplitude")
             slopes = response.image(point.fields, values, unknowns.amplitude_modes, modes)
@@ -182,12 +168,39 @@ class Forward:
             rows[amplitude.stop :] = slopes[:modes].cpu()
         return rows
 
+    def levels(self, point: Point) -> Tensor:
+        """Derivative of `total` by levels and companions, (unknowns, ny, nx), float32, on the CPU.
+
+        Those by companions are of the coarse copy.
+        """
+        unknowns, vector = point.unknowns, point.vector
+        flux, gain = unknowns.level("flux", vector), self.problem.gain
+        by_level = {
+            "flux": gain * point.image,
+            "background": torch.ones_like(point.image),
+            "pedestal": gain - 1,
+        }
+        rows = [by_level[name].float().cpu() for name in unknowns.linear]
+        for source in unknowns.sources(vector):
+            if not unknowns.shows_companions:
+                rows += [torch.zeros(point.image.shape)] * 3
+                continue
+            opd = self.coarse_opd(point)
+            values = self._towards(unknowns.values(vector), unknowns.turn @ source[1:])
+            with torch.no_grad():
+                rows.append((flux * self.coarse(opd, **values)).float().cpu())
+            moved = self._position_slopes(opd, values)
+            turned = torch.tensordot(unknowns.turn.T, moved, dims=1)
+            rows += list((flux * source[0] * turned).float())
+        return torch.stack(rows) if rows else torch.zeros(0, *point.image.shape)
+
     def slopes(self, point: Point, pixels: Tensor) -> dict[str, Tensor]:
         """Derivatives of ``(pixels * total).sum()`` through the model itself.
 
         They take as long as two or three images, by reverse mode at one wavelength after the other.
         `jacobian` has those of a coarse copy at fewer wavelengths, with an error that exceeds a
-        gradient near its zero. The dependence of companions on the wavefront is neglected in both.
+        gradient near its zero. The dependence of companions on the wavefront is neglected in both,
+        and `levels` has the derivatives by the other unknowns.
 
         Parameters
         ----------
@@ -227,7 +240,7 @@ class Forward:
         result = {name: slope.double().cpu().flatten() for name, slope in by_name.items()}
         result["modes"] = self._by_modes(totals[0].real)
         if totals[0].is_complex():
-            result["amplitude"] = -self._by_modes(totals[0].imag)
+            result["amplitude"] = -self._by_modes(totals[0].imag)[: unknowns.amplitude_modes]
         return result
 
     def _by_modes(self, by_opd: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from torch import Tensor
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.linear.responses import Responses
-from pyklip_diffrender.refinement.accurate_step import accurate_step
+from pyklip_diffrender.refinement.accurate_step import ModelDerivatives, accurate_step
 from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.refinement.joint_layout import JointLayout
@@ -115,26 +116,33 @@ class Solver:
         self.objective = Objective(
             [Forward(problem, responses) for problem in problems], settings.robust
         )
-        own_prior = settings.drift if len(problems) > 1 else None
-        self.drift = count_modes_below(basis, settings.drift_cycles) if own_prior else 0
+        self.drift = 0
+        if settings.drift is not None and len(problems) > 1:
+            self.drift = count_modes_below(basis, settings.drift_cycles)
+        self.set_priors(settings)
+        self.damping = 0.0
+        self._has_accurate_steps = settings.relinearise > _ACCURATE
+        self._kappa, self._needs_accurate = math.nan, False
+        self._equations: NormalEquations | None = None
+        self._has_poor_equations = False
+
+    def set_priors(self, settings: GaussNewton) -> None:
+        """Take the priors of the wavefront from settings that differ in nothing else."""
+        self.settings, basis = settings, self.basis
         self.amplitude_deviation = settings.prior.amplitude_deviation(basis)
         self.shape = settings.prior.shape(basis)
         self.group = basis.group_index
         self.scale_names = list(basis.groups)
         scales = [settings.prior.scales[name] for name in basis.groups]
-        if own_prior is not None:
-            frames, groups = len(problems), len(basis.groups)
-            own_shape = own_prior.shape(basis)[: self.drift]
+        if settings.drift is not None and self.drift:
+            frames, groups = len(self.objective.forwards), len(basis.groups)
+            own_shape = settings.drift.shape(basis)[: self.drift]
             own_group = basis.group_index[: self.drift] + groups
             self.shape = torch.cat([self.shape, own_shape.repeat(frames)])
             self.group = torch.cat([self.group, own_group.repeat(frames)])
             self.scale_names += [f"{name} drift" for name in basis.groups]
-            scales += [own_prior.scales[name] for name in basis.groups]
+            scales += [settings.drift.scales[name] for name in basis.groups]
         self.scales = torch.tensor(scales, dtype=torch.float64)
-        self.damping = 0.0
-        self._has_accurate_steps = settings.relinearise > _ACCURATE
-        self._kappa, self._needs_accurate = math.nan, False
-        self._equations: NormalEquations | None = None
 
     def first_layout(self) -> JointLayout:
         """Layout of the unknowns, with starting values, before companions are added."""
@@ -259,33 +267,58 @@ class Solver:
     def _accurate_step(self, state: State, kappa: float, modes: int) -> tuple[State, float]:
         """Take a step, or a part of it, with derivatives of the model itself."""
         objective = self.objective
-        equations = self._linearise(state, kappa, modes, objective.robust, _ACCURATE, exact=True)
         weights = objective.weights(state, kappa, objective.robust)
-        deviation = self.prior_deviation(state.joint)[: len(equations.current)]
-        enough = self.settings.tolerance * objective.pixels / 2
-        step = accurate_step(objective, equations, weights, deviation, enough)
         before = self._cost(state, weights)
-        for part in _PARTS:
-            trial = self._moved(state, part * step)
-            after = self._cost(trial, weights)
-            if after < before:
-                return trial, (before - after) / objective.pixels
+        derivatives = ModelDerivatives(objective, state, weights)
+        offset = state.vector - state.joint.initial()
+        deviation = self.prior_deviation(state.joint)
+        enough = self.settings.tolerance * objective.pixels / 2
+        # Equations of an earlier state precondition nearly as well, and take longer than the step.
+        for is_new in (False, True):
+            equations = self._equations
+            if is_new or equations is None or not self._precondition(equations, state, modes):
+                robust = objective.robust
+                equations = self._linearise(state, kappa, modes, robust, _ACCURATE)
+            step, settled = accurate_step(
+                derivatives, equations.curvature, offset, deviation, enough
+            )
+            self._has_poor_equations = not settled
+            for part in _PARTS:
+                trial = self._moved(state, part * step)
+                after = self._cost(trial, weights)
+                if after < before:
+                    return trial, (before - after) / objective.pixels
+            if equations.state is state:
+                break
         return state, 0.0
 
+    def _precondition(self, equations: NormalEquations, state: State, modes: int) -> bool:
+        """Whether the last equations can precondition an accurate step from a state."""
+        return (
+            not self._has_poor_equations
+            and self._responses.farthest <= _ACCURATE
+            and equations.state.joint is state.joint
+            and len(equations.current) == state.joint.unknowns_with(modes)
+        )
+
     def _linearise(
-        self,
-        state: State,
-        kappa: float,
-        modes: int,
-        robust: float,
-        allowed: float,
-        *,
-        exact: bool = False,
+        self, state: State, kappa: float, modes: int, robust: float, allowed: float
     ) -> NormalEquations:
         """Linearise about a state, with derivatives whose error is at most `allowed`."""
-        self._equations = None  # The next ones are as large.
-        self._responses.relinearise, self._responses.farthest = allowed, 0.0
-        self._equations = linearise(self.objective, state, kappa, modes, robust, exact=exact)
+        jacobians: list[Tensor] = []
+        equations = self._equations
+        if (
+            equations is not None
+            and equations.state is state
+            and self._responses.farthest <= allowed
+            and len(equations.current) == state.joint.unknowns_with(modes)
+        ):
+            jacobians = [frame.jacobian for frame in equations.frames]
+        else:
+            self._responses.relinearise, self._responses.farthest = allowed, 0.0
+        equations = self._equations = None  # The next ones are as large.
+        self._equations = linearise(self.objective, state, kappa, modes, robust, jacobians)
+        self._has_poor_equations = False
         return self._equations
 
     def _moved(self, state: State, step: Tensor) -> State:
@@ -296,9 +329,11 @@ class Solver:
 
     def leave_out(self, pixels: Sequence[Tensor]) -> None:
         """Leave out pixels from now on; a mask, (ny, nx), for every frame."""
-        self._equations = None
         for forward, mask in zip(self.objective.forwards, pixels, strict=True):
             forward.problem.leave_out(mask)
+        if self._equations is not None:
+            # They no longer belong to any weights, but their Jacobians stay.
+            self._equations = replace(self._equations, kappa=math.nan)
 
     def linear_model(
         self, state: State, kappa: float, modes: int, robust: float, *, final: bool = True

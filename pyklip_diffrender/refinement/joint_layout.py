@@ -105,6 +105,14 @@ class JointLayout:
         values[first : first + self.drift] += vector[self.drift_rows(frame)]
         return values
 
+    def onto_unknowns(self, frame: int, vector: Tensor) -> Tensor:
+        """Return derivatives by the joint vector from those by a frame's; adjoint of `of_frame`."""
+        total = torch.zeros(self.size, dtype=vector.dtype)
+        total[self.rows(frame)] = vector
+        first = self.frames[frame].where("modes").start
+        total[self.drift_rows(frame)] = vector[first : first + self.drift]
+        return total
+
     def joined(self, vectors: Sequence[Tensor]) -> Tensor:
         """Return the joint vector; shared parameters are those of the first frame."""
         joint = torch.zeros(self.size, dtype=torch.float64)

@@ -11,10 +11,9 @@ from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
 from pyklip_diffrender.linear.frames import LinearFrame, summed_rows
-from pyklip_diffrender.refinement.forward import Forward, Point
-from pyklip_diffrender.refinement.objective import Objective, State, Weights
+from pyklip_diffrender.refinement.objective import Objective, State
 
-__all__ = ["NormalEquations", "curve", "linearise"]
+__all__ = ["NormalEquations", "linearise"]
 
 
 @dataclass(frozen=True)
@@ -45,10 +44,6 @@ class NormalEquations:
     current: Tensor
     frames: tuple[LinearFrame, ...]
 
-
-_DIFFERENCE = 0.01
-"""Part of a step between the images whose difference is a derivative. Their curvature matters less
-than the rounding errors of single precision."""
 
 _PIXELS = 1024
 """Number of pixels whose Jacobian is converted to double precision at a time."""
@@ -82,8 +77,7 @@ def linearise(
     kappa: float,
     modes: int,
     robust: float,
-    *,
-    exact: bool = False,
+    jacobians: Sequence[Tensor] = (),
 ) -> NormalEquations:
     """Linearise all frames about a state.
 
@@ -98,9 +92,8 @@ def linearise(
         between frames, 0 for the alignment only.
     robust : float
         Residual, in standard deviations, of half weight; inf for least squares.
-    exact : bool
-        Whether the gradient is that of the model itself and not of its coarse copy, with which the
-        curvature is computed; see `Forward.slopes`.
+    jacobians : sequence of Tensor, optional
+        Jacobians of all frames at this state, if they are known.
     """
     joint = state.joint
     size = joint.unknowns_with(modes)
@@ -113,7 +106,7 @@ def linearise(
     whitened = objective.whiten(residuals, weights)
     for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
         residual, weight, common = (each.cpu() for each in (residuals[k], *weights[k]))
-        rendered = forward.jacobian(point, modes)
+        rendered = jacobians[k] if jacobians else forward.jacobian(point, modes)
         first = point.unknowns.where("modes").start
         rows = joint.rows(k)[: len(rendered)]
         drift = joint.drift_rows(k) if modes else torch.zeros(0, dtype=torch.int64)
@@ -121,8 +114,6 @@ def linearise(
         product, pulled = _accumulate(
             rendered.flatten(1), weight.flatten(), whitened[k].cpu().flatten()
         )
-        if exact and modes:
-            _put_slopes(pulled, forward, point, weights[k].weight * whitened[k])
         if len(state.points) == 1:
             curvature, gradient = product, pulled
             continue
@@ -137,48 +128,3 @@ def linearise(
         curvature -= _accumulate(rows, ones, ones)[0]
     gradient = gradient + curvature @ current
     return NormalEquations(state, kappa, robust, curvature, gradient, current, tuple(frames))
-
-
-def curve(
-    objective: Objective, equations: NormalEquations, weights: Sequence[Weights], step: Tensor
-) -> Tensor:
-    """Product of the curvature with a step, by derivatives of the model itself.
-
-    The curvature of the equations is that of a coarse copy, whose derivatives are those of another
-    point. Where the effects of several unknowns cancel, it may be wrong by an order of magnitude.
-
-    Parameters
-    ----------
-    objective : Objective
-    equations : NormalEquations
-    weights : sequence of Weights
-        Of the equations.
-    step : Tensor, (unknowns,)
-
-    Returns
-    -------
-    Tensor, (unknowns,)
-    """
-    state = equations.state
-    moved = state.vector.clone()
-    moved[: len(step)] += _DIFFERENCE * step
-    images = [
-        (ahead.total - point.total) / _DIFFERENCE
-        for ahead, point in zip(objective.at(state.joint, moved).points, state.points, strict=True)
-    ]
-    total = torch.zeros_like(step)
-    whitened = objective.whiten(images, weights)
-    for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
-        frame = equations.frames[k]
-        pixels = weights[k].weight * whitened[k]
-        on_rows = (frame.jacobian.flatten(1) @ pixels.cpu().flatten().float()).double()
-        _put_slopes(on_rows, forward, point, pixels)
-        total += frame.onto_unknowns(on_rows, len(step))
-    return total
-
-
-def _put_slopes(on_rows: Tensor, forward: Forward, point: Point, pixels: Tensor) -> None:
-    """Replace derivatives by the optical parameters and the wavefront by accurate ones."""
-    for name, slope in forward.slopes(point, pixels).items():
-        places = point.unknowns.where(name)
-        on_rows[places] = slope[: len(on_rows[places])]

@@ -203,6 +203,21 @@ class GaussNewton:
         # Some of what is freed does not return to the system at once.
         return max(0.0, 0.9 * self.memory - _PROCESS - arrays)
 
+    def with_wider_priors(self, ratios: Mapping[str, float]) -> GaussNewton:
+        """Return settings whose priors have scales multiplied by ratios above 1.
+
+        Parameters
+        ----------
+        ratios : mapping of str to float
+            As `Refinement.prior_ratios`: by group of modes, followed by " drift" for those of
+            `drift`, and "amplitude".
+        """
+        of_drift = {
+            name.removesuffix(" drift"): r for name, r in ratios.items() if " drift" in name
+        }
+        drift = self.drift and self.drift.widened(of_drift)
+        return replace(self, prior=self.prior.widened(ratios), drift=drift)
+
     @classmethod
     def nircam(cls, **changes: Any) -> GaussNewton:
         """Return the settings for real NIRCam frames, for which the model is not exact.

@@ -7,7 +7,7 @@ modes, is stationary (D. MacKay, "Bayesian interpolation", Neural Computation 4,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -114,6 +114,27 @@ class WavefrontPrior:
     def shape(self, basis: Basis) -> Tensor:
         """Standard deviation of every mode relative to its group's scale, (modes,)."""
         return 1 / (1 + (basis.frequencies / self.knee) ** self.slope)
+
+    def widened(self, ratios: Mapping[str, float]) -> WavefrontPrior:
+        """Return a prior with its scales multiplied by ratios above 1.
+
+        Parameters
+        ----------
+        ratios : mapping of str to float
+            By group of modes, and "amplitude" for the scale of the amplitude modes.
+
+        Examples
+        --------
+        >>> from pyklip_diffrender import WavefrontPrior
+        >>> WavefrontPrior({"segment": 2.0, "texture": 0.1}).widened({"segment": 1.5}).scales
+        {'segment': 3.0, 'texture': 0.1}
+        """
+        wider = {name: max(1.0, ratio) for name, ratio in ratios.items()}
+        return replace(
+            self,
+            scales={name: wider.get(name, 1.0) * scale for name, scale in self.scales.items()},
+            amplitude_scale=wider.get("amplitude", 1.0) * self.amplitude_scale,
+        )
 
 
 @dataclass(frozen=True)
