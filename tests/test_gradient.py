@@ -249,11 +249,17 @@ def test_accurate_steps_keep_their_equations(monkeypatch: pytest.MonkeyPatch) ->
     solver._has_poor_equations = True
     solver._accurate_step(after, 0.01, len(BASIS))
     assert calls == [0, 0]
+    # Weights of a smaller model error are others, those of a little smaller one are not.
+    solver._accurate_step(after, 0.008, len(BASIS))
+    assert calls == [0, 0]
+    solver._accurate_step(after, 0.002, len(BASIS))
+    assert calls[:2] == [0, 0]
+    assert len(calls) == 3
     grown = solver.objective.at(
         *after.joint.with_companions([dr.Planet(1e-4, 0.3, 20.0)], after.vector)
     )
-    solver._accurate_step(grown, 0.01, len(BASIS))
-    assert calls == [0, 0, 0]
+    solver._accurate_step(grown, 0.002, len(BASIS))
+    assert len(calls) == 4
 
 
 def test_equations_that_lead_nowhere_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,6 +52,12 @@ were up to 10 % too shallow near the occulter."""
 _PEDESTAL = 0.5
 """Relative prior deviation of the pedestal of a known pattern."""
 
+_FAR = 0.03
+"""Model error above which steps fail because they are large. They are damped then."""
+
+_SIMILAR = 1.5
+"""Ratio of model errors above which normal equations precondition poorly."""
+
 _PARTS = (1.0, 0.4, 0.16, 0.064)
 """Parts of an accurate step that are tried until one lowers the penalised chi-squared."""
 
@@ -122,7 +128,7 @@ class Solver:
         self.set_priors(settings)
         self.damping = 0.0
         self._has_accurate_steps = settings.relinearise > _ACCURATE
-        self._kappa, self._needs_accurate = math.nan, False
+        self._kappa, self._needs_accurate = math.inf, False
         self._equations: NormalEquations | None = None
         self._has_poor_equations = False
 
@@ -214,8 +220,9 @@ class Solver:
         gain : float
             Decrease, or expected decrease, of the penalised chi-squared per pixel.
         """
-        if kappa != self._kappa:
-            self._kappa, self._needs_accurate = kappa, False
+        if kappa > self._kappa or kappa >= _FAR:
+            self._needs_accurate = False
+        self._kappa = kappa
         # Without the wavefront, derivatives are cheap and always accurate.
         may_repeat = self._has_accurate_steps and modes > 0
         if not (may_repeat and self._needs_accurate):
@@ -233,8 +240,8 @@ class Solver:
         equations = self._linearise(
             state, kappa, modes, objective.robust, self.settings.relinearise
         )
-        # New derivatives that fail show that the model is not linear.
-        is_stale = may_repeat and self._responses.farthest > 0
+        # New derivatives that fail show that the model is not linear, as do large steps.
+        is_stale = may_repeat and self._responses.farthest > 0 and kappa < _FAR
         weights = objective.weights(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else self.damping
@@ -276,7 +283,11 @@ class Solver:
         # Equations of an earlier state precondition nearly as well, and take longer than the step.
         for is_new in (False, True):
             equations = self._equations
-            if is_new or equations is None or not self._precondition(equations, state, modes):
+            if (
+                is_new
+                or equations is None
+                or not self._precondition(equations, state, kappa, modes)
+            ):
                 robust = objective.robust
                 equations = self._linearise(state, kappa, modes, robust, _ACCURATE)
             step, settled = accurate_step(
@@ -292,10 +303,13 @@ class Solver:
                 break
         return state, 0.0
 
-    def _precondition(self, equations: NormalEquations, state: State, modes: int) -> bool:
+    def _precondition(
+        self, equations: NormalEquations, state: State, kappa: float, modes: int
+    ) -> bool:
         """Whether the last equations can precondition an accurate step from a state."""
         return (
             not self._has_poor_equations
+            and not equations.kappa > _SIMILAR * kappa  # It is NaN where weights have changed.
             and self._responses.farthest <= _ACCURATE
             and equations.state.joint is state.joint
             and len(equations.current) == state.joint.unknowns_with(modes)
