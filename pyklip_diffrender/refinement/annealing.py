@@ -18,7 +18,8 @@ from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.companions import bright_companions
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.gauss_newton import Solver, count_modes_below
+from pyklip_diffrender.refinement.gauss_newton import Solver
+from pyklip_diffrender.refinement.mode_priors import ModePriors, count_modes_below
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.outliers import isolated_outliers
 from pyklip_diffrender.refinement.problem import Problem
@@ -27,6 +28,7 @@ from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.wavefront.bases import Basis
+from pyklip_diffrender.wavefront.priors import EvidenceUpdate
 
 __all__ = ["Annealing"]
 
@@ -124,7 +126,7 @@ class Annealing:
         settings, solver, floor = self.settings, self.solver, self.settings.min_model_error
         state = aligned = best = self._begin
         best_error = (math.inf, math.inf)
-        first_scales = solver.scales
+        first_scales = solver.priors.scales
         kappa = max(self.objective.model_error(state), floor)
         if self._is_warm and floor:
             kappa = floor  # A larger one would lead away from the solution, and back.
@@ -163,7 +165,8 @@ class Annealing:
                 best = state = self._with_companions(state if is_close else aligned, bright)
                 best_error, remaining = (math.inf, math.inf), settings.max_iterations
                 if not is_close:
-                    solver.scales, solver.damping, modes = first_scales, 0.0, 0
+                    solver.priors.scales = first_scales
+                    solver.damping, modes = 0.0, 0
                     kappa = max(self.objective.model_error(state), floor)
                 continue
             if settled and kappa <= floor and modes == len(self.basis):
@@ -193,24 +196,27 @@ class Annealing:
     def _with_wider_prior(self, state: State) -> State:
         """Raise the scales of a prior that is too narrow, and go on with them."""
         for _ in range(_WIDENINGS):
-            explained = self.objective.chi2_per_pixel(state) < _EXPLAINED
-            ratios = self._prior_ratios(state) if explained else {}
+            if self.objective.chi2_per_pixel(state) >= _EXPLAINED:
+                break
+            self.solver.linear_model(state, 0.0, self._all_modes, math.inf, final=False)
+            ratios = self._prior_ratios(self.solver.posterior(state))
             if not self._is_improbable(ratios):
                 break
             _log.info("the wavefront is improbable under its prior, by factors %s", ratios)
             self.settings = self.settings.with_wider_priors(ratios)
-            self.solver.set_priors(self.settings)
+            frames = len(self.problems)
+            self.solver.priors = ModePriors.of(self.settings, self.basis, frames)
             state = self._without_outliers(self._settled(state, self.settings.max_iterations))
         return state
 
-    def _prior_ratios(self, state: State) -> dict[str, float]:
-        kappa = self._unexplained(state)
-        self.solver.linear_model(state, kappa, self._all_modes, math.inf, final=False)
-        return self.solver.prior_ratios(self.solver.posterior(state))
+    def _prior_ratios(self, update: EvidenceUpdate) -> dict[str, float]:
+        """Size of the fitted modes relative to their prior, by group; empty with fitted scales."""
+        is_fixed = self.settings.wavefront and not self.settings.prior.fit_scales
+        return self.solver.priors.ratios(update) if is_fixed else {}
 
     def _is_improbable(self, ratios: Mapping[str, float]) -> bool:
         """Whether the wavefront is too large for its prior."""
-        of_wavefront = [ratios[name] for name in self.solver.scale_names if ratios]
+        of_wavefront = [ratios[name] for name in self.solver.priors.names if ratios]
         return max(of_wavefront, default=0.0) >= _IMPROBABLE
 
     def _settled(self, state: State, steps: int) -> State:
@@ -265,7 +271,7 @@ class Annealing:
     def _modes_for(self, kappa: float) -> int:
         """Number of leading modes to fit while the model error is kappa."""
         joint_fit = len(self.problems) > 1
-        amplitude = len(self.solver.amplitude_deviation) > 0
+        amplitude = len(self.solver.priors.amplitude) > 0
         everything = self.settings.min_model_error > 0 or amplitude or joint_fit
         return len(self.basis) if everything or kappa <= _COARSE else self._few_modes
 
@@ -294,7 +300,7 @@ class Annealing:
         update = self.solver.posterior(state)
         assert update.variance is not None
         deviation = update.variance.sqrt()
-        ratios = self.solver.prior_ratios(update)
+        priors, ratios = self.solver.priors, self._prior_ratios(update)
         if status is Status.CONVERGED and self._is_improbable(ratios):
             status = Status.PRIOR_MISMATCH
         frames = []
@@ -336,7 +342,7 @@ class Annealing:
             model_error=kappa,
             companions=first.unknowns.sources(first.vector).numpy(),
             companion_errors=deviation[rows].reshape(-1, 3).numpy(),
-            scales=dict(zip(self.solver.scale_names, self.solver.scales.tolist(), strict=True)),
+            scales=dict(zip(priors.names, priors.scales.tolist(), strict=True)),
             prior_ratios=ratios,
             effective_parameters=update.effective,
             log_evidence=update.log_evidence,

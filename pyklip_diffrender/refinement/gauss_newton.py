@@ -23,14 +23,15 @@ from pyklip_diffrender.refinement.accurate_step import ModelDerivatives, accurat
 from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.refinement.joint_layout import JointLayout
+from pyklip_diffrender.refinement.mode_priors import ModePriors
 from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
 from pyklip_diffrender.refinement.objective import Objective, State, Weights
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.wavefront.bases import Basis
-from pyklip_diffrender.wavefront.priors import EvidenceUpdate, scale_ratios, solve_with_evidence
+from pyklip_diffrender.wavefront.priors import EvidenceUpdate, solve_with_evidence
 
-__all__ = ["Solver", "count_modes_below"]
+__all__ = ["Solver"]
 
 _TRIES = 7
 """Largest number of attempts at a step, with increasing damping."""
@@ -65,12 +66,6 @@ _POOR = 0.5
 """Ratio of the actual to the expected gain of a step below which its derivatives are poor."""
 
 
-def count_modes_below(basis: Basis, cycles: float) -> int:
-    """Count the leading modes of a basis whose spatial frequency is at most `cycles`."""
-    beyond = torch.nonzero(basis.frequencies > cycles).flatten()
-    return int(beyond[0]) if len(beyond) else len(basis)
-
-
 class Solver:
     """Takes damped Gauss-Newton steps with a given basis.
 
@@ -85,8 +80,8 @@ class Solver:
 
     Attributes
     ----------
-    scales : Tensor, (groups,)
-        The prior's scales, nm, updated in every step unless they are fixed.
+    priors : ModePriors
+        Their scales are updated in every step unless they are fixed.
     damping : float
         Levenberg-Marquardt damping of the next step.
 
@@ -122,33 +117,12 @@ class Solver:
         self.objective = Objective(
             [Forward(problem, responses) for problem in problems], settings.robust
         )
-        self.drift = 0
-        if settings.drift is not None and len(problems) > 1:
-            self.drift = count_modes_below(basis, settings.drift_cycles)
-        self.set_priors(settings)
+        self.priors = ModePriors.of(settings, basis, len(problems))
         self.damping = 0.0
         self._has_accurate_steps = settings.relinearise > _ACCURATE
         self._kappa, self._needs_accurate = math.inf, False
         self._equations: NormalEquations | None = None
         self._has_poor_equations = False
-
-    def set_priors(self, settings: GaussNewton) -> None:
-        """Take the priors of the wavefront from settings that differ in nothing else."""
-        self.settings, basis = settings, self.basis
-        self.amplitude_deviation = settings.prior.amplitude_deviation(basis)
-        self.shape = settings.prior.shape(basis)
-        self.group = basis.group_index
-        self.scale_names = list(basis.groups)
-        scales = [settings.prior.scales[name] for name in basis.groups]
-        if settings.drift is not None and self.drift:
-            frames, groups = len(self.objective.forwards), len(basis.groups)
-            own_shape = settings.drift.shape(basis)[: self.drift]
-            own_group = basis.group_index[: self.drift] + groups
-            self.shape = torch.cat([self.shape, own_shape.repeat(frames)])
-            self.group = torch.cat([self.group, own_group.repeat(frames)])
-            self.scale_names += [f"{name} drift" for name in basis.groups]
-            scales += [settings.drift.scales[name] for name in basis.groups]
-        self.scales = torch.tensor(scales, dtype=torch.float64)
 
     def first_layout(self) -> JointLayout:
         """Layout of the unknowns, with starting values, before companions are added."""
@@ -159,7 +133,7 @@ class Solver:
             for problem, forward in zip(problems, self.objective.forwards, strict=True)
         )
         own = (*self.settings.own, "pedestal") if len(frames) > 1 else ()
-        return JointLayout(frames, own, self.drift)
+        return JointLayout(frames, own, self.priors.drift)
 
     def _frame_layout(self, problem: Problem, forward: Forward, roll: float) -> FrameLayout:
         free, deviations = self.settings.free, dict(self.settings.deviations)
@@ -174,7 +148,7 @@ class Solver:
             free,
             {**{n: v.cpu() for n, v in start.items()}, **levels},
             len(self.basis),
-            len(self.amplitude_deviation),
+            len(self.priors.amplitude),
             list(self.settings.companions),
             roll,
             not problem.observation.reference,
@@ -199,8 +173,7 @@ class Solver:
 
     def prior_deviation(self, layout: JointLayout) -> Tensor:
         """Prior standard deviations of all unknowns."""
-        wavefront = self.scales[self.group] * self.shape
-        return torch.cat([layout.prior_deviation(), self.amplitude_deviation, wavefront])
+        return torch.cat([layout.prior_deviation(), self.priors.deviation])
 
     def step(self, state: State, kappa: float, modes: int) -> tuple[State, float]:
         """Take one damped step.
@@ -246,7 +219,7 @@ class Solver:
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else self.damping
         update = self._solve(layout, equations, fit_scales=fits_scales, damping=damping)
-        self.scales = update.scales
+        self.priors.scales = update.scales
         expected = self._predicted_gain(layout, equations, update.step)
         if expected < self.settings.tolerance * objective.pixels:
             # The gain is too small for another linearisation.
@@ -395,18 +368,6 @@ class Solver:
         assert self._equations.state is state
         return self._solve(state.joint, self._equations, errors=True)
 
-    def prior_ratios(self, update: EvidenceUpdate) -> dict[str, float]:
-        """Size of the fitted modes relative to their prior, by group; empty with fitted scales."""
-        settings = self.settings
-        if settings.prior.fit_scales or not settings.wavefront or update.variance is None:
-            return {}
-        amplitude = self.amplitude_deviation
-        deviation = torch.cat([amplitude, self.scales[self.group] * self.shape])
-        group = torch.cat([torch.zeros(len(amplitude), dtype=torch.int64), self.group + 1])
-        last = slice(-len(deviation), None)
-        ratios = scale_ratios(update.step[last], update.variance[last], deviation, group)
-        return dict(zip(["amplitude", *self.scale_names], ratios.tolist(), strict=True))
-
     def _solve(
         self,
         layout: JointLayout,
@@ -421,16 +382,16 @@ class Solver:
         modes = max(0, len(curvature) - layout.where("modes").start)
         fixed = layout.prior_deviation()
         if modes:
-            fixed = torch.cat([fixed, self.amplitude_deviation])
+            fixed = torch.cat([fixed, self.priors.amplitude])
         # Unknowns differ by many powers of ten, so the system is solved in scaled units.
         unit = torch.ones(len(curvature), dtype=torch.float64)
         unit[: len(fixed)] = curvature.diagonal()[: len(fixed)].clamp(min=1e-300) ** -0.5
         update = solve_with_evidence(
             (curvature * unit[:, None]).mul_(unit),
             equations.gradient * unit,
-            self.shape[:modes],
-            self.group[:modes],
-            self.scales,
+            self.priors.shape[:modes],
+            self.priors.group[:modes],
+            self.priors.scales,
             fixed / unit[: len(fixed)],
             iterations=1 if fit_scales and modes else 0,
             damping=damping,
