@@ -253,16 +253,13 @@ class Solver:
         offset = state.vector - state.joint.initial()
         deviation = self.prior_deviation(state.joint)
         enough = self.settings.tolerance * objective.pixels / 2
-        # Equations of an earlier state precondition nearly as well, and take longer than the step.
+        # Equations of an earlier state precondition nearly as well, and new ones take longer than
+        # the step itself.
         for is_new in (False, True):
+            if is_new or not self._can_precondition(state, kappa, modes):
+                self._linearise(state, kappa, modes, objective.robust, _ACCURATE)
             equations = self._equations
-            if (
-                is_new
-                or equations is None
-                or not self._precondition(equations, state, kappa, modes)
-            ):
-                robust = objective.robust
-                equations = self._linearise(state, kappa, modes, robust, _ACCURATE)
+            assert equations is not None
             step, settled = accurate_step(
                 derivatives, equations.curvature, offset, deviation, enough
             )
@@ -274,14 +271,15 @@ class Solver:
                     return trial, (before - after) / objective.pixels
             if equations.state is state:
                 break
+            del equations  # The next ones are as large.
         return state, 0.0
 
-    def _precondition(
-        self, equations: NormalEquations, state: State, kappa: float, modes: int
-    ) -> bool:
+    def _can_precondition(self, state: State, kappa: float, modes: int) -> bool:
         """Whether the last equations can precondition an accurate step from a state."""
+        equations = self._equations
         return (
-            not self._has_poor_equations
+            equations is not None
+            and not self._has_poor_equations
             and not equations.kappa > _SIMILAR * kappa  # It is NaN where weights have changed.
             and self._responses.farthest <= _ACCURATE
             and equations.state.joint is state.joint
