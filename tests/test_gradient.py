@@ -115,6 +115,25 @@ def of_the_model_itself(solver: Solver) -> Solver:
     )
 
 
+def test_the_gradient_by_companions_is_that_of_chi_squared() -> None:
+    """Their images are those of the coarse copy, which is the model in this test."""
+    solver, state = solver_of(2)
+    solver = of_the_model_itself(solver)
+    objective = solver.objective
+    state = objective.at(*state.joint.with_companions([dr.Planet(3e-3, 0.4, 20.0)], state.vector))
+    weights = objective.weights(state, 0.01, 4.0)
+    exact = gradient(solver, state, exact=True)
+    where = state.joint.where("companions")
+    for place, step in zip(range(where.start, where.stop), (1e-6, 1e-4, 1e-4), strict=True):
+        moved = torch.zeros(state.joint.size, dtype=torch.float64)
+        moved[place] = step
+        ahead, behind = (
+            objective.chi2(objective.at(state.joint, state.vector + sign * moved), weights)
+            for sign in (1, -1)
+        )
+        np.testing.assert_allclose(float(exact[place]), -(ahead - behind) / (4 * step), rtol=1e-3)
+
+
 def test_where_the_copy_is_the_model_both_gradients_are_the_same() -> None:
     """But for single precision, in which the derivatives of the copy are stored."""
     solver, state = solver_of(1)

@@ -648,3 +648,14 @@ def test_derivatives_from_far_away_do_not_end_a_fit(monkeypatch: pytest.MonkeyPa
     assert set(calls) == {0.3}
     assert chi2[1] < 1.05
     assert chi2[0] < 1.01 * chi2[1]
+
+
+def test_priors_are_widened_by_group() -> None:
+    """Where ratios are above 1; those of the drift are its own."""
+    prior = WavefrontPrior({"segment": 2.0, "texture": 0.5}, amplitude_scale=3.0)
+    drift = WavefrontPrior({"segment": 0.2, "texture": 0.1})
+    ratios = {"segment": 1.5, "texture": 0.7, "segment drift": 0.9, "texture drift": 4.0}
+    wider = GaussNewton(prior=prior, drift=drift).with_wider_priors({**ratios, "amplitude": 2.0})
+    assert wider.prior == replace(prior, scales={"segment": 3.0, "texture": 0.5}, amplitude_scale=6)
+    assert wider.drift == replace(drift, scales={"segment": 0.2, "texture": 0.4})
+    assert GaussNewton(prior=prior).with_wider_priors(ratios).drift is None
