@@ -209,7 +209,7 @@ class GaussNewton:
         Parameters
         ----------
         ratios : mapping of str to float
-            As `Refinement.prior_ratios`: by group of modes, followed by " drift" for those of
+            As ``Refinement.prior_ratios``: by group of modes, followed by " drift" for those of
             `drift`, and "amplitude".
         """
         of_drift = {
