@@ -162,12 +162,18 @@ class Annealing:
                 # Near the solution the model is linear, so that further steps remove the bias of
                 # the wavefront. Otherwise the fit starts again from the alignment.
                 is_close = error < _NEAR
-                best = state = self._with_companions(state if is_close else aligned, bright)
+                state = self._with_companions(state if is_close else aligned, bright)
                 best_error, remaining = (math.inf, math.inf), settings.max_iterations
-                if not is_close:
+                if is_close:
+                    # Images are less linear in positions than in the wavefront, and steps of these
+                    # few unknowns are cheap.
+                    solver.damping = 0.0
+                    state = self._settled(state, _STEPS, modes=0)
+                else:
                     solver.priors.scales = first_scales
                     solver.damping, modes = 0.0, 0
                     kappa = max(self.objective.model_error(state), floor)
+                best = state
                 continue
             if settled and kappa <= floor and modes == len(self.basis):
                 status = _status_of(chi2)
@@ -219,13 +225,14 @@ class Annealing:
         of_wavefront = [ratios[name] for name in self.solver.priors.names if ratios]
         return max(of_wavefront, default=0.0) >= _IMPROBABLE
 
-    def _settled(self, state: State, steps: int) -> State:
-        """Take steps until they gain little."""
+    def _settled(self, state: State, steps: int, modes: int | None = None) -> State:
+        """Take steps, by default of all modes, until they gain little."""
+        modes = self._all_modes if modes is None else modes
         kappa = max(self._unexplained(state), self.settings.min_model_error)
         for _ in range(steps):
-            state, gain = self.solver.step(state, kappa, self._all_modes)
+            state, gain = self.solver.step(state, kappa, modes)
             error, chi2 = self.objective.model_error(state), self.objective.chi2_per_pixel(state)
-            self._record(kappa, self._all_modes, chi2, error, gain)
+            self._record(kappa, modes, chi2, error, gain)
             if gain < self.settings.tolerance:
                 break
         return state

@@ -282,7 +282,6 @@ class Solver:
             and not self._has_poor_equations
             and not equations.kappa > _SIMILAR * kappa  # It is NaN where weights have changed.
             and self._responses.farthest <= _ACCURATE
-            and equations.state.joint is state.joint
             and len(equations.current) == state.joint.unknowns_with(modes)
         )
 
