@@ -10,11 +10,14 @@ import numpy as np
 from astropy.table import Table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 __all__ = ["draw"]
 
 _INK = "#1b1f24"
 _OURS, _OTHERS = "#5b3f95", "#c0631a"
+_MARKER = 6
+"""Half a marker's width, pixels."""
 
 
 def draw(table: Table) -> Figure:
@@ -62,8 +65,9 @@ def draw(table: Table) -> Figure:
 
 
 def _label_apart(ax: Axes, names: Mapping[str, tuple[float, float]]) -> None:
-    """Names beside their points, where they neither cover each other nor leave the axes."""
-    used: list[Any] = []
+    """Names beside their points, where they cover neither each other nor points."""
+    middles = ax.transData.transform(np.reshape(list(names.values()), (-1, 2)))
+    used: list[Any] = [Bbox.from_extents(*(xy - _MARKER), *(xy + _MARKER)) for xy in middles]
     for name, point in names.items():
         for up, right in product((5, -9, 17, -21, 29, -33), (True, False)):
             label = ax.annotate(
