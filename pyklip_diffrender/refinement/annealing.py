@@ -75,7 +75,8 @@ _IMPROBABLE = 1.5
 """Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
 
 _STEPS = 4
-"""Largest number of steps after each. With robust weights, bad pixels have done little harm."""
+"""Largest number of steps after each, because bad pixels have done little harm with robust weights,
+and of steps that fit a new companion alone."""
 
 _WIDENINGS = 3
 """Largest number of times that a prior is widened. Two rolls of HIP 17695 in F444W needed two."""
