@@ -65,7 +65,7 @@ def draw(table: Table) -> Figure:
 
 
 def _label_apart(ax: Axes, names: Mapping[str, tuple[float, float]]) -> None:
-    """Names beside their points, inside the axes, where they cover neither points nor each other."""
+    """Names beside points, inside the axes, where they cover neither points nor each other."""
     middles = ax.transData.transform(np.reshape(list(names.values()), (-1, 2)))
     used: list[Any] = [Bbox.from_extents(*(xy - _MARKER), *(xy + _MARKER)) for xy in middles]
     for name, point in names.items():
