@@ -352,6 +352,14 @@ def out_of_memory(folder: Path, *_: int) -> str:
     return f"1 job failed ({said[0]}), 1 (its worker {said[1]}), the other {2 * JOBS - 2} finished"
 
 
+def _address_in(log: Path) -> str | None:
+    """The scheduler's address, or None until dask has written the file that it creates empty."""
+    try:
+        return str(json.loads(log.read_text())["address"])
+    except (FileNotFoundError, json.JSONDecodeError):
+        return None
+
+
 @contextmanager
 def scheduler(folder: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """A scheduler as a process; yields its address."""
@@ -362,9 +370,10 @@ def scheduler(folder: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     )  # fmt: skip
     try:
         end = time.monotonic() + 60
-        while not log.exists() and time.monotonic() < end:
+        while (address := _address_in(log)) is None:
+            require(time.monotonic() < end, "the scheduler did not start within a minute")
             time.sleep(0.05)
-        yield json.loads(log.read_text())["address"], process
+        yield address, process
     finally:
         process.terminate()
         process.wait()
