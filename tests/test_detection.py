@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import Detection, search, small_sample_factor
+from pyklip_diffrender.detection import Detection, search
 from pyklip_diffrender.detection.calibration import calibration_errors
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.relinearise import with_companions
@@ -713,17 +713,6 @@ def test_companions_do_not_raise_the_contrast_curve(one: Detection) -> None:
     np.testing.assert_allclose(by_itself["contrast"], given["contrast"], rtol=1e-3)
 
 
-def test_small_samples_need_higher_thresholds() -> None:
-    # Mawet et al. 2014, figure 6: at 1 lambda/D, six elements, a 5 sigma false alarm
-    # probability needs tens of sigma; far out nothing is added.
-    near, far = small_sample_factor(np.array([1.0, 1000.0]), 1.0)
-    expected = stats.t.isf(stats.norm.sf(5.0), 4) * math.sqrt(1 + 1 / 5) / 5
-    assert near == pytest.approx(expected)
-    assert near > 5
-    assert far == pytest.approx(1.0, abs=0.01)
-    assert small_sample_factor(np.array([0.1]), 1.0)[0] == math.inf
-
-
 # -- products and mistakes -------------------------------------------------------------------
 
 
@@ -1069,7 +1058,7 @@ def test_all_errors_have_the_factor_of_their_separation(
     one: Detection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plain = dr.detect(one.fits, scatter=1.0)
-    factor = ErrorFactor(np.array([0.2, 0.9]), np.array([1.6, 1.0]))
+    factor = ErrorFactor(np.array([0.2, 0.9]), np.array([1.6, 1.0]), np.full(2, 50.0))
     monkeypatch.setattr(search, "_error_factor", lambda *_: factor)
     found = dr.detect(one.fits)
     factors = factor.at(np.hypot(found.grid[..., 0], found.grid[..., 1]))
@@ -1084,6 +1073,11 @@ def test_all_errors_have_the_factor_of_their_separation(
     )
     curve = found.contrast_curve
     np.testing.assert_allclose(curve["error_factor"], factor.at(curve["separation"].value))
+    # Noise in units of measured errors follows Student's t.
+    wider = stats.t.isf(stats.norm.sf(5.0), 50) / 5
+    np.testing.assert_allclose(curve["small_sample"], wider * curve["contrast"])
+    limits = plain.contrast_curve
+    np.testing.assert_allclose(limits["small_sample"], limits["contrast"])
     # A ring is as wide as a pixel.
     np.testing.assert_allclose(
         curve["contrast"], plain.contrast_curve["contrast"] * curve["error_factor"], rtol=0.05

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.ndimage import gaussian_filter
 
 from pyklip_diffrender.detection import search
@@ -74,7 +75,7 @@ def test_sources_do_not_raise_their_own_threshold() -> None:
 
 
 def test_factors_are_interpolated_and_never_below_their_floor() -> None:
-    factor = ErrorFactor(np.array([0.5, 1.0]), np.array([2.0, 0.8]))
+    factor = ErrorFactor(np.array([0.5, 1.0]), np.array([2.0, 0.8]), np.full(2, 50.0))
     np.testing.assert_allclose(factor.at([0.1, 0.75, 3.0]), [2.0, 1.4, 0.8])
     offsets = torch.tensor([[0.3, 0.4], [0.0, -1.0]], dtype=torch.float64)
     np.testing.assert_allclose(factor.of(offsets), [2.0, 0.8])
@@ -82,6 +83,34 @@ def test_factors_are_interpolated_and_never_below_their_floor() -> None:
     assert factor.typical == pytest.approx(1.4)
     assert factor.is_needed
     assert not ErrorFactor.constant(1.0).is_needed
+
+
+def test_noise_exceeds_the_threshold_as_rarely_as_gaussian_noise() -> None:
+    measured = ErrorFactor(np.array([0.4, 2.0]), np.ones(2), np.array([10.0, 50.0]))
+    threshold = measured.threshold(3.0, [0.4, 2.0])
+    assert threshold[0] > threshold[1] > 3.0
+    np.testing.assert_allclose(measured.false_alarm(threshold, [0.4, 2.0]), stats.norm.sf(3.0))
+    # The variance of this noise was drawn from few values, like that of a ring.
+    rng = np.random.default_rng(5)
+    count = 400_000
+    scatter = np.sqrt(rng.chisquare(10, count) / 10)
+    exceeded = np.mean(rng.normal(size=count) / scatter > threshold[0])
+    assert exceeded == pytest.approx(stats.norm.sf(3.0), rel=0.15)
+    known = ErrorFactor.constant(1.5)
+    np.testing.assert_allclose(known.threshold(3.0, [0.4, 2.0]), 3.0)
+
+
+def test_the_scatter_of_a_ring_is_as_well_known_as_its_positions_are_many() -> None:
+    grid, ones = field(), np.ones((80, 80))
+    distance = np.hypot(grid[..., 0], grid[..., 1])
+    ring = np.abs(distance - 0.6) < 0.2
+    maps = [snr_map(seed, ones) for seed in range(300)]
+    variances = [(each[ring] ** 2).mean() for each in maps]
+    positions = 2 * np.mean(variances) ** 2 / np.var(variances)
+    factor = scatter_profile(maps[0], grid, torch.zeros(0, 2), 0.2, RESOLUTION)
+    freedom = float(np.interp(0.6, factor.separations, factor.freedom))
+    # 20 for the scatter of the whole field. Real S/N is smoother than this noise.
+    assert 0.5 * positions < freedom - 20 < positions
 
 
 def test_a_map_without_valid_pixels_needs_no_factor() -> None:

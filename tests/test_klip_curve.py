@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -12,12 +13,13 @@ import pytest
 import torch
 from astropy import units as u
 from numpy.typing import NDArray
+from scipy import stats
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.pyklip_backend.klip_curve import klip_curve
+from pyklip_diffrender.pyklip_backend.klip_curve import klip_curve, small_sample_factor
 from pyklip_diffrender.refinement import FrameFit
 
 NPIX, SIZE = 64, 32
@@ -171,3 +173,14 @@ def test_without_references_there_is_no_curve() -> None:
         klip_curve(reduction([science[0], same]))
     with pytest.raises(IncompatibleSetupError, match="rings are complete"):
         klip_curve(reduction(science, references), 3.0)
+
+
+def test_small_samples_need_higher_thresholds() -> None:
+    # Mawet et al. 2014, figure 6: at 1 lambda/D, six elements, a 5 sigma false alarm
+    # probability needs tens of sigma; far out nothing is added.
+    near, far = small_sample_factor(np.array([1.0, 1000.0]), 1.0)
+    expected = stats.t.isf(stats.norm.sf(5.0), 4) * math.sqrt(1 + 1 / 5) / 5
+    assert near == pytest.approx(expected)
+    assert near > 5
+    assert far == pytest.approx(1.0, abs=0.01)
+    assert small_sample_factor(np.array([0.1]), 1.0)[0] == math.inf

@@ -180,7 +180,9 @@ def test_probabilities_of_false_alarms() -> None:
     elements = (2.0 / (4.5e-6 / 6.6) * np.pi / 180 / 3600) ** 2
     assert row["false_alarm_probability"] == pytest.approx(2.87e-7 * elements, rel=0.15)
     # Student's t has wider tails: noise whose level was read off few places is known less well.
-    weak.__dict__["error_factor"] = ErrorFactor(np.array([0.5, 1.0]), np.array([1.2, 1.0]))
+    weak.__dict__["error_factor"] = ErrorFactor(
+        np.array([0.5, 1.0]), np.array([1.2, 1.0]), np.full(2, 20.0)
+    )
     (wide,) = summarise(replace(reduction(), detection=weak))["candidates"]
     assert wide["false_alarm_probability"] > 10 * row["false_alarm_probability"]
 

@@ -9,7 +9,6 @@ is unbiased, and its error includes the uncertainty of the wavefront.
 from __future__ import annotations
 
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.contrast import small_sample_factor
 from pyklip_diffrender.detection.disk import Disk, fit_disk
 from pyklip_diffrender.detection.recovery import measured_planet, recover_planets, with_planets
 from pyklip_diffrender.detection.result import Detection
@@ -27,7 +26,6 @@ __all__ = [
     "measure",
     "measured_planet",
     "recover_planets",
-    "small_sample_factor",
     "wide_field",
     "with_planets",
 ]

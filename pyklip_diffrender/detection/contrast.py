@@ -1,4 +1,4 @@
-"""The contrast curve and its small-sample correction."""
+"""The contrast curve."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import NDArray
-from scipy import stats
 
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 
-__all__ = ["contrast_table", "described", "small_sample_factor"]
+__all__ = ["contrast_table", "described"]
 
 _SIGMAS = 5.0
 """S/N of a contrast curve."""
@@ -24,41 +23,11 @@ _COLUMNS = {
     "lowest": (".2e", "of the ring"),
     "highest": (".2e", "of the ring"),
     "known_star": (".2e", "median if the image of the star were known"),
-    "small_sample": (".2e", "median with the small-sample correction"),
+    "small_sample": (".2e", "median with the small-sample correction of measured errors"),
     "error_factor": (".2f", "by which errors were multiplied, included in all but known_star"),
     "flux_density": (".2e", "of the median, in the photometric calibration of the frames"),
 }
 """Formats and descriptions of the columns."""
-
-
-def small_sample_factor(
-    separation: NDArray[np.float64], resolution: float, sigmas: float = 5.0
-) -> NDArray[np.float64]:
-    """Factor of a detection threshold when the noise is estimated from few resolution elements.
-
-    D. Mawet et al., "Fundamental limitations of high contrast imaging set by small sample
-    statistics", ApJ 792, 97 (2014), section 3.2. With n = 2 pi r / resolution elements, the false
-    alarm probability of `sigmas` Gaussian standard deviations belongs to a value of Student's t
-    with n - 2 degrees of freedom, times sqrt(1 + 1 / (n - 1)).
-
-    Parameters
-    ----------
-    separation : ndarray
-        In the unit of `resolution`.
-    resolution : float
-        Size of a resolution element, lambda/D.
-
-    Returns
-    -------
-    ndarray
-        Threshold over `sigmas`; inf for fewer than three elements.
-    """
-    elements = np.floor(2 * math.pi * np.asarray(separation, dtype=float) / resolution)
-    freedom = np.maximum(elements - 2, 1)
-    threshold = stats.t.isf(stats.norm.sf(sigmas), freedom) * np.sqrt(
-        1 + 1 / np.maximum(elements - 1, 1)
-    )
-    return np.where(elements >= 3, threshold / sigmas, np.inf)
 
 
 def contrast_table(
@@ -90,13 +59,15 @@ def contrast_table(
     QTable
         Separation; median contrast of the ring and its magnitude difference; lowest and highest
         contrast; the median for a known star (the photon limit of a matched filter); the median
-        with the small-sample correction, which applies where errors were scaled to the measured
-        scatter; the factor; if `star` is known, the flux density of the median.
+        with the small-sample correction: where errors were scaled to the scatter of the S/N, noise
+        follows Student's t, with as many degrees of freedom as positions told of the scatter, and
+        exceeds this limit as rarely as Gaussian noise exceeds 5 sigma; the factor; if `star` is
+        known, the flux density of the median.
     """
     rows = []
-    small_sample = small_sample_factor(separations, resolution, _SIGMAS)
+    corrections = factor.threshold(_SIGMAS, separations) / _SIGMAS
     for separation, error, photon_error, correction in zip(
-        separations, errors, photon, small_sample, strict=True
+        separations, errors, photon, corrections, strict=True
     ):
         if not len(error):
             continue

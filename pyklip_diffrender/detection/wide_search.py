@@ -435,4 +435,5 @@ def _joined(inner: ErrorFactor, outer: ErrorFactor, edge: float) -> ErrorFactor:
     return ErrorFactor(
         np.concatenate([inner.separations[near], outer.separations[far]]),
         np.concatenate([inner.factors[near], outer.factors[far]]),
+        np.concatenate([inner.freedom[near], outer.freedom[far]]),
     )

@@ -125,7 +125,7 @@ def draw_detection(detection: Detection) -> Figure:
         separation, curve["lowest"], curve["highest"], color="#5b3f95", alpha=0.15, lw=0
     )
     right.semilogy(separation, curve["contrast"], color="#5b3f95", label="wavefront marginalised")
-    if detection.error_factor.is_needed:
+    if detection.error_factor.is_measured:
         right.semilogy(
             separation, curve["small_sample"], ":", color="#5b3f95", label="small-sample corrected"
         )

@@ -174,7 +174,7 @@ def plot_detection(
         label="range of angles",
     )  # fmt: skip
     right.semilogy(separation, curve["contrast"], color=ACCENT, label="median")
-    if detection.error_factor.is_needed:
+    if detection.error_factor.is_measured:
         right.semilogy(
             separation, curve["small_sample"], ":", color=ACCENT, label="median, few samples"
         )

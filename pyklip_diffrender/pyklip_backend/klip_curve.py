@@ -7,6 +7,7 @@ KLIP leaves.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +17,10 @@ from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import NDArray
 from pyklip.klip import klip_math, rotate
+from scipy import stats
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
-from pyklip_diffrender.detection.contrast import small_sample_factor
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_arcsec
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.reduction import Reduction
     from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["KlipSubtraction", "klip_curve"]
+__all__ = ["KlipSubtraction", "klip_curve", "small_sample_factor"]
 
 Image = NDArray[np.float64]
 
@@ -144,6 +145,36 @@ def klip_curve(reduction: Reduction, separations: Any = None) -> QTable:
     for name, form in (("separation", ".3f"), ("contrast", ".2e"), ("throughput", ".2f")):
         table[name].info.format = form
     return table
+
+
+def small_sample_factor(
+    separation: NDArray[np.float64], resolution: float, sigmas: float = 5.0
+) -> NDArray[np.float64]:
+    """Factor of a detection threshold when the noise is estimated from few resolution elements.
+
+    D. Mawet et al., "Fundamental limitations of high contrast imaging set by small sample
+    statistics", ApJ 792, 97 (2014), section 3.2. With n = 2 pi r / resolution elements, the false
+    alarm probability of `sigmas` Gaussian standard deviations belongs to a value of Student's t
+    with n - 2 degrees of freedom, times sqrt(1 + 1 / (n - 1)).
+
+    Parameters
+    ----------
+    separation : ndarray
+        In the unit of `resolution`.
+    resolution : float
+        Size of a resolution element, lambda/D.
+
+    Returns
+    -------
+    ndarray
+        Threshold over `sigmas`; inf for fewer than three elements.
+    """
+    elements = np.floor(2 * math.pi * np.asarray(separation, dtype=float) / resolution)
+    freedom = np.maximum(elements - 2, 1)
+    threshold = stats.t.isf(stats.norm.sf(sigmas), freedom) * np.sqrt(
+        1 + 1 / np.maximum(elements - 1, 1)
+    )
+    return np.where(elements >= 3, threshold / sigmas, np.inf)
 
 
 class KlipSubtraction:

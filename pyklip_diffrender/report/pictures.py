@@ -78,8 +78,8 @@ def search_pictures(
     )
     sigmas = summary["contrast_curve"]["sigmas"]
     small_sample = (
-        " Dotted: the median, corrected for the small number of resolution elements near the star."
-        if detection.error_factor.is_needed
+        " Dotted: the median, corrected for the small number of positions that tell of the scatter."
+        if detection.error_factor.is_measured
         else ""
     )
     beside = (

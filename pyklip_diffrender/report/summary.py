@@ -12,7 +12,6 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import NDArray
-from scipy import stats
 
 from pyklip_diffrender import __version__
 from pyklip_diffrender.detection import Detection, Disk, WideField
@@ -227,14 +226,11 @@ def _injected(planets: QTable) -> dict[str, Any]:
 def _false_alarm(detection: Detection, snr: float, separation: float) -> float:
     """Probability that noise alone makes a peak of this S/N anywhere in the field.
 
-    Gaussian noise where the fit explains its data; Student's t, as in the small-sample column of
-    the contrast curve, where the errors were scaled to the scatter of the S/N.
+    Gaussian noise where the errors are those of the fit; Student's t, as in the small-sample column
+    of the contrast curve, where they were scaled to the scatter of the S/N.
     """
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
-    elements = math.floor(2 * math.pi * separation / resolution)
-    single = stats.norm.sf(snr)
-    if detection.error_factor.is_measured and elements >= 3:
-        single = stats.t.sf(snr / math.sqrt(1 + 1 / (elements - 1)), elements - 2)
+    single = float(detection.error_factor.false_alarm(snr, separation))
     pixel = abs(detection.grid[0, 1, 0] - detection.grid[0, 0, 0]) * abs(
         detection.grid[1, 0, 1] - detection.grid[0, 0, 1]
     )
