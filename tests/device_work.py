@@ -27,9 +27,9 @@ from pyklip_diffrender.wavefront.bases import FourierModes
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = [
-    "PLANET", "QUICK", "SIZE", "fit_gradient", "fitted", "forward_mode", "frame", "gradient",
-    "image", "model_on", "opd", "point_sources", "reached", "response", "rolls", "search",
-    "settings", "tensors",
+    "PLANET", "QUICK", "SIZE", "fit_gradient", "fitted", "frame", "gradient", "image",
+    "model_on", "opd", "parameter_derivatives", "point_sources", "reached", "response", "rolls",
+    "search", "settings", "tensors",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -129,7 +129,7 @@ def gradient(device: Any, **changes: object) -> list[Array]:
     return [each.grad.cpu().numpy().ravel() for each in (phase, *values.values())]  # type: ignore[union-attr]
 
 
-def forward_mode(device: Any, **changes: object) -> list[Array]:
+def parameter_derivatives(device: Any, **changes: object) -> list[Array]:
     model = model_on(device, **changes)
     start = torch.as_tensor(opd(), device=device)
     return [parameter_jacobian(model, start, tensors(model), tuple(VALUES)).cpu().numpy()]

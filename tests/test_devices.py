@@ -21,7 +21,7 @@ from pretend_device import DEVICE, pretended
 import pyklip_diffrender as dr
 from pyklip_diffrender.bridges import from_poppy
 from pyklip_diffrender.detection import wide_field, with_planets
-from pyklip_diffrender.linear.forward_mode import jacfwd
+from pyklip_diffrender.linear.jacobian import jacobian
 from pyklip_diffrender.optics.detector_effects import GaussianBlur, LinearResampling, PixelCrosstalk
 from pyklip_diffrender.optics.rotation import SplineRotation
 from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Systematics
@@ -53,7 +53,7 @@ def agree(compute: Callable[[Any], Sequence[Array | float]], rtol: float) -> Non
         lambda there, here: torch.zeros_like(there) + torch.zeros(3, device=here.device),
         lambda there, here: there.numpy(),
         lambda there, here: np.asarray(there),
-        lambda there, here: jacfwd(lambda x: x * here)(there),
+        lambda there, here: jacobian(lambda x: [x * here], there),
     ],
 )
 def test_the_pretended_device_refuses_to_mix(mistake: Callable[..., object]) -> None:
@@ -73,7 +73,8 @@ def test_the_pretended_device_follows_data() -> None:
         (there * torch.ones(3, device=DEVICE)).sum().backward()
         assert here.grad is not None
         assert here.grad.device == here.device != DEVICE
-        assert jacfwd(torch.sin)(there.detach()).device == DEVICE
+        (slope,) = jacobian(lambda x: [torch.sin(x)], there)
+        assert slope.device == DEVICE
 
 
 # -- images and derivatives ----------------------------------------------------------------------
@@ -86,7 +87,7 @@ def test_the_pretended_device_follows_data() -> None:
         (work.gradient, 1e-9),
         (work.response, 1e-5),
         (work.fit_gradient, 1e-9),
-        pytest.param(work.forward_mode, 1e-9, marks=pytest.mark.slow),
+        pytest.param(work.parameter_derivatives, 1e-9, marks=pytest.mark.slow),
         pytest.param(work.point_sources, 1e-5, marks=pytest.mark.slow),
     ],
 )

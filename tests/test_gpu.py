@@ -39,7 +39,7 @@ def compare(got: list[Array], expected: list[Array], tolerance: float) -> None:
     [
         (work.image, (1e-10, 1e-4)),
         (work.gradient, (1e-9, 2e-4)),
-        (work.forward_mode, (1e-9, 1e-4)),
+        (work.parameter_derivatives, (1e-9, 1e-4)),
         (work.point_sources, (1e-5, 1e-5)),
         (work.response, (1e-5, 1e-4)),
         (work.fit_gradient, (1e-9, 2e-4)),

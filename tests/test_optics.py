@@ -19,7 +19,6 @@ from pyklip_diffrender.instrument.masks import ROUND_MASKS
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, filter_throughput
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.linear.forward_mode import jacfwd
 from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
@@ -219,7 +218,7 @@ def test_what_is_kept_for_one_position_is_not_used_for_another(opd: torch.Tensor
             model(opd, lyot_shift=shift + step).sum() - model(opd, lyot_shift=shift - step).sum()
         )
     assert float(slope[0]) == pytest.approx(float(change) / 2e-6, rel=1e-5)
-    forward = jacfwd(lambda s: model(opd, lyot_shift=s).sum())(shift.detach())
+    forward = torch.func.jacfwd(lambda s: model(opd, lyot_shift=s).sum())(shift.detach())
     torch.testing.assert_close(forward, slope, rtol=1e-9, atol=0)
 
 

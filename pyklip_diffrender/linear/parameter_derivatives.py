@@ -5,12 +5,12 @@ As in `response`, the derivative of the complex field may come from a coarser mo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.linear.forward_mode import jacfwd
+from pyklip_diffrender.linear.jacobian import jacobian
 from pyklip_diffrender.optics.system import OpticalSystem
 
 __all__ = ["field_derivatives", "image_derivatives", "parameter_jacobian"]
@@ -24,7 +24,7 @@ def field_derivatives(
 ) -> dict[str, list[Tensor]]:
     """Derivatives of the complex field on the detector with respect to named parameters.
 
-    Forward-mode derivatives of the model itself.
+    They are derivatives of the model itself.
 
     Parameters
     ----------
@@ -45,49 +45,24 @@ def field_derivatives(
     moved = {name: values[name] for name in names if name not in _IMAGE_PARAMETERS}
     if not moved:
         return {}
-    behind = {name: value for name, value in moved.items() if name in model.parameters_behind}
-    before = {name: value for name, value in moved.items() if name not in behind}
+    behind = model.parameters_behind.intersection(moved)
     wavelengths = model.bandpass.wavelengths
     with torch.no_grad():
         at = model.values(values)
         waves = [model.pupil_field(model.opd(opd), each, at) for each in wavelengths]
-        if before:
-            # Constants are not kept within a transform, so the model makes them here.
-            for wave in waves:
-                model.propagate(wave, at)
-        if behind:
-            waves = [model.behind_occulter(wave, at) for wave in waves]
+        waves = [model.behind_occulter(wave, at) for wave in waves] if behind else []
+    slopes = {}
+    for name, value in moved.items():
 
-    def all_the_way(varied: dict[str, Tensor]) -> list[Tensor]:
-        return model.fields(opd, **{**values, **varied})
+        def fields(varied: Tensor, name: str = name) -> list[Tensor]:
+            changed = {**values, name: varied}
+            if name not in behind:
+                return model.fields(opd, **changed)
+            checked = model.values(changed)
+            return [model.to_detector(wave, checked) for wave in waves]
 
-    def last_part(varied: dict[str, Tensor]) -> list[Tensor]:
-        moved = model.values({**values, **varied})
-        return [model.to_detector(wave, moved) for wave in waves]
-
-    slopes = _slopes(all_the_way, before)
-    for name, value in behind.items():
-        # One by one, because the costs of a pass grow with the number of components.
-        slopes |= _slopes(last_part, {name: value})
+        slopes[name] = jacobian(fields, value)
     return slopes
-
-
-def _slopes(
-    fields: Callable[[dict[str, Tensor]], list[Tensor]], values: dict[str, Tensor]
-) -> dict[str, list[Tensor]]:
-    """Derivatives of complex fields, (components, ny, nx) each."""
-    if not values:
-        return {}
-
-    def parts(varied: dict[str, Tensor]) -> list[Tensor]:
-        # Complex outputs of jacfwd would need complex inputs.
-        return [torch.view_as_real(field) for field in fields(varied)]
-
-    slopes = jacfwd(parts)(values)
-    return {
-        name: [torch.view_as_complex(s[name].movedim(-1, 0).contiguous()) for s in slopes]
-        for name in values
-    }
 
 
 def image_derivatives(
@@ -118,10 +93,10 @@ def image_derivatives(
     for name in names:
         if name in _IMAGE_PARAMETERS:
 
-            def image(value: Tensor, name: str = name) -> Tensor:
-                return model.image_of(fields, {**values, name: value})
+            def image(varied: Tensor, name: str = name) -> list[Tensor]:
+                return [model.image_of(fields, {**values, name: varied})]
 
-            rows.append(jacfwd(image)(values[name]).movedim(-1, 0))
+            rows += jacobian(image, values[name])
             continue
         total = torch.zeros((), dtype=fields[0].real.dtype, device=model.device)
         for field, slope, weight in zip(fields, slopes[name], model.bandpass.weights, strict=True):
