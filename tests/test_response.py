@@ -13,6 +13,7 @@ from scipy.stats import multivariate_normal
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.linear.jacobian import jacobian
 from pyklip_diffrender.linear.last_pupil import LastPupil
 from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
@@ -235,6 +236,22 @@ def test_piston_of_the_whole_pupil_does_nothing(opd: torch.Tensor) -> None:
     together = image[0::3].sum(dim=0)
     # The outlines, widened to the middle of the gaps, leave a few thousandths at the corners.
     assert float(together.norm()) < 5e-3 * float(image[0::3].norm())
+
+
+def test_jacobian_of_real_and_complex_outputs() -> None:
+    x = torch.linspace(-1, 1, 5, dtype=torch.float64)
+
+    def outputs(at: torch.Tensor) -> list[torch.Tensor]:
+        phase = at[0] * x + at[1] ** 2 * x[:, None]
+        return [torch.polar(1 + 0 * phase, phase), at[1] * x]
+
+    at = torch.tensor([0.7, -0.4], dtype=torch.float64)
+    with torch.no_grad():  # As in a fit.
+        field, line = jacobian(outputs, at)
+    value = outputs(at)[0]
+    torch.testing.assert_close(field, torch.stack([1j * x * value, -0.8j * x[:, None] * value]))
+    torch.testing.assert_close(line, torch.stack([0 * x, x]))
+    assert not at.requires_grad
 
 
 NAMES = ("star_offset", "lyot_shift", "lyot_rotation", "si_zernikes", "detector_shift", "blur")
