@@ -332,6 +332,16 @@ def test_settings_that_cannot_be_are_refused_when_they_are_made(
         GaussNewton.nircam(**changes)
 
 
+def test_modes_of_the_preset_reach_the_edge_of_the_fitted_square() -> None:
+    expected = {"F444W": 18, "F480M": 16, "F356W": 22, "F250M": 32, "F210M": 18}
+    for name, cycles in expected.items():
+        assert GaussNewton.nircam(name).cycles == (cycles,)
+    assert GaussNewton.nircam() == GaussNewton.nircam("F444W")
+    for name in ("F44W", "CLEAR", ""):
+        with pytest.raises(IncompatibleSetupError, match=r"filter: got .*F444W"):
+            GaussNewton.nircam(name)
+
+
 @pytest.mark.parametrize("cycles", [6, 6.0, (6,), [6.0], np.float64(6)])
 def test_a_single_number_of_cycles_will_do(cycles: object) -> None:
     made = GaussNewton(cycles=cycles, free=["flux"], companions=[PLANET])  # type: ignore[arg-type]

@@ -414,7 +414,7 @@ def test_rolls_share_an_unknown_pattern_where_nothing_is_known(
     assert (values == 0).all()
     assert (errors == 0.03).all()
     assert pattern.pedestal == 1.9
-    preset = GaussNewton.nircam(min_model_error=0.002)
+    preset = GaussNewton.nircam(roll.filter, min_model_error=0.002)
     assert chosen(roll, roll).settings == preset
     assert chosen(roll, roll, memory=2e9).settings == replace(preset, memory=2e9)
     assert chosen(roll, replace(roll, unit=u.DN / u.s)).systematics is not None

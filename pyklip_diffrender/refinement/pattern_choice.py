@@ -137,7 +137,7 @@ def choose_systematics(
             pattern = _unknown_pattern(science)
         _log.info("pattern of the model's error: %s", pattern)
     if pattern is not None and settings is None and science[0].is_nircam:
-        settings = GaussNewton.nircam(min_model_error=_KNOWN_MODEL_ERROR)
+        settings = replace(settings_for(science[0]), min_model_error=_KNOWN_MODEL_ERROR)
     settings = _limited(settings, science[0], memory)
     return PatternChoice(tuple(science), pattern, settings, tuple(fits), tuple(failed))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,7 +12,8 @@ import numpy as np
 from astropy import units as u
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import set_numbers, to_bytes, to_unit
+from pyklip_diffrender.io.units import ARCSEC, set_numbers, to_bytes, to_unit
+from pyklip_diffrender.optics.grid import JWST_DIAMETER
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
@@ -19,6 +21,12 @@ from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = ["Adam", "GaussNewton", "settings_for"]
+
+_REACH = 40
+"""Pixels from the star to the edge of the square that `reduce` fits."""
+
+_LONG_WAVE = 2.4e-6
+"""m; beyond, NIRCam has its long-wave detectors, whose pixels are twice as wide."""
 
 _PROCESS = 1.3e9
 """Memory that the package and PyTorch take, with what a fit needs for a while, bytes."""
@@ -219,7 +227,7 @@ class GaussNewton:
         return replace(self, prior=self.prior.widened(ratios), drift=drift)
 
     @classmethod
-    def nircam(cls, **changes: Any) -> GaussNewton:
+    def nircam(cls, filter: str | None = None, **changes: Any) -> GaussNewton:
         """Return the settings for real NIRCam frames, for which the model is not exact.
 
         The prior's scales are fixed unless they are much too small, the pupil's amplitude is free
@@ -233,8 +241,23 @@ class GaussNewton:
 
         Parameters
         ----------
+        filter : str, optional
+            Such as "F356W". The finest modes move light by 40 pixels, to the edge of the square
+            that `reduce` fits: 18 cycles in F444W, 22 in F356W and 32 in F250M. Default as in
+            F444W.
         **changes
             Fields with other values.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For a name that is not one of NIRCam's filters, or a value that a field cannot have.
+
+        Examples
+        --------
+        >>> from pyklip_diffrender import GaussNewton
+        >>> GaussNewton.nircam("F356W", max_iterations=60).cycles
+        (22.0,)
         """
         preset = cls(
             free=(
@@ -258,8 +281,8 @@ class GaussNewton:
                 amplitude_slope=0.5,
             ),
             widen_prior=True,
-            # To 2.5 arcsec; finer modes cost time and leave chi-squared within 3 %.
-            cycles=(18.0,),
+            # Finer modes cost time and leave chi-squared within 3 %.
+            cycles=(_cycles_to_edge("F444W" if filter is None else filter),),
             deviations={"star_offset": 0.003, "lyot_shift": 0.004, "lyot_rotation": 0.2},
             max_companions=1,
             companion_threshold=3.0,
@@ -314,4 +337,16 @@ def _require_positive(settings: GaussNewton | Adam, *names: str) -> None:
 
 def settings_for(observation: Observation) -> GaussNewton:
     """Return the default settings for an observation: the NIRCam preset for real NIRCam frames."""
-    return GaussNewton.nircam() if observation.is_nircam else GaussNewton()
+    return GaussNewton.nircam(observation.filter) if observation.is_nircam else GaussNewton()
+
+
+def _cycles_to_edge(filter: str) -> float:
+    """Spatial frequency that moves light of a filter of NIRCam by `_REACH` pixels."""
+    name = re.match(r"F(\d{3})(W2?|M|N)$", filter)
+    if name is None:
+        raise IncompatibleSetupError(
+            f"filter: got {filter!r}, expected the name of one of NIRCam's filters, such as F444W"
+        )
+    wavelength = int(name[1]) * 1e-8
+    pixel = 0.063 if wavelength > _LONG_WAVE else 0.031
+    return float(int(_REACH * pixel * ARCSEC * JWST_DIAMETER / wavelength))

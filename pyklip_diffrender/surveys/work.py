@@ -22,6 +22,7 @@ __all__ = ["reduce_job"]
 def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str, Any]:
     """Reduce a sequence, perhaps with a planet in it, and write the products."""
     options = job.options
+    known: Any
     common: dict[str, Any] = {
         "size": options.size,
         "threshold": options.threshold,
@@ -29,25 +30,22 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
         "disk": options.disk,
         "star_flux": options.star_flux,
         "star_flux_error": options.star_flux_error,
-        "settings": GaussNewton.nircam(**options.settings) if options.settings else None,
     }
     if job.injection is not None and job.base is not None:
         fit = Refinement.read(folder.parent / job.base / "fit.fits")
         first = fit.frames[0].observation
         planet = _planet(job.injection, first.position_angle)
         science = with_planets(_with_disk(fit.frames, job), [planet])
-        sequence = Sequence(first.target, science)
-        reduction = reduce(sequence, job.opd, systematics=fit.systematics or "off", **common)
-        extra = {"recovered": _recovered(reduction, job.injection)}
+        sequence, known = Sequence(first.target, science), fit.systematics or "off"
     else:
         sequence = Sequence.from_files(job.files, target=job.target, filter=job.filter)
-        known: Any = options.systematics
+        known = options.systematics
         if known not in ("auto", "references", "off"):
             known = Systematics.read(known)
-        reduction, extra = (
-            reduce(sequence, job.opd, systematics=known, wide=options.wide, **common),
-            {},
-        )
+        common["wide"] = options.wide
+    if options.settings:
+        common["settings"] = GaussNewton.nircam(sequence.science[0].filter, **options.settings)
+    reduction = reduce(sequence, job.opd, systematics=known, **common)
     written = reduction.detection.write(folder)
     if reduction.wide is not None:
         written += reduction.wide.write(folder)
@@ -59,7 +57,10 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
     if reduction.systematics is not None:
         written.append(reduction.systematics.write(folder / "systematics.fits"))
     write_report(reduction, folder, written)
-    return {**_result(summarise(reduction)), **extra}
+    result = _result(summarise(reduction))
+    if job.injection is not None and job.base is not None:
+        result["recovered"] = _recovered(reduction, job.injection)
+    return result
 
 
 def _with_disk(frames: abc.Sequence[FrameFit], job: Job) -> list[FrameFit]:

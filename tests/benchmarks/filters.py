@@ -6,7 +6,7 @@ Run from the root of the project, with the frames of programme 1184 in ../shared
 
 Two rolls of G 7-34 keep their headers, orientation and noise, but for the filter and the mask.
 Their images are those of a finer model than that of the fit (512 samples, 15 wavelengths), with a
-wavefront that has drifted from the map for twice the time between two maps, a star 7 mas from the
+wavefront that has drifted from the map for twice the time between two maps, a star 3 mas from the
 middle of the mask, and a flat field with errors of 2 % in every pixel. `reduce` gets the files and
 the map.
 """
@@ -28,7 +28,7 @@ from pyklip_diffrender.report import summarise
 ROLLS = ("jw01184005001_03106", "jw01184006001_03106")
 FLUX = 0.3  # Jy
 FLAT = 0.02
-OFFSET = (0.004, -0.006)  # arcsec
+OFFSET = (0.002, -0.002)  # arcsec
 HOURS = 3 * 86.0
 SEPARATIONS = (0.5, 1.0, 2.0)
 
