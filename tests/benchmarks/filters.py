@@ -6,9 +6,8 @@ Run from the root of the project, with the frames of programme 1184 in ../shared
 
 Two rolls of G 7-34 keep their headers, orientation and noise, but for the filter and the mask.
 Their images are those of a finer model than that of the fit (512 samples, 15 wavelengths), with a
-wavefront that has drifted from the map for twice the time between two maps, a star 3 mas from the
-middle of the mask, and a flat field with errors of 2 % in every pixel. `reduce` gets the files and
-the map.
+wavefront 10 nm rms from the map, a star 3 mas from the middle of the mask, and a flat field with
+errors of 2 % in every pixel. `reduce` gets the files and the map.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ ROLLS = ("jw01184005001_03106", "jw01184006001_03106")
 FLUX = 0.3  # Jy
 FLAT = 0.02
 OFFSET = (0.002, -0.002)  # arcsec
-HOURS = 3 * 86.0
+CHANGE = 10e-9  # m rms
 SEPARATIONS = (0.5, 1.0, 2.0)
 
 
@@ -80,8 +79,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--planets", type=int, default=14)
     options = parser.parse_args()
-    before, after = (dr.read_opd(options.data / f"opd_2022-08-{day}.fits.gz") for day in (11, 14))
-    opd = dr.drift(before, after, hours=HOURS)
+    sensed = dr.read_opd(options.data / "opd_2022-08-14.fits.gz")
+    opd = sensed.data + dr.random_opd(5, npix=sensed.data.shape[-1], rms=CHANGE).data
     for name in options.filters:
         filter, _, mask = name.partition(":")
         mask = mask or "MASK335R"
@@ -91,7 +90,7 @@ def main() -> None:
                 (source,) = (options.data / "gto1184").glob(f"{roll}*calints*")
                 simulate(source, file, filter, mask, opd, seed)
             began = time.perf_counter()
-            result = dr.reduce(files, after, injections=options.planets)
+            result = dr.reduce(files, sensed, injections=options.planets)
         seconds = time.perf_counter() - began
         summary = summarise(result)
         planets = summary["injections"]
