@@ -31,7 +31,7 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     RefinementError,
 )
-from pyklip_diffrender.refinement import FrameFit
+from pyklip_diffrender.refinement import FrameFit, GaussNewton
 from pyklip_diffrender.surveys import execution, folders, page, runs, work
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.driver import run_survey, survey
@@ -671,8 +671,10 @@ def test_a_disk_and_the_whole_frames_are_part_of_the_job(
         def write(self, folder: Path) -> Path:
             return folder / "disk.fits"
 
-    def reduce(*_: Any, wide: bool, disk: bool, star_flux: Any, **__: Any) -> Any:
+    def reduce(*_: Any, wide: bool, disk: bool, star_flux: Any, settings: Any, **__: Any) -> Any:
         asked.append({"wide": wide, "disk": disk, "star_flux": star_flux})
+        # Other fields than those asked for are those of the preset in the filter of the frames.
+        assert settings == GaussNewton.nircam("F356W", max_iterations=7)
         return SimpleNamespace(
             detection=part, fit=part, systematics=None,
             wide=part if wide else None, disk=Disk() if disk else None,
@@ -685,14 +687,16 @@ def test_a_disk_and_the_whole_frames_are_part_of_the_job(
         "contrast_curve": {k: [1.0] for k in CURVE}, "frames": [], "wide_field": wide_field,
     }  # fmt: skip
     monkeypatch.setattr(work, "reduce", reduce)
-    monkeypatch.setattr(work.Sequence, "from_files", lambda *_, **__: None)
+    frames = SimpleNamespace(science=(SimpleNamespace(filter="F356W"),))
+    monkeypatch.setattr(work.Sequence, "from_files", lambda *_, **__: frames)
     monkeypatch.setattr(work, "summarise", lambda _: summary)
     monkeypatch.setattr(
         work, "write_report", lambda *args: written.append([each.name for each in args[2]])
     )
     config = inputs(tmp_path, 1)
     for name in ("wide", "disk"):
-        (job,) = planned({**config, "options": {name: True, "star_flux": 0.4}})
+        options = {name: True, "star_flux": 0.4, "settings": {"max_iterations": 7}}
+        (job,) = planned({**config, "options": options})
         record = work.reduce_job(job, tmp_path)
         assert [each["false_alarm_probability"] for each in record["candidates"]] == [None]
         assert record["curve"] == wide_field["contrast_curve"]

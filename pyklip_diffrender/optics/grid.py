@@ -196,7 +196,7 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
     """
     rows, columns = grid.shape
     origin = torch.tensor([grid.columns[0], grid.rows[0]], dtype=torch.float64)
-    # All polygons at once, because in forward mode every operation takes 0.3 ms.
+    # All polygons at once: the time goes to the number of operations, above all in derivatives.
     sizes = torch.tensor([len(polygon) for polygon in polygons])
     owner = torch.repeat_interleave(torch.arange(len(polygons)), sizes)
     first = (sizes.cumsum(0) - sizes)[owner]
