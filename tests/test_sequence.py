@@ -424,3 +424,40 @@ def test_rolls_share_an_unknown_pattern_where_nothing_is_known(
     for rolls in ((roll,), (roll, elsewhere), (lost, lost), (simulated, simulated)):
         assert chosen(*rolls).systematics is None
     assert chosen(roll, roll, request="off").systematics is None
+
+
+def test_a_rough_fit_tells_which_pixels_a_frame_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted, places = [], []
+    known = learn_systematics(reference_fit())
+
+    def rough_fit(*_: object, settings: GaussNewton, **options: object) -> Refinement:
+        fitted.append(settings)
+        return reference_fit()
+
+    def place(fit: Refinement, pattern: Systematics) -> Observation | None:
+        places.append(pattern)
+        return replace(lost, first_pixel=(3, 4)) if len(places) < 3 else None
+
+    monkeypatch.setattr(pattern_choice, "refine", rough_fit)
+    monkeypatch.setattr(pattern_choice, "register", place)
+    monkeypatch.setattr(pattern_choice, "known_systematics", lambda *_: known)
+    lost = frame("TARGET", 20)
+    assert lost.first_pixel is None
+    own = GaussNewton(cycles=6.0, min_model_error=0.001)
+    for settings in (own, None):
+        choice = pattern_choice.choose_systematics(
+            [lost], [], cast(OpticalSystem, None), cast(OPDMap, None), settings=settings
+        )
+        assert choice.systematics is known
+        assert [each.first_pixel for each in choice.science] == [(3, 4)]
+        assert choice.settings is settings
+    # The fit ends while the pattern, 5 % of the star, dominates what it leaves.
+    assert [each.cycles for each in fitted] == [own.cycles, GaussNewton().cycles]
+    assert [each.min_model_error for each in fitted] == [0.05, 0.05]
+    assert all(each.tolerance > 10 * GaussNewton().tolerance for each in fitted)
+    # Without a place there is no pattern.
+    choice = pattern_choice.choose_systematics(
+        [lost], [], cast(OpticalSystem, None), cast(OPDMap, None)
+    )
+    assert choice.systematics is None
+    assert choice.science == (lost,)

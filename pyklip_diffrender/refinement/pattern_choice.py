@@ -33,6 +33,11 @@ _KNOWN_MODEL_ERROR = 0.002
 from other stars: the pattern's own error is counted apart."""
 
 
+_ROUGH: dict[str, Any] = {"min_model_error": 0.05, "tolerance": 0.05, "widen_prior": False}
+"""Changes to the settings of a fit that only tells which pixels a frame shows, which the pattern
+does as soon as it dominates the residual. In thirteen frames of four stars, places differed by at
+most 0.05 pixel from those of the headers or of full fits."""
+
 _TYPICAL_PATTERN = 0.03
 _TYPICAL_PEDESTAL = 1.9
 """Rms of the pattern, and pedestal in MJy/sr, that describe the residuals of the library's stars at
@@ -204,7 +209,7 @@ def _registered(
         frame: Observation | None = each
         if each.first_pixel is None:
             with stage(f"1 of 4: place of {each.name} on the detector"):
-                frame = register(refine(model, each, opd, **common), pattern)
+                frame = register(_rough_fit(model, each, opd, **common), pattern)
         if frame is None:
             _log.warning(
                 "%s: the file does not say which pixels of the detector its frames show, and the "
@@ -213,6 +218,21 @@ def _registered(
             return science, None
         moved.append(frame)
     return moved, pattern
+
+
+def _rough_fit(
+    model: OpticalSystem,
+    observation: Observation,
+    opd: OPDMap,
+    *,
+    settings: GaussNewton | Adam | None,
+    progress: bool,
+) -> Refinement:
+    """A fit until the pattern dominates the residual."""
+    settings = settings or settings_for(observation)
+    if isinstance(settings, GaussNewton):
+        settings = replace(settings, **_ROUGH)
+    return refine(model, observation, opd, settings=settings, progress=progress)
 
 
 def _by_star(observations: Iterable[Observation]) -> dict[str, list[Observation]]:
