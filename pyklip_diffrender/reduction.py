@@ -45,6 +45,9 @@ __all__ = ["Reduction", "reduce"]
 
 _log = logging.getLogger(__name__)
 
+_SEVERAL = 3
+"""Number of candidates from which extended light is more likely than planets."""
+
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
@@ -90,6 +93,16 @@ class Reduction:
     disk: Disk | None = None
     injections: QTable | None = None
 
+    @property
+    def remark(self) -> str:
+        """What to do about candidates that are not likely to be planets; empty if they may be."""
+        if self.disk is not None or len(self.detection.table) < _SEVERAL:
+            return ""
+        return (
+            "Several candidates about one star are more often parts of a disk, or residuals of the "
+            "star, than planets: repeat the reduction with disk=True (--disk on the command line)."
+        )
+
     def __repr__(self) -> str:
         return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"
 
@@ -98,8 +111,8 @@ class Reduction:
         search = self.detection if self.wide is None else self.wide
         return (
             f"{self.sequence!r}\n{self.fit.status.message}\n"
-            f"pattern of the model's error: {known}\n{search}"
-        )
+            f"pattern of the model's error: {known}\n{search}\n{self.remark}"
+        ).rstrip()
 
     def _repr_html_(self) -> str:
         facts = {
@@ -111,6 +124,8 @@ class Reduction:
                 "none" if self.systematics is None else self.systematics.name
             ),
         }
+        if self.remark:
+            facts["Remark"] = self.remark
         head = html_summary(f"Reduction of {self.sequence.target}", facts)
         return f"{head}\n{self.detection._repr_html_()}"
 

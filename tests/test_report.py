@@ -15,12 +15,14 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import torch
 from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
 from astropy.time import Time
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.planning.choice import ModelError
@@ -143,6 +145,23 @@ def test_every_status_comes_with_advice(status: Status) -> None:
     assert advice(status, patterned=True).endswith(".")
     missing = "reference stars" in advice(status, patterned=False)
     assert missing == (status is Status.MODEL_MISMATCH)
+
+
+def test_several_candidates_suggest_a_disk() -> None:
+    whole = reduction()
+    places = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.6]])
+    three = Candidates.at(places, np.full(3, 1e-5))
+    three = replace(three, covariance=1e-12 * torch.eye(9, dtype=torch.float64))
+    crowded = replace(whole, detection=replace(whole.detection, candidates=three))
+    suggestion = "repeat the reduction with disk=True (--disk on the command line)"
+    assert len(crowded.detection.table) == 3
+    assert str(crowded).endswith(f"{suggestion}.")
+    assert suggestion in crowded._repr_html_()
+    assert suggestion in summarise(crowded)["status"]["advice"]
+    # One candidate, or light of a disk that was fitted already.
+    fitted = replace(crowded, disk=cast(dr.Disk, object()))
+    assert whole.remark == fitted.remark == ""
+    assert "disk" not in str(whole)
 
 
 @pytest.mark.parametrize(

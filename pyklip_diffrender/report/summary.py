@@ -18,7 +18,7 @@ from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.reduction import Reduction
 from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement
-from pyklip_diffrender.report.words import MANY, advice, sentence
+from pyklip_diffrender.report.words import advice, sentence
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["summarise", "wavefronts"]
@@ -66,7 +66,7 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
             "advice": advice(
                 fit.status,
                 patterned=reduction.systematics is not None,
-                many=reduction.disk is None and len(detection.table) >= MANY,
+                remark=reduction.remark,
             ),
             "usable": fit.status.usable,
             "calibrated": fit.status.calibrated,

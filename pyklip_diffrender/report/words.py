@@ -9,7 +9,6 @@ from typing import Any
 from pyklip_diffrender.refinement import Status
 
 __all__ = [
-    "MANY",
     "advice",
     "number",
     "plus_minus",
@@ -58,16 +57,7 @@ _REFERENCES = (
 )
 
 
-MANY = 3
-"""Number of candidates from which extended light is likely."""
-
-_EXTENDED = (
-    " Several candidates about one star are more often parts of a disk, or residuals of the star, "
-    "than planets: repeat the reduction with --disk, reduce(disk=True) in Python."
-)
-
-
-def advice(status: Status, *, patterned: bool, many: bool = False) -> str:
+def advice(status: Status, *, patterned: bool, remark: str = "") -> str:
     """What to do about the status of a fit.
 
     Parameters
@@ -75,13 +65,11 @@ def advice(status: Status, *, patterned: bool, many: bool = False) -> str:
     status : Status
     patterned : bool
         Whether the pattern of the model's error was known.
-    many : bool
-        Whether there are so many candidates that extended light is likely.
+    remark : str
+        What else there is to say about the reduction.
     """
-    if status is not Status.MODEL_MISMATCH:
-        return _ADVICE[status]
-    missing = "" if patterned else _REFERENCES
-    return _ADVICE[status] + missing + (_EXTENDED if many else "")
+    missing = _REFERENCES if status is Status.MODEL_MISMATCH and not patterned else ""
+    return f"{_ADVICE[status]}{missing} {remark}".rstrip()
 
 
 def sentence(summary: Mapping[str, Any]) -> str:
