@@ -179,9 +179,10 @@ def reduce(
     Parameters
     ----------
     sequence : Sequence, or files as for `Sequence.from_files`
-    opd : path, OPDMap, Quantity or array
+    opd : path, OPDMap, Quantity, array or "flat"
         The wavefront to start from, as for `refine`. Of a folder of maps, the one nearest in time
-        is taken; see `choose_map` for other rules.
+        is taken; see `choose_map` for other rules. "flat" is for frames without a map: the fit
+        then takes longer.
     target, filter : str, optional
         See `Sequence.from_files`.
     size : int

@@ -335,6 +335,16 @@ def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(
     assert "HIP-3" in capsys.readouterr().err
 
 
+def test_frames_without_a_map_start_from_a_flat_wavefront(
+    tmp_path: Path, frames: Path, reduced: list[StubReduction], capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["reduce", str(frames), "--opd", "flat", "-o", str(tmp_path / "products")]
+    assert main(arguments) == 0
+    assert "wavefront map: flat wavefront\n" in capsys.readouterr().out
+    (call,) = reduced
+    assert not call.arguments["opd"].data.any()
+
+
 def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
     sequence = Sequence.from_files(frames)
     names = [name for name, _ in steps_of(sequence, 6, "auto")]

@@ -22,6 +22,7 @@ from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import sha256
 from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
 from pyklip_diffrender.wavefront.bases import SegmentMotions
 from pyklip_diffrender.wavefront.opd import (
     OPDMap,
@@ -123,6 +124,15 @@ def test_an_implausible_rms_warns_and_names_the_unit_that_would_do(
 
 def test_a_flat_wavefront_is_plausible() -> None:
     assert not as_opd_map(np.zeros((NPIX, NPIX))).data.any()
+
+
+def test_flat_stands_for_a_flat_wavefront() -> None:
+    flat = as_opd_map("flat")
+    assert flat.name == "flat wavefront"
+    assert flat.date is None
+    assert flat.shape == (256, 256)
+    assert not flat.data.any()
+    assert not starting_opd(DiffrenderSettings(opd="flat"), None).data.any()
 
 
 # -- holes -----------------------------------------------------------------------------------

@@ -389,10 +389,10 @@ def _map(sequence: Sequence, opd: Path | None, folder: Path | None, rule: str | 
     """The wavefront map that the options ask for."""
     from pyklip_diffrender.bridges.wss import load_wss_opd_by_date
     from pyklip_diffrender.wavefront.map_choice import choose_map
-    from pyklip_diffrender.wavefront.opd import read_opd
+    from pyklip_diffrender.wavefront.opd import as_opd_map
 
     if opd is not None:
-        return read_opd(opd)
+        return as_opd_map(str(opd))
     date, rule = sequence.date, rule or "nearest"
     if date is None:
         raise IncompatibleSetupError(

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
 from pyklip_diffrender.wavefront.map_choice import RULES, Rule, choose_map, wavefront_for
-from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
+from pyklip_diffrender.wavefront.opd import FLAT, OPDMap, as_opd_map
 
 if TYPE_CHECKING:
     from pyklip_diffrender.planning import Plan
@@ -60,7 +60,8 @@ class DiffrenderSettings:
     opd : path, ndarray, Quantity or OPDMap, optional
         Wavefront map to start from: a FITS file, or a square array in metres, OTE entrance-pupil
         orientation. There is no default: a reduction without one raises `MissingOPDError`. Of a
-        folder of maps, the one closest in time to the frames is taken.
+        folder of maps, the one closest in time to the frames is taken; "flat" stands for a flat
+        wavefront.
     opd_folder : path, optional
         Folder of maps from which `opd` chooses: "closest", the last one "before" the frames, the
         first one "after" them, or "interpolate"; see `choose_map`.
@@ -229,9 +230,10 @@ def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
             "FITS file, an array in metres or a Quantity, in one of three ways: "
             "register(opd=...) once; `with backend(opd=...):` around klip_dataset; or "
             "dataset.diffrender = DiffrenderSettings(opd=...). For JWST, take the map measured "
-            "closest in time to the observation, or give the folder with your maps"
+            "closest in time to the observation, or give the folder with your maps; opd='flat' "
+            "starts without one"
         )
-    if isinstance(opd, str | os.PathLike):
+    if isinstance(opd, str | os.PathLike) and opd != FLAT:
         path = Path(opd).resolve()
         # A contrast curve reads the same map for each of its 120 reductions.
         state = path.stat() if path.is_file() else None

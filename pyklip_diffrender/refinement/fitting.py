@@ -55,9 +55,9 @@ def refine(
         each has its own star position, flux and background (`GaussNewton.own`), their wavefront
         is shared, or differs by as much as `GaussNewton.drift` allows, and companions rotate with
         the position angle.
-    opd : path, OPDMap, Quantity or array
+    opd : path, OPDMap, Quantity, array or "flat"
         The wavefront to start from, entrance-pupil orientation; bare arrays in metres. It is
-        resampled to the model's pupil.
+        resampled to the model's pupil. "flat" stands for a flat wavefront.
     settings : GaussNewton or Adam, optional
         Default `GaussNewton.nircam()` for frames whose header says NIRCam, else `GaussNewton()`.
     start : dict or sequence of dict, optional
@@ -105,7 +105,7 @@ def refine(
     if opd is None:
         raise MissingOPDError(
             "refine needs a wavefront to start from: a path to an OPD map, an array in metres, "
-            "or random_opd(seed) to try things out"
+            "'flat' if there is none, or random_opd(seed) to try things out"
         )
     if not isinstance(model, OpticalSystem):
         raise IncompatibleSetupError(

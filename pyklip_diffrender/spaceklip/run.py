@@ -81,7 +81,7 @@ def run_obs(
         STARCENX, STARCENY: aligned ones, usually. Other concatenations are skipped.
     opd : path, OPDMap, Quantity or array
         The wavefront to start from; see `DiffrenderSettings`. Of a folder of maps, the one nearest
-        in time is taken.
+        in time is taken; "flat" stands for a flat wavefront.
     restrict_to : str, optional
         Only concatenations whose name contains this.
     subdir : str

@@ -31,7 +31,22 @@ from pyklip_diffrender.io.units import native_float64, to_metres, to_number, war
 from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import FourierModes, SegmentMotions
 
-__all__ = ["OPDMap", "as_opd_map", "drift", "random_drift", "random_opd", "read_opd", "resample"]
+__all__ = [
+    "FLAT",
+    "OPDMap",
+    "as_opd_map",
+    "drift",
+    "random_drift",
+    "random_opd",
+    "read_opd",
+    "resample",
+]
+
+FLAT = "flat"
+"""What stands for a flat wavefront in place of a map."""
+
+_FLAT_SAMPLES = 256
+"""Samples across it; a flat wavefront is the same with any number."""
 
 
 def read_opd(
@@ -112,14 +127,14 @@ def read_opd(
         raise CorruptFileError(
             f"{path.name}: all values of the map are zero, expected a measured wavefront. Choose "
             f"the HDU with extension=, out of {[each.name or k for k, each in enumerate(hdus)]}, "
-            "or pass an array of zeros where a flat wavefront is meant"
+            f"or give {FLAT!r} in place of the file where a flat wavefront is meant"
         )
     date = sensing_date(header, path.name)
     return _checked(OPDMap(data, date, path.name, sha256(path)))
 
 
 def as_opd_map(opd: Any, name: str = "array") -> OPDMap:
-    """Make an `OPDMap` of a path, Quantity, array, tensor or map; bare numbers are metres.
+    """Make an `OPDMap` of a path, Quantity, array, tensor, map or "flat"; bare numbers are metres.
 
     Raises
     ------
@@ -128,6 +143,8 @@ def as_opd_map(opd: Any, name: str = "array") -> OPDMap:
     """
     if isinstance(opd, OPDMap):
         return opd
+    if isinstance(opd, str) and opd == FLAT:
+        opd, name = np.zeros((_FLAT_SAMPLES, _FLAT_SAMPLES)), "flat wavefront"
     if isinstance(opd, str | os.PathLike):
         return read_opd(opd)
     data = to_metres(opd, "opd")
