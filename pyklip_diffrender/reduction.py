@@ -35,7 +35,11 @@ from pyklip_diffrender.refinement import (
     to_jansky,
     with_star_flux,
 )
-from pyklip_diffrender.refinement.pattern_choice import PatternRequest, choose_systematics
+from pyklip_diffrender.refinement.pattern_choice import (
+    PatternChoice,
+    PatternRequest,
+    choose_systematics,
+)
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.scene.sequence import Sequence
@@ -262,26 +266,30 @@ def reduce(
         for each in sequence.science:
             require_calibrated(each)
     model = model_for(sequence.science[0], size, device=device)
-    whole, sequence = sequence.science, sequence.cutout(size)
-    choice = choose_systematics(
-        sequence.science,
-        sequence.references,
-        model,
-        wavefront,
-        systematics=systematics,
-        settings=settings,
-        memory=limit,
-        progress=progress,
-    )
-    sequence = replace(sequence, science=choice.science)
-    options: dict[str, Any] = {
-        "systematics": choice.systematics,
-        "settings": choice.settings,
-        "progress": progress,
-    }
+    whole, cut = sequence.science, sequence.cutout(size)
+
+    def chosen(**options: Any) -> PatternChoice:
+        return choose_systematics(
+            cut.science,
+            cut.references,
+            model,
+            wavefront,
+            systematics=systematics,
+            settings=settings,
+            memory=limit,
+            progress=progress,
+            **options,
+        )
 
     def fitted(science: tuple[Observation, ...]) -> Refinement:
-        fit = refine(model, science, wavefront, **options)
+        fit = refine(
+            model,
+            science,
+            wavefront,
+            systematics=choice.systematics,
+            settings=choice.settings,
+            progress=progress,
+        )
         if jansky is None:
             return fit
         return with_star_flux(fit, jansky, star_flux_error, progress=progress)
@@ -289,8 +297,14 @@ def reduce(
     def searched(science: tuple[Observation, ...]) -> Detection:
         return detect(fitted(science), threshold=threshold, progress=progress)
 
+    choice = chosen()
     with stage("2 of 4: wavefront"):
-        fit = fitted(sequence.science)
+        fit = fitted(choice.science)
+    if choice.is_refuted_by(fit):
+        choice = chosen(library=False)
+        with stage("2 of 4: wavefront, without the pattern of the library"):
+            fit = fitted(choice.science)
+    sequence = replace(cut, science=choice.science)
     extended = None
     if disk:
         with stage("2 of 4: extended light, and wavefront without it"):

@@ -27,11 +27,13 @@ from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     observation_from_dataset,
     register,
+    subtract_by_refinement,
     unregister,
 )
 from pyklip_diffrender.pyklip_backend.frames import frames_of
-from pyklip_diffrender.pyklip_backend.references import References, pattern_for
-from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
+from pyklip_diffrender.pyklip_backend.references import ChosenPattern, References, pattern_for
+from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Systematics
+from pyklip_diffrender.refinement.pattern_choice import PatternChoice
 from pyklip_diffrender.scene.observation import Observation
 
 CARDS = {"SUBSTRT1": 492, "SUBSTRT2": 1502, "DETECTOR": "NRCALONG"}
@@ -239,7 +241,7 @@ def test_which_pattern_is_used(
         stars.append(frames[0].target)
         return SimpleNamespace(frames=[SimpleNamespace(observation=each) for each in frames])
 
-    def known(observation: Observation, references: Any = ()) -> Systematics | None:
+    def known(observation: Observation, references: Any = (), **options: Any) -> Any:
         names = ["REF"] * bool(references) + ["OTHER"] * library
         flat = np.zeros(observation.shape)
         made = Systematics(flat, flat + 0.1, (15.5, 15.5), 0.1, provenance={"stars": names})
@@ -254,16 +256,49 @@ def test_which_pattern_is_used(
     references = References(frames=(frame("REF"), frame("REF")))
     model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
     told: list[str] = []
-    chosen = pattern_for([frame("TARGET")], references, model, OPD, settings, told.append)
+    # Two rolls, which would share a pattern of their own if nothing else were known.
+    science = [frame("TARGET"), frame("TARGET")]
+    chosen = pattern_for(science, references, model, OPD, settings, told.append)
     assert stars == fitted
     assert (chosen.label, chosen.reference_frames) == (label, used)
-    assert (chosen.systematics is None) == (label == "none")
+    assert (chosen.choice.systematics is None) == (label == "none")
     assert told == [
         "fitting the reference stars" if fitted else "the reference frames are not needed"
     ]
     if label != "none":
         # The pattern's own error takes the place of most of the model's.
-        assert chosen.settings == GaussNewton.nircam(min_model_error=0.002)
+        assert chosen.choice.settings == GaussNewton.nircam(min_model_error=0.002)
+
+
+def test_a_library_of_another_flat_field_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fit is repeated with what there is besides the library."""
+    patterns: list[str] = []
+    zeros = np.zeros((32, 32))
+
+    def chosen(*_: Any, library: bool = True) -> ChosenPattern:
+        name = "library" if library else "references"
+        pattern = Systematics(zeros, zeros + 0.1, (15.5, 15.5), 0.1, name=name)
+        choice = PatternChoice((simulated,), pattern, settings.fit, from_library=library)
+        return ChosenPattern(choice, name)
+
+    def lacks(fit: Refinement) -> bool:
+        assert fit.systematics is not None
+        patterns.append(fit.systematics.name)
+        return True
+
+    simulated = replace(frame("TARGET"), header=fits.Header())
+    model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
+    fit = GaussNewton(free=("flux", "background"), wavefront=False)
+    settings = DiffrenderSettings(model=model, fit=fit, max_chi2=np.inf)
+    subtract = "pyklip_diffrender.pyklip_backend.subtract"
+    monkeypatch.setattr(f"{subtract}.pattern_for", chosen)
+    monkeypatch.setattr("pyklip_diffrender.refinement.pattern_choice.lacks_pattern", lacks)
+    told: list[str] = []
+    with pytest.warns(DiffrenderWarning):  # The star is not one of this model.
+        result = subtract_by_refinement(simulated, OPD, settings, tell=told.append)
+    assert result.systematics == "references"
+    assert patterns == ["library"]
+    assert "the frames do not show the pattern of the library" in told
 
 
 def test_references_that_are_asked_for_must_be_there() -> None:
@@ -279,7 +314,8 @@ def test_simulations_and_the_adam_recipe_use_no_pattern_by_default() -> None:
     for science, fit in ((simulated, None), (frame("TARGET"), Adam())):
         settings = DiffrenderSettings(fit=fit)
         chosen = pattern_for([science], References(), model, OPD, settings, print)
-        assert (chosen.systematics, chosen.settings, chosen.label) == (None, fit, "none")
+        choice = chosen.choice
+        assert (choice.systematics, choice.settings, chosen.label) == (None, fit, "none")
 
 
 # Which wavefront map is used

@@ -39,6 +39,7 @@ from pyklip_diffrender.pyklip_backend.references import ChosenPattern
 from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
 from pyklip_diffrender.refinement import Adam, GaussNewton, Status, Systematics, refine
+from pyklip_diffrender.refinement.pattern_choice import PatternChoice
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
@@ -491,7 +492,7 @@ def test_frames_that_were_moved_for_the_fit_are_subtracted_where_they_are(
         (frame,) = science
         shifted = shift_frames(frame.data, away[np.newaxis])
         registered = replace(frame, data=shifted, center=frame.center + away)
-        return ChosenPattern((registered,), None, settings.fit)
+        return ChosenPattern(PatternChoice((registered,), None, settings.fit))
 
     monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract.pattern_for", moved)
     settings = DiffrenderSettings(model=small, fit=ALIGNED, start={"star_offset": (0.02, 0.0)})

@@ -26,7 +26,7 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.planning.choice import ModelError
-from pyklip_diffrender.refinement import Status
+from pyklip_diffrender.refinement import Status, pattern_size
 from pyklip_diffrender.report import summarise, write_report
 from pyklip_diffrender.report.html import page
 from pyklip_diffrender.report.words import (
@@ -145,6 +145,22 @@ def test_every_status_comes_with_advice(status: Status) -> None:
     assert advice(status, patterned=True).endswith(".")
     missing = "reference stars" in advice(status, patterned=False)
     assert missing == (status is Status.MODEL_MISMATCH)
+
+
+def test_the_report_says_how_much_of_the_pattern_is_there() -> None:
+    whole = reduction()
+    assert summarise(whole)["systematics"] is None
+    (frame,) = whole.fit.frames
+    pattern = 0.02 * np.random.default_rng(5).normal(size=frame.star.shape)
+    x, y = frame.observation.center[0].tolist()
+    known = dr.Systematics(pattern, 0 * pattern + 0.01, (x, y), 0.02, name="HD 3")
+    fit = replace(whole.fit, frames=(replace(frame, gain=1 + pattern),), systematics=known)
+    used = summarise(replace(whole, fit=fit, systematics=known))["systematics"]
+    size = pattern_size(fit)
+    assert size is not None
+    assert (used["size"], used["size_error"]) == size
+    # The residual, which is noise, is taken for what is left with the pattern.
+    assert abs(size[0] - 1) < 5 * size[1] < 0.5
 
 
 def test_several_candidates_suggest_a_disk() -> None:

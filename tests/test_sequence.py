@@ -348,16 +348,19 @@ def test_reduce_says_what_systematics_it_takes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("systematics", "library", "fits"),
+    ("systematics", "library", "shown", "fits"),
     [
-        ("auto", True, ["TARGET"]),
-        ("auto", False, ["REF", "TARGET"]),
-        ("references", True, ["REF", "TARGET"]),
-        ("off", True, ["TARGET"]),
+        ("auto", True, True, ["TARGET"]),
+        ("auto", False, True, ["REF", "TARGET"]),
+        ("references", True, True, ["REF", "TARGET"]),
+        ("off", True, True, ["TARGET"]),
+        # The library is of another flat field.
+        ("auto", True, False, ["TARGET", "REF", "TARGET"]),
+        ("references", True, False, ["REF", "TARGET"]),
     ],
 )
 def test_references_are_fitted_only_where_they_are_needed(
-    monkeypatch: pytest.MonkeyPatch, systematics: str, library: bool, fits: list[str]
+    monkeypatch: pytest.MonkeyPatch, systematics: str, library: bool, shown: bool, fits: list[str]
 ) -> None:
     fitted, patterns = [], []
     known = learn_systematics(reference_fit())
@@ -369,13 +372,16 @@ def test_references_are_fitted_only_where_they_are_needed(
         patterns.append(options.get("systematics"))
         return reference_fit()
 
-    def from_library(observation: Observation, references: object = ()) -> Systematics | None:
+    def from_library(
+        observation: Observation, references: object = (), **options: object
+    ) -> Systematics | None:
         return known if library or references else None
 
     choosing = "pyklip_diffrender.refinement.pattern_choice"
     for module in ("pyklip_diffrender.reduction", choosing):
         monkeypatch.setattr(f"{module}.refine", fit)
     monkeypatch.setattr(f"{choosing}.known_systematics", from_library)
+    monkeypatch.setattr(f"{choosing}.lacks_pattern", lambda fit: not shown)
     monkeypatch.setattr("pyklip_diffrender.reduction.detect", lambda fit, **options: None)
     there = replace(frame("TARGET", 20), first_pixel=(0, 0))
     sequence = Sequence("TARGET", (there,), (frame("REF", 10), frame("REF", 11)))
@@ -383,7 +389,7 @@ def test_references_are_fitted_only_where_they_are_needed(
     assert fitted == fits
     assert patterns[-1] is (None if systematics == "off" else known)
     assert result.systematics is patterns[-1]
-    assert len(result.references) == len(fits) - 1
+    assert len(result.references) == fits.count("REF")
 
 
 def test_rolls_share_an_unknown_pattern_where_nothing_is_known(

@@ -20,6 +20,7 @@ from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, 
 from pyklip_diffrender.refinement.learning import (
     learn_systematics,
 )
+from pyklip_diffrender.refinement.pattern_match import lacks_pattern, pattern_size
 from pyklip_diffrender.refinement.pedestal import light_and_residual, pattern_pedestal
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.problem import Problem
@@ -205,6 +206,34 @@ def test_frames_fitted_together_have_the_pattern_each_at_its_star() -> None:
     assert fit.status is Status.CONVERGED
     assert fit.reduced_chi2 == pytest.approx(1.0, abs=0.1)
     np.testing.assert_array_equal(fit.frames[1].gain[1:, 2:], 1 + pattern()[:-1, :-2])
+
+
+@pytest.mark.parametrize("size", [1.0, 0.6, 0.0])
+def test_frames_tell_how_much_of_a_pattern_they_show(
+    size: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Another flat field may have removed a part of the pattern, or all of it."""
+    spoilt = observed(light() * (1 + size * pattern()) + light(PLANET), 53)
+    fit = fitted(spoilt, known(0.01))
+    measured = pattern_size(fit)
+    assert measured is not None
+    assert measured[0] == pytest.approx(size, abs=0.1)
+    assert 0 < measured[1] < 0.05
+    assert lacks_pattern(fit) is (size < 0.5)
+    warnings = [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
+    assert len(warnings) == (size < 0.5)
+    assert all("flat-field pattern of measured" in each for each in warnings)
+
+
+def test_a_fit_without_a_known_pattern_says_nothing_about_it() -> None:
+    spoilt = observed(light(), 54)
+    zeros = np.zeros((SIZE, SIZE))
+    for systematics in (None, Systematics(zeros, zeros + 0.01, MIDDLE, RMS)):
+        fit = fitted(spoilt, systematics)
+        assert pattern_size(fit) is None
+        assert not lacks_pattern(fit)
+    with_it = fitted(spoilt, known(0.01))
+    assert pattern_size(replace(with_it, linear=None)) is None
 
 
 @cache

@@ -22,7 +22,7 @@ from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:
     from pyklip_diffrender.optics.system import OpticalSystem
-    from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
+    from pyklip_diffrender.refinement.pattern_choice import PatternChoice
 
 __all__ = [
     "ChosenPattern",
@@ -79,22 +79,18 @@ class References:
 
 @dataclass(frozen=True, eq=False)
 class ChosenPattern:
-    """The pattern of the model's error for a fit, see `PatternChoice`.
+    """The pattern of the model's error for a fit, and where it comes from.
 
     Attributes
     ----------
-    science : tuple of Observation
-    systematics : Systematics or None
-    settings : GaussNewton, Adam or None
+    choice : PatternChoice
     label : str
         What the pattern is, in a few words.
     reference_frames : int
         Number of frames of reference stars that it was learned from.
     """
 
-    science: tuple[Observation, ...]
-    systematics: Systematics | None
-    settings: GaussNewton | Adam | None
+    choice: PatternChoice
     label: str = "none"
     reference_frames: int = 0
 
@@ -161,6 +157,8 @@ def pattern_for(
     opd: OPDMap,
     settings: DiffrenderSettings,
     tell: Callable[[str], None],
+    *,
+    library: bool = True,
 ) -> ChosenPattern:
     """Choose the pattern of the model's error as `reduce` does.
 
@@ -175,6 +173,8 @@ def pattern_for(
         Without `systematics`, real NIRCam frames get "auto", others "off".
     tell : callable
         Called with a line of text before reference stars are fitted.
+    library : bool
+        False leaves the package's library out.
 
     Raises
     ------
@@ -197,12 +197,18 @@ def pattern_for(
 
     def choose(request: Any, others: Sequence[Observation]) -> Any:
         return choose_systematics(
-            science, others, model, opd, systematics=request, settings=settings.fit
+            science,
+            others,
+            model,
+            opd,
+            systematics=request,
+            library=library,
+            settings=settings.fit,
         )
 
     first = "off" if requested == "references" else requested
     choice = choose(first, [])
-    needed = requested == "references" or (requested == "auto" and choice.systematics is None)
+    needed = requested == "references" or (requested == "auto" and not choice.from_library)
     if needed and references:
         tell("fitting the reference stars")
         choice = choose("references", references.cut(model.detector.shape, science[0]))
@@ -214,8 +220,8 @@ def pattern_for(
     if isinstance(requested, Systematics):
         label = f"given ({requested.name})"
     elif choice.systematics is not None:
-        library = [n for n in choice.systematics.provenance.get("stars", []) if n not in stars]
-        parts = [("references", stars), ("library", library)]
+        others = [n for n in choice.systematics.provenance.get("stars", []) if n not in stars]
+        parts = [("references", stars), ("library", others)]
         label = ", ".join(f"{origin} ({', '.join(names)})" for origin, names in parts if names)
     used = sum(map(len, learned)) if choice.systematics is not None else 0
-    return ChosenPattern(choice.science, choice.systematics, choice.settings, label, used)
+    return ChosenPattern(choice, label, used)

@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 from pyklip_diffrender.pyklip_backend.pointings import Pointing, pointings_of
-from pyklip_diffrender.pyklip_backend.references import References, pattern_for
+from pyklip_diffrender.pyklip_backend.references import (
+    ChosenPattern,
+    References,
+    pattern_for,
+)
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.verdict import (
     require_plausible,
@@ -167,39 +171,20 @@ def subtract_by_refinement(
         If a fit has not converged to a model that explains the data.
     """
     model = model_of(observation, settings)
-    # Takes a second to import, so only after the input has been checked.
-    from pyklip_diffrender.refinement import Adam, refine
-
-    seed = SEED if settings.seed is None else settings.seed
     groups = list(pointings_of(observation) if pointings is None else pointings)
     windows = [Window.about(g.observation.center[0], model.detector.shape) for g in groups]
     cut = [window.of(group.observation) for window, group in zip(windows, groups, strict=True)]
     references = References() if references is None else references
     pattern = pattern_for(cut, references, model, opd, settings, tell)
-    adam = isinstance(settings.fit, Adam)
-    # The Adam recipe takes one observation at a time.
-    together = [(k,) for k in range(len(groups))] if adam else [tuple(range(len(groups)))]
-    tell(
-        f"fitting {_counted(len(observation), 'frame')} of {_counted(len(groups), 'pointing')}"
-        f"{'' if adam or len(groups) == 1 else ' together'}, {model.detector.shape[1]} x "
-        f"{model.detector.shape[0]} pixels, pattern of the model's error: {pattern.label}"
-    )
-    results: list[Refinement] = []
-    for chosen in together:
-        name = cut[chosen[0]].name
-        result = refine(
-            model,
-            [pattern.science[k] for k in chosen],
-            opd,
-            settings=pattern.settings,
-            start=settings.start,
-            systematics=pattern.systematics,
-            plan="auto" if settings.plan is None else settings.plan,
-            seed=seed,
-        )
-        require_plausible(name, result, settings.max_chi2)
-        tell(f"{_described(result)}, {result.seconds:.0f} s")
-        results.append(result)
+    together, results = _refined(pattern, model, opd, settings, tell)
+    if any(pattern.choice.is_refuted_by(result) for result in results):
+        tell("the frames do not show the pattern of the library")
+        pattern = pattern_for(cut, references, model, opd, settings, tell, library=False)
+        together, results = _refined(pattern, model, opd, settings, tell)
+    # Takes a second to import, so only after the input has been checked.
+    from pyklip_diffrender.refinement import Adam
+
+    adam, seed = isinstance(settings.fit, Adam), _seed_of(settings)
     keep, error_factor = settings.keep_detected, None
     if (observation.is_nircam and not adam) if keep is None else keep:
         results, error_factor = _with_companions(results, tell)
@@ -226,6 +211,49 @@ def subtract_by_refinement(
         tuple(fitted),
         error_factor,
     )
+
+
+def _refined(
+    pattern: ChosenPattern,
+    model: OpticalSystem,
+    opd: OPDMap,
+    settings: DiffrenderSettings,
+    tell: Callable[[str], None],
+) -> tuple[list[tuple[int, ...]], list[Refinement]]:
+    """Fit all pointings; the numbers of those that were fitted together, and the fits."""
+    from pyklip_diffrender.refinement import Adam, refine
+
+    science = pattern.choice.science
+    adam = isinstance(settings.fit, Adam)
+    # The Adam recipe takes one observation at a time.
+    everything = tuple(range(len(science)))
+    together: list[tuple[int, ...]] = [(k,) for k in everything] if adam else [everything]
+    tell(
+        f"fitting {_counted(sum(map(len, science)), 'frame')} of "
+        f"{_counted(len(science), 'pointing')}"
+        f"{'' if adam or len(science) == 1 else ' together'}, {model.detector.shape[1]} x "
+        f"{model.detector.shape[0]} pixels, pattern of the model's error: {pattern.label}"
+    )
+    results: list[Refinement] = []
+    for chosen in together:
+        result = refine(
+            model,
+            [science[k] for k in chosen],
+            opd,
+            settings=pattern.choice.settings,
+            start=settings.start,
+            systematics=pattern.choice.systematics,
+            plan="auto" if settings.plan is None else settings.plan,
+            seed=_seed_of(settings),
+        )
+        require_plausible(science[chosen[0]].name, result, settings.max_chi2)
+        tell(f"{_described(result)}, {result.seconds:.0f} s")
+        results.append(result)
+    return together, results
+
+
+def _seed_of(settings: DiffrenderSettings) -> int:
+    return SEED if settings.seed is None else settings.seed
 
 
 def _described(result: Refinement) -> str:

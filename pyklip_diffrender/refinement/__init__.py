@@ -6,6 +6,7 @@ from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.learning import learn_systematics
 from pyklip_diffrender.refinement.library import known_systematics
+from pyklip_diffrender.refinement.pattern_match import pattern_size
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
@@ -29,6 +30,7 @@ __all__ = [
     "jansky_per_unit",
     "known_systematics",
     "learn_systematics",
+    "pattern_size",
     "refine",
     "refine_again",
     "require_calibrated",

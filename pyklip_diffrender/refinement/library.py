@@ -32,7 +32,10 @@ _COVERED = 0.5
 
 
 def known_systematics(
-    observation: Observation, references: Refinement | Sequence[Refinement] = ()
+    observation: Observation,
+    references: Refinement | Sequence[Refinement] = (),
+    *,
+    library: bool = True,
 ) -> Systematics | None:
     """Pattern of the model's error from reference stars and from the package's own library.
 
@@ -43,6 +46,8 @@ def known_systematics(
         planets is in the pattern.
     references : Refinement or sequence of Refinement
         Fits of reference stars, if there are any.
+    library : bool
+        False leaves the library out.
 
     Returns
     -------
@@ -61,12 +66,12 @@ def known_systematics(
     >>> print(dr.known_systematics(frame))
     <Systematics 'HIP17695, G-7-34': F444W, 80 x 80 pixels>
     """
-    library = _library_for(observation)
-    pedestal = library[0].pedestal if library else None
+    known = _library_for(observation) if library else []
+    pedestal = known[0].pedestal if known else None
     patterns = measure_patterns(references, pedestal)
     stars = {_plain(pattern.star) for pattern in patterns} | {_plain(observation.target)}
     if all(pattern.first_pixel is not None for pattern in patterns):
-        patterns += [each for each in library if _plain(each.star) not in stars]
+        patterns += [each for each in known if _plain(each.star) not in stars]
     return combine_patterns(patterns) if len(patterns) > 1 else None
 
 

@@ -15,6 +15,7 @@ from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.library import known_systematics
+from pyklip_diffrender.refinement.pattern_match import lacks_pattern
 from pyklip_diffrender.refinement.registration import register
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
@@ -61,6 +62,8 @@ class PatternChoice:
         One for each reference star that was fitted.
     failed : tuple of (str, str)
         Reference stars that could not be fitted, and why.
+    from_library : bool
+        Whether the pattern is that of the package's library alone.
     """
 
     science: tuple[Observation, ...]
@@ -68,6 +71,11 @@ class PatternChoice:
     settings: GaussNewton | Adam | None
     references: tuple[Refinement, ...] = ()
     failed: tuple[tuple[str, str], ...] = ()
+    from_library: bool = False
+
+    def is_refuted_by(self, fit: Refinement) -> bool:
+        """Whether a fit with the library's pattern shows that the frames do not have it."""
+        return lacks_pattern(fit) and self.from_library
 
 
 def require_request(systematics: object) -> None:
@@ -88,6 +96,7 @@ def choose_systematics(
     opd: OPDMap,
     *,
     systematics: PatternRequest = "auto",
+    library: bool = True,
     settings: GaussNewton | Adam | None = None,
     memory: float | None = None,
     progress: bool = False,
@@ -107,6 +116,9 @@ def choose_systematics(
         "auto" takes the pattern of the library, and fits the references only where it has none;
         "references" fits them in any case and uses both. Where neither knows anything, rolls that
         show the same pixels of the detector share a pattern of which only the size is known.
+    library : bool
+        False leaves the library out, for frames that do not show its pattern, see
+        `PatternChoice.is_refuted_by`.
     settings : GaussNewton or Adam, optional
         Of the fits; default those of `refine`.
     memory : float, optional
@@ -129,22 +141,26 @@ def choose_systematics(
     fits: list[Refinement] = []
     failed: list[tuple[str, str]] = []
     pattern = systematics if isinstance(systematics, Systematics) else None
+    from_library = False
     if systematics in ("auto", "references"):
         first = science[0]
-        if systematics == "auto":
+        if systematics == "auto" and library:
             pattern = known_systematics(first)
             if pattern is not None:
                 science, pattern = _registered(science, pattern, model, opd, common)
+                from_library = pattern is not None
         if pattern is None and references:
             fits, failed = _fit_references(references, model, opd, common)
-            pattern = known_systematics(first, fits)
+            pattern = known_systematics(first, fits, library=library)
         if pattern is None:
             pattern = _unknown_pattern(science)
         _log.info("pattern of the model's error: %s", pattern)
     if pattern is not None and settings is None and science[0].is_nircam:
         settings = replace(settings_for(science[0]), min_model_error=_KNOWN_MODEL_ERROR)
     settings = _limited(settings, science[0], memory)
-    return PatternChoice(tuple(science), pattern, settings, tuple(fits), tuple(failed))
+    return PatternChoice(
+        tuple(science), pattern, settings, tuple(fits), tuple(failed), from_library
+    )
 
 
 def _limited(

@@ -143,6 +143,8 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     if used is not None:
         stars = ", ".join(used["stars"])
         pattern = used["name"] if stars in ("", used["name"]) else f"{used['name']} ({stars})"
+        if used["size"] is not None:
+            pattern += f"; {plus_minus(used['size'], used['size_error'])} of it seen"
     star = summary["star"]
     flux = []
     if star is not None:

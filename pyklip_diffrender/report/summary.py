@@ -17,7 +17,7 @@ from pyklip_diffrender import __version__
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.reduction import Reduction
-from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement
+from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement, pattern_size
 from pyklip_diffrender.report.words import advice, sentence
 from pyklip_diffrender.scene.observation import Observation
 
@@ -144,7 +144,8 @@ def _systematics(reduction: Reduction) -> dict[str, Any] | None:
     if used is None:
         return None
     provenance = {key: used.provenance.get(key, []) for key in ("stars", "frames")}
-    return {"name": used.name, **provenance}
+    size, error = pattern_size(reduction.fit) or (None, None)
+    return {"name": used.name, **provenance, "size": size, "size_error": error}
 
 
 def _star(detection: Detection) -> dict[str, Any] | None:
