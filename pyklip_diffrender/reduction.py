@@ -52,6 +52,10 @@ _log = logging.getLogger(__name__)
 _SEVERAL = 3
 """Number of candidates from which extended light is more likely than planets."""
 
+_LARGE = 4.0
+"""Chi-squared per pixel above which more is missing than what real frames leave where the pattern
+of the flat field is known: at most 1.6 for stars without a disk, 5 to 32 for AU Mic."""
+
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
@@ -99,13 +103,19 @@ class Reduction:
 
     @property
     def remark(self) -> str:
-        """What to do about candidates that are not likely to be planets; empty if they may be."""
-        if self.disk is not None or len(self.detection.table) < _SEVERAL:
+        """What to do if the frames seem to show extended light; else empty."""
+        if self.disk is not None:
             return ""
-        return (
-            "Several candidates about one star are more often parts of a disk, or residuals of the "
-            "star, than planets: repeat the reduction with disk=True (--disk on the command line)."
-        )
+        if len(self.detection.table) >= _SEVERAL:
+            reason = (
+                "Several candidates about one star are more often parts of a disk, or residuals of "
+                "the star, than planets"
+            )
+        elif self.systematics is not None and self.fit.chi2_per_pixel > _LARGE:
+            reason = "The residual is far above the noise, as it is where the star has a disk"
+        else:
+            return ""
+        return f"{reason}: repeat the reduction with disk=True (--disk on the command line)."
 
     def __repr__(self) -> str:
         return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"

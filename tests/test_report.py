@@ -174,9 +174,14 @@ def test_several_candidates_suggest_a_disk() -> None:
     assert str(crowded).endswith(f"{suggestion}.")
     assert suggestion in crowded._repr_html_()
     assert suggestion in summarise(crowded)["status"]["advice"]
-    # One candidate, or light of a disk that was fitted already.
-    fitted = replace(crowded, disk=cast(dr.Disk, object()))
-    assert whole.remark == fitted.remark == ""
+    # So does a residual that is not explained by an unknown pattern of the flat field.
+    poor = replace(whole, fit=replace(whole.fit, chi2_per_pixel=9.0))
+    flat = np.zeros((4, 4))
+    patterned = replace(poor, systematics=dr.Systematics(flat, flat, (1.0, 1.0), 0.02))
+    assert "far above the noise" in str(patterned)
+    # One candidate, an unknown pattern, or light of a disk that was fitted already.
+    fitted = [replace(each, disk=cast(dr.Disk, object())) for each in (crowded, patterned)]
+    assert [each.remark for each in (whole, poor, *fitted)] == [""] * 4
     assert "disk" not in str(whole)
 
 
