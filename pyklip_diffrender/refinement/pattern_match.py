@@ -27,8 +27,8 @@ _SURE = 2.0
 def pattern_size(fit: Refinement) -> tuple[float, float] | None:
     """Measure how large the known pattern is in the frames, and the error of that.
 
-    The size is 1 if the frames show what ``Systematics.pattern`` says, and 0 if they show nothing of
-    it. All unknowns of the fit are marginalised, as well as the error of the pattern.
+    The size is 1 if the frames show what ``Systematics.pattern`` says, and 0 if they show nothing
+    of it. All unknowns of the fit are marginalised, as well as the error of the pattern.
 
     Parameters
     ----------
