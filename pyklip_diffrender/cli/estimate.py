@@ -12,16 +12,17 @@ from pyklip_diffrender.scene.sequence import Sequence
 
 __all__ = ["describe_plan", "steps_of"]
 
-# Measured on two cores with frames of 80 x 80 pixels: one roll of HIP 65426 takes 154 s, of which
-# 50 s find its place on the detector, two rolls of G 7-34 take 139 s. In two rolls of AU Mic, the
-# fits with extended light take four fifths of the time of the fit before; in HIP 17695 the fit with
-# the star's flux takes three fifths of it. Exponents as documented.
-_FIT = 50.0
-_SEARCH = 25.0
+# Measured on two cores with frames of 80 x 80 pixels: one roll of HIP 65426 takes 45 s, of which
+# 13 s find its place on the detector, two rolls of G 7-34 take 46 s and of HIP 17695 75 s. In two
+# rolls of AU Mic, the fits with extended light take four fifths of the time of the fit before; in
+# HIP 17695 the fit with the star's flux takes three fifths of it. Exponents as documented.
+_FIT = 22.0
+_PLACE = 0.6
+_SEARCH = 5.0
 _DISK = 0.8
 _TIED = 0.6
 _WIDE = 10.0
-_WRITE = 10.0
+_WRITE = 5.0
 _FRAMES = 0.88
 _PIXELS = 0.17
 _MEMORY = 1.4e9
@@ -57,7 +58,7 @@ def steps_of(
     unplaced = sum(each.first_pixel is None for each in sequence.science)
     stars = {each.target for each in sequence.references}
     if known and unplaced:
-        steps.append((f"place on the detector of {_frames(unplaced)}", fit * unplaced))
+        steps.append((f"place on the detector of {_frames(unplaced)}", _PLACE * fit * unplaced))
     elif not known and systematics in ("auto", "references") and stars:
         frames = len(sequence.references)
         steps.append((f"reference stars: {', '.join(sorted(stars))}", fit * frames**_FRAMES))

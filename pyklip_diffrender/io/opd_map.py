@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.io.html_repr import html_summary
 
-__all__ = ["OPDMap"]
+__all__ = ["FLAT", "OPDMap"]
+
+FLAT = "flat"
+"""What stands for a flat wavefront in place of a map."""
 
 
 @dataclass(frozen=True)

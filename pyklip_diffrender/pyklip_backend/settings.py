@@ -25,8 +25,9 @@ from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, MissingOPDError
+from pyklip_diffrender.io.opd_map import FLAT
 from pyklip_diffrender.wavefront.map_choice import RULES, Rule, choose_map, wavefront_for
-from pyklip_diffrender.wavefront.opd import FLAT, OPDMap, as_opd_map
+from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
 
 if TYPE_CHECKING:
     from pyklip_diffrender.planning import Plan

@@ -171,6 +171,9 @@ def subtract_by_refinement(
         If a fit has not converged to a model that explains the data.
     """
     model = model_of(observation, settings)
+    # Takes a second to import, so only after the input has been checked.
+    from pyklip_diffrender.refinement import Adam
+
     groups = list(pointings_of(observation) if pointings is None else pointings)
     windows = [Window.about(g.observation.center[0], model.detector.shape) for g in groups]
     cut = [window.of(group.observation) for window, group in zip(windows, groups, strict=True)]
@@ -181,9 +184,6 @@ def subtract_by_refinement(
         tell("the frames do not show the pattern of the library")
         pattern = pattern_for(cut, references, model, opd, settings, tell, library=False)
         together, results = _refined(pattern, model, opd, settings, tell)
-    # Takes a second to import, so only after the input has been checked.
-    from pyklip_diffrender.refinement import Adam
-
     adam, seed = isinstance(settings.fit, Adam), _seed_of(settings)
     keep, error_factor = settings.keep_detected, None
     if (observation.is_nircam and not adam) if keep is None else keep:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.opd_map import FLAT
 
 __all__ = ["Config", "Injections", "Options", "SequenceConfig", "read_config"]
 
@@ -87,7 +88,8 @@ class SequenceConfig:
     files : tuple of Path
         Files, or one folder.
     opd : Path
-        A wavefront map, or a folder of maps, of which the nearest in time is used.
+        A wavefront map, or a folder of maps, of which the nearest in time is used; ``Path("flat")``
+        for a flat wavefront.
     target, filter : str or None
         As for `Sequence.from_files`.
     options : Options
@@ -193,11 +195,8 @@ class _Table:
         where = ": ".join(filter(None, [self.place, key]))
         return _Table(self.content.pop(key, {}), where, self.folder, self.problems)
 
-    def path(self, key: str, default: Any, expected: str) -> Path | None:
-        """A path that exists, relative to the configuration's folder."""
-        return self.take(key, default, expected, lambda value: self.existing(value))
-
     def existing(self, value: Any) -> Path:
+        """A path that exists, relative to the configuration's folder."""
         path = self.folder / _text(value)
         try:
             exists = path.exists()
@@ -255,7 +254,10 @@ def _sequence(table: _Table, options: Options, injections: Injections) -> Sequen
     for key in missing:
         table.complain(key, "nothing", f'a path, such as {key} = "{key}.fits"')
     files = table.take("files", None, expected, paths)
-    opd = table.path("opd", None, "a wavefront map or a folder of maps that exists")
+    opd = table.take(
+        "opd", None, "a wavefront map or a folder of maps that exists, or 'flat'",
+        lambda value: Path(FLAT) if value == FLAT else table.existing(value),
+    )  # fmt: skip
     target = table.take("target", None, "text, the name of the star", _text)
     filter_ = table.take("filter", None, 'text such as "F444W"', _text)
     first = files[0] if files else Path("sequence")

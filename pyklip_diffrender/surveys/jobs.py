@@ -17,6 +17,7 @@ from pyklip_diffrender import __version__
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import open_fits, sha256
 from pyklip_diffrender.io.headers import header_date, merged_header
+from pyklip_diffrender.io.opd_map import FLAT
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
 from pyklip_diffrender.wavefront.map_choice import dated_maps
 
@@ -124,11 +125,12 @@ def _jobs(
     opd = _nearest(sequence.opd, files, date) if sequence.opd.is_dir() else sequence.opd
     pattern, star = sequence.options.systematics, sequence.options.star_flux
     known = [] if pattern in ("auto", "references", "off") else [Path(pattern)]
-    inputs = {str(path): digest(path) for path in (*files, opd, *known)}
+    maps = [] if str(opd) == FLAT else [opd]
+    inputs = {str(path): digest(path) for path in (*files, *maps, *known)}
     facts = {
         "version": __version__,
         "frames": sorted(inputs[str(path)] for path in files),
-        "opd": inputs[str(opd)],
+        "opd": inputs.get(str(opd), FLAT),
         "target": sequence.target,
         "filter": sequence.filter,
         "size": sequence.options.size,

@@ -26,13 +26,12 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
 from pyklip_diffrender.io.headers import header_text, merged_header, sensing_date
-from pyklip_diffrender.io.opd_map import OPDMap
+from pyklip_diffrender.io.opd_map import FLAT, OPDMap
 from pyklip_diffrender.io.units import native_float64, to_metres, to_number, warn_of_rms
 from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import FourierModes, SegmentMotions
 
 __all__ = [
-    "FLAT",
     "OPDMap",
     "as_opd_map",
     "drift",
@@ -41,9 +40,6 @@ __all__ = [
     "read_opd",
     "resample",
 ]
-
-FLAT = "flat"
-"""What stands for a flat wavefront in place of a map."""
 
 _FLAT_SAMPLES = 256
 """Samples across it; a flat wavefront is the same with any number."""
