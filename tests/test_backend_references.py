@@ -242,7 +242,8 @@ def test_which_pattern_is_used(
         return SimpleNamespace(frames=[SimpleNamespace(observation=each) for each in frames])
 
     def known(observation: Observation, references: Any = (), **options: Any) -> Any:
-        names = ["REF"] * bool(references) + ["OTHER"] * library
+        known_stars = library and options.get("library", True)
+        names = ["REF"] * bool(references) + ["OTHER"] * known_stars
         flat = np.zeros(observation.shape)
         made = Systematics(flat, flat + 0.1, (15.5, 15.5), 0.1, provenance={"stars": names})
         return made if names else None
@@ -265,6 +266,8 @@ def test_which_pattern_is_used(
     assert told == [
         "fitting the reference stars" if fitted else "the reference frames are not needed"
     ]
+    without = pattern_for(science, references, model, OPD, settings, print, library=False)
+    assert "library" not in without.label
     if label != "none":
         # The pattern's own error takes the place of most of the model's.
         assert chosen.choice.settings == GaussNewton.nircam(min_model_error=0.002)

@@ -227,6 +227,7 @@ def test_the_library_leaves_out_the_target_and_what_it_does_not_cover(tmp_path: 
     assert known is not None
     assert known.provenance["stars"] == ["G-7-34"]
     frames.header["TARGPROP"] = "A STAR"
+    assert dr.known_systematics(frames, library=False) is None
     assert dr.known_systematics(replace(frames, first_pixel=(100, 100))) is None
     assert dr.known_systematics(replace(frames, filter="F335M")) is None
     frames.header["DETECTOR"] = "NRCBLONG"

@@ -362,7 +362,7 @@ def test_reduce_says_what_systematics_it_takes() -> None:
 def test_references_are_fitted_only_where_they_are_needed(
     monkeypatch: pytest.MonkeyPatch, systematics: str, library: bool, shown: bool, fits: list[str]
 ) -> None:
-    fitted, patterns = [], []
+    fitted, patterns, asked = [], [], []
     known = learn_systematics(reference_fit())
 
     def fit(model: object, frames: object, opd: object, **options: object) -> Refinement:
@@ -375,6 +375,7 @@ def test_references_are_fitted_only_where_they_are_needed(
     def from_library(
         observation: Observation, references: object = (), **options: object
     ) -> Systematics | None:
+        asked.append(options.get("library", True))
         return known if library or references else None
 
     choosing = "pyklip_diffrender.refinement.pattern_choice"
@@ -390,6 +391,7 @@ def test_references_are_fitted_only_where_they_are_needed(
     assert patterns[-1] is (None if systematics == "off" else known)
     assert result.systematics is patterns[-1]
     assert len(result.references) == fits.count("REF")
+    assert (False in asked) is (len(fits) == 3)
 
 
 def test_rolls_share_an_unknown_pattern_where_nothing_is_known(
