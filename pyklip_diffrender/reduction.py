@@ -196,7 +196,7 @@ def reduce(
     opd : path, OPDMap, Quantity, array or "flat"
         The wavefront to start from, as for `refine`. Of a folder of maps, the one nearest in time
         is taken; see `choose_map` for other rules. "flat" is for frames without a map: the fit
-        then takes longer.
+        then takes longer, and the star's flux is uncertain by 40 % unless `star_flux` says it.
     target, filter : str, optional
         See `Sequence.from_files`.
     size : int
@@ -275,6 +275,11 @@ def reduce(
     if jansky is not None:
         for each in sequence.science:
             require_calibrated(each)
+    elif not wavefront.data.any() and sequence.science[0].is_nircam:
+        _log.warning(
+            "without a wavefront map the star's flux, and contrasts with it, may be wrong by 40 %; "
+            "give the flux as star_flux (--star-flux)"
+        )
     model = model_for(sequence.science[0], size, device=device)
     whole, cut = sequence.science, sequence.cutout(size)
 

@@ -13,6 +13,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection import measured_planet
 from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
 from pyklip_diffrender.refinement import Refinement, star_flux, star_flux_error, with_star_flux
+from pyklip_diffrender.wavefront.opd import as_opd_map
 
 TRUTH = 3e-5
 PLANET = dr.Planet(TRUTH, 0.6, 120.0)
@@ -50,6 +51,31 @@ def test_simulated_frames_have_no_such_error(fit: Refinement) -> None:
     (frame,) = fit.frames
     plain = replace(frame, observation=replace(frame.observation, header=fits.Header()))
     assert star_flux_error(replace(fit, frames=(plain,))) == 0.0
+
+
+def test_without_a_map_the_star_is_less_certain(
+    fit: Refinement, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flat = as_opd_map("flat")
+    assert star_flux_error(replace(fit, initial=flat)) == 0.4
+    known = replace(SETTINGS, star_flux_error=0.05)
+    assert star_flux_error(replace(fit, initial=flat, settings=known)) == 0.05
+    # `reduce` says so, unless the flux is given.
+    monkeypatch.setattr("pyklip_diffrender.reduction.model_for", _stop)
+    sequence = dr.Sequence("A STAR", (fit.frames[0].observation,))
+    for opd, flux, warned in (
+        ("flat", None, True),
+        ("flat", 0.4, False),
+        (fit.initial, None, False),
+    ):
+        caplog.clear()
+        with pytest.raises(StopIteration):
+            dr.reduce(sequence, opd, star_flux=flux)
+        assert ("may be wrong by 40 %; give the flux" in caplog.text) is warned
+
+
+def _stop(*_: object, **__: object) -> None:
+    raise StopIteration
 
 
 @pytest.mark.parametrize("share", [0.98, 1.02])

@@ -98,8 +98,8 @@ class GaussNewton:
         least squares.
     star_flux_error : float, optional
         Relative error of the star's flux that errors of contrasts include besides that of the fit.
-        Default 0.1 for real frames, where only diffracted light tells how bright the star is,
-        and 0 for others.
+        Default 0.1 for real frames, where only diffracted light tells how bright the star is
+        (0.4 if they are fitted without a wavefront map), and 0 for others.
     memory : float, str or Quantity, optional
         Memory that the process should take, bytes or such as "2 GB", of which it needs 1.3 GB
         for itself. Derivatives that do not fit are computed in parts whenever they are needed,
