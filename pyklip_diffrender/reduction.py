@@ -204,8 +204,9 @@ def reduce(
     systematics : Systematics, "auto", "references" or "off"
         Pattern of the model's error. "auto" takes that of the library (see `known_systematics`),
         and fits the reference stars only where there is none for these pixels; "references" fits
-        them in any case and uses both. With "off", or where neither has anything, the target is
-        fitted without a pattern.
+        them in any case and uses both. A fit that shows less than half of the library's pattern is
+        repeated without the library. Where nothing is known, rolls of the same pixels share a
+        pattern of which only the size is known. With "off" there is no pattern.
     settings : GaussNewton, optional
         Of the fits; default those of `refine`.
     threshold : float

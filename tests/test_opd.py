@@ -24,6 +24,7 @@ from pyklip_diffrender.io.files import sha256
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
 from pyklip_diffrender.wavefront.bases import SegmentMotions
+from pyklip_diffrender.wavefront.map_choice import wavefront_for
 from pyklip_diffrender.wavefront.opd import (
     OPDMap,
     as_opd_map,
@@ -126,12 +127,16 @@ def test_a_flat_wavefront_is_plausible() -> None:
     assert not as_opd_map(np.zeros((NPIX, NPIX))).data.any()
 
 
-def test_flat_stands_for_a_flat_wavefront() -> None:
+def test_flat_stands_for_a_flat_wavefront(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A folder of that name does not change it.
+    (tmp_path / "flat").mkdir()
+    monkeypatch.chdir(tmp_path)
     flat = as_opd_map("flat")
     assert flat.name == "flat wavefront"
     assert flat.date is None
     assert flat.shape == (256, 256)
     assert not flat.data.any()
+    assert not wavefront_for("flat", None).data.any()
     assert not starting_opd(DiffrenderSettings(opd="flat"), None).data.any()
 
 

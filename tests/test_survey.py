@@ -216,7 +216,9 @@ def test_of_a_folder_of_maps_the_nearest_in_time_is_used(tmp_path: Path) -> None
     assert list(job.inputs) == [config["sequence"][0]["files"], job.opd]
 
 
-def test_a_sequence_may_have_no_map(tmp_path: Path) -> None:
+def test_a_sequence_may_have_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "flat").mkdir()
+    monkeypatch.chdir(tmp_path)
     config = inputs(tmp_path, 1)
     (mapped,) = planned(config)
     config["sequence"][0]["opd"] = "flat"

@@ -208,7 +208,8 @@ def outputs(default: str | None = None, *, folder: bool = True) -> Decorator:
 
 wavefront = _all(
     option("--opd", type=file_type(), metavar="FILE", section="Wavefront map",
-           help="Wavefront map to start from (FITS), or flat: without a map, a fit takes longer."),
+           help="Wavefront map to start from (FITS), or flat: without a map a fit takes longer, "
+           "and contrasts are uncertain by 40 % unless --star-flux is given."),
     option("--opd-folder", type=file_type(), metavar="FOLDER", section="Wavefront map",
            help="Folder of wavefront maps, of which one is chosen by its date."),
     option("--opd-date", type=click.Choice(["nearest", "before", "after", "interpolate"]),

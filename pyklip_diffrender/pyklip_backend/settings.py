@@ -223,7 +223,7 @@ def starting_opd(settings: DiffrenderSettings, date: Time | None) -> OPDMap:
         return _chosen(folder, date, _RULES[opd])
     if opd is None and folder is not None:
         return _chosen(folder, date, "nearest")
-    if isinstance(opd, str | os.PathLike) and Path(opd).is_dir():
+    if isinstance(opd, str | os.PathLike) and opd != FLAT and Path(opd).is_dir():
         return _chosen(opd, date, "nearest")
     if opd is None:
         raise MissingOPDError(

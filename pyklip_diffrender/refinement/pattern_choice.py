@@ -33,7 +33,6 @@ _KNOWN_MODEL_ERROR = 0.002
 """Smallest model error, as a fraction of the star, where the pattern of the model's error is known
 from other stars: the pattern's own error is counted apart."""
 
-
 _ROUGH: dict[str, Any] = {"min_model_error": 0.05, "tolerance": 0.05, "widen_prior": False}
 """Changes to the settings of a fit that only tells which pixels a frame shows, which the pattern
 does as soon as it dominates the residual. In thirteen frames of four stars, places differed by at
@@ -74,7 +73,10 @@ class PatternChoice:
     from_library: bool = False
 
     def is_refuted_by(self, fit: Refinement) -> bool:
-        """Whether a fit with the library's pattern shows that the frames do not have it."""
+        """Whether a fit with the library's pattern shows that the frames do not have it.
+
+        If they do not have the pattern, a warning is logged, whatever pattern it is.
+        """
         return lacks_pattern(fit) and self.from_library
 
 

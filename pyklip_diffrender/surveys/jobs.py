@@ -122,10 +122,12 @@ def _jobs(
     sequence: SequenceConfig, digest: Callable[[Path], str], date: Callable[[Path], Time | None]
 ) -> list[Job]:
     files = _files(sequence.files)
-    opd = _nearest(sequence.opd, files, date) if sequence.opd.is_dir() else sequence.opd
+    opd, is_flat = sequence.opd, str(sequence.opd) == FLAT
+    if not is_flat and opd.is_dir():
+        opd = _nearest(opd, files, date)
     pattern, star = sequence.options.systematics, sequence.options.star_flux
     known = [] if pattern in ("auto", "references", "off") else [Path(pattern)]
-    maps = [] if str(opd) == FLAT else [opd]
+    maps = [] if is_flat else [opd]
     inputs = {str(path): digest(path) for path in (*files, *maps, *known)}
     facts = {
         "version": __version__,

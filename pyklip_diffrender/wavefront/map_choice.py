@@ -23,7 +23,7 @@ from pyklip_diffrender.errors import (
     MissingOPDError,
 )
 from pyklip_diffrender.io.headers import header_text, merged_header, sensing_date
-from pyklip_diffrender.io.opd_map import OPDMap
+from pyklip_diffrender.io.opd_map import FLAT, OPDMap
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.wavefront.opd import as_opd_map, read_opd
 
@@ -129,7 +129,7 @@ def wavefront_for(opd: Any, date: Time | None) -> OPDMap:
     DiffrenderWarning
         If the map is more than 200 days from the date.
     """
-    if isinstance(opd, str | os.PathLike) and Path(opd).is_dir():
+    if isinstance(opd, str | os.PathLike) and opd != FLAT and Path(opd).is_dir():
         if date is None:
             raise IncompatibleSetupError(
                 f"{opd} is a folder of wavefront maps, and the frames have no date (DATE-BEG) to "

@@ -31,18 +31,10 @@ from pyklip_diffrender.io.units import native_float64, to_metres, to_number, war
 from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import FourierModes, SegmentMotions
 
-__all__ = [
-    "OPDMap",
-    "as_opd_map",
-    "drift",
-    "random_drift",
-    "random_opd",
-    "read_opd",
-    "resample",
-]
+__all__ = ["OPDMap", "as_opd_map", "drift", "random_drift", "random_opd", "read_opd", "resample"]
 
 _FLAT_SAMPLES = 256
-"""Samples across it; a flat wavefront is the same with any number."""
+"""Samples across a flat wavefront, which is the same with any number."""
 
 
 def read_opd(
