@@ -12,8 +12,8 @@ from pyklip_diffrender.scene.sequence import Sequence
 
 __all__ = ["describe_plan", "steps_of"]
 
-# Measured on two cores with frames of 80 x 80 pixels: one roll of HIP 65426 takes 45 s, of which
-# 13 s find its place on the detector, two rolls of G 7-34 take 46 s and of HIP 17695 75 s. In two
+# Measured on two cores with frames of 80 x 80 pixels: one roll of HIP 65426 takes 50 s, of which
+# 14 s find its place on the detector, two rolls of G 7-34 take 46 s and of HIP 17695 75 s. In two
 # rolls of AU Mic, the fits with extended light take four fifths of the time of the fit before; in
 # HIP 17695 the fit with the star's flux takes three fifths of it. Exponents as documented.
 _FIT = 22.0
