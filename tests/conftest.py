@@ -28,7 +28,7 @@ import torch
 from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parents[1]
-# For the scripts in tests/benchmarks; last, so that an installed package comes before its source.
+# For the scripts in benchmarks; last, so that an installed package comes before its source.
 sys.path.append(str(ROOT))
 
 # A deadline measures how busy the machine is; derandomised, a failure is there again tomorrow.

@@ -17,20 +17,20 @@ import pytest
 import torch
 from astropy.table import Table
 
+from benchmarks import operations
+from benchmarks.speed import Setting, rivals, run_bench, timing, write_page, write_table
+from benchmarks.speed import images as bench_images
+from benchmarks.speed.__main__ import main
+from benchmarks.speed.case import Case
+from benchmarks.speed.figure import draw
+from benchmarks.speed.images import forward
+from benchmarks.speed.memory import memory_of, peak_memory
+from benchmarks.speed.page import page, targets
+from benchmarks.speed.plain import plain_stpsf
+from benchmarks.speed.rivals import load, paper_recipe
+from benchmarks.speed.rows import ROWS, select_rows
+from benchmarks.speed.timing import exponent, interleaved
 from pyklip_diffrender.errors import IncompatibleSetupError
-from tests.benchmarks import operations
-from tests.benchmarks.speed import Setting, rivals, run_bench, timing, write_page, write_table
-from tests.benchmarks.speed import images as bench_images
-from tests.benchmarks.speed.__main__ import main
-from tests.benchmarks.speed.case import Case
-from tests.benchmarks.speed.figure import draw
-from tests.benchmarks.speed.images import forward
-from tests.benchmarks.speed.memory import memory_of, peak_memory
-from tests.benchmarks.speed.page import page, targets
-from tests.benchmarks.speed.plain import plain_stpsf
-from tests.benchmarks.speed.rivals import load, paper_recipe
-from tests.benchmarks.speed.rows import ROWS, select_rows
-from tests.benchmarks.speed.timing import exponent, interleaved
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -280,7 +280,7 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert main(options) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"performance.ecsv", "performance.png"}
     table = Table.read(tmp_path / "performance.ecsv", format="ascii.ecsv")
-    command = "python -m tests.benchmarks.speed --quick --rows 'forward + backward'"
+    command = "python -m benchmarks.speed --quick --rows 'forward + backward'"
     assert table.meta["command"] == command
     assert f"by `{command}`" in page(table)
 
@@ -298,7 +298,7 @@ def test_a_gpu_that_is_not_there_is_a_usage_error(
 @pytest.mark.slow
 def test_it_runs_as_a_script(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "tests.benchmarks.speed", "--help"],
+        [sys.executable, "-m", "benchmarks.speed", "--help"],
         cwd=ROOT,
         env={k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"},
         capture_output=True,

@@ -37,7 +37,7 @@ def test_nothing_is_half_done_and_nothing_finished_is_lost(scenario: str) -> Non
         pytest.skip("needs dask.distributed")
     done = subprocess.run(
         [
-            sys.executable, "-m", "tests.benchmarks.faults", "--seeds", "1", "--mutations", "60",
+            sys.executable, "-m", "benchmarks.faults", "--seeds", "1", "--mutations", "60",
             "--only", scenario,
         ],
         cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,

@@ -1,7 +1,7 @@
 """What the hard cases share: small systems, comparators, and the rows of the stability table.
 
 A row is measured by the tests, which hold it to its limits, and by
-``tests/benchmarks/stability.py``, which prints it into the documentation.
+``benchmarks/stability.py``, which prints it into the documentation.
 """
 
 from __future__ import annotations

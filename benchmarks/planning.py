@@ -1,6 +1,6 @@
 """What a plan saves, and what it changes, from a bright star to a faint one.
 
-    python tests/benchmarks/planning.py
+    python benchmarks/planning.py
 
 Every frame (embedded generator, the wavefront map 40 h old) is fitted with the model as given, with
 a plan of its own, and with that plan once more, on one core; the star that is found and the planet
@@ -117,7 +117,7 @@ def main() -> None:
         for seed in case.seeds:
             print(row(case, seed), flush=True)  # As they come: the whole takes minutes.
     print()
-    print("\n".join(provenance("tests/benchmarks/planning.py", packages=())))
+    print("\n".join(provenance("benchmarks/planning.py", packages=())))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the frames of programme 1184 in ../shared/data/gto1184::
 
-    python -m tests.benchmarks.filters F250M F410M F480M F460M:MASK430R
+    python -m benchmarks.filters F250M F410M F480M F460M:MASK430R
 
 Two rolls of G 7-34 keep their headers, orientation and noise, but for the filter and the mask.
 Their images are those of a finer model than that of the fit (512 samples, 15 wavelengths), with a

@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the frames of programme 1184 in ../shared/data/gto1184::
 
-    python -m tests.benchmarks.injections --target G-7-34 --filter F444W --planets 21
+    python -m benchmarks.injections --target G-7-34 --filter F444W --planets 21
 
 For the rolls of one target, with all other stars as KLIP's references, it prints the 5-sigma limits
 of `reduce` (closed form) and of KLIP (`klip_curve`), both with the small-sample correction, and

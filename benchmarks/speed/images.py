@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.speed.case import Accuracy, Case, missing
+from benchmarks.speed.rivals import hcipy_image, load, paper_recipe, prysm_image
+from benchmarks.speed.setting import CELLS, WAVELENGTH, Arrays, Setting
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import coarse_steps
-from tests.benchmarks.speed.case import Accuracy, Case, missing
-from tests.benchmarks.speed.rivals import hcipy_image, load, paper_recipe, prysm_image
-from tests.benchmarks.speed.setting import CELLS, WAVELENGTH, Arrays, Setting
 
 __all__ = ["FORWARD", "STEP", "forward", "step"]
 
@@ -161,7 +161,7 @@ def _scaled(image: Any, setting: Setting) -> Any:
 
 
 def _poppy(setting: Setting) -> Callable[[], Any]:
-    from tests.benchmarks.speed.plain import plain_poppy
+    from benchmarks.speed.plain import plain_poppy
 
     arrays = setting.arrays
     return plain_poppy(
@@ -184,8 +184,8 @@ def _stpsf_cases(setting: Setting) -> list[Case]:
     if setting.data is None:
         return [missing(FORWARD, name, "no data directory (--stpsf-path or STPSF_PATH)")]
     os.environ["STPSF_PATH"] = str(setting.data)
+    from benchmarks.speed.plain import plain_stpsf
     from pyklip_diffrender.bridges import from_webbpsf
-    from tests.benchmarks.speed.plain import plain_stpsf
 
     try:
         instrument = plain_stpsf(setting.data, 256 if setting.quick else setting.npix)

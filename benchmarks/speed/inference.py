@@ -11,6 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.speed.case import Accuracy, Case
+from benchmarks.speed.rivals import paper_recipe
+from benchmarks.speed.setting import Setting
 from pyklip_diffrender.detection import Detection, contrast_curve, detect, measure
 from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.linear.response import WavefrontResponse, downsample
@@ -21,9 +24,6 @@ from pyklip_diffrender.refinement import GaussNewton, Refinement, refine
 from pyklip_diffrender.scene.objects import Planet, Scene
 from pyklip_diffrender.scene.simulation import planet_photons
 from pyklip_diffrender.wavefront.bases import Basis, default_basis
-from tests.benchmarks.speed.case import Accuracy, Case
-from tests.benchmarks.speed.rivals import paper_recipe
-from tests.benchmarks.speed.setting import Setting
 
 __all__ = [
     "CONTRAST",

@@ -3,7 +3,7 @@
 Run from the root of the project, with the source of the installed version of pyKLIP, whose frames
 (`tests/data`) are in its repository but not in its package::
 
-    python -m tests.benchmarks.pyklip_suite /path/to/pyklip
+    python -m benchmarks.pyklip_suite /path/to/pyklip
 
 The tests run twice, each time on a copy of the source's tests. Tests without their data fail both
 times. `--stand-ins` makes frames for those that look for cubes of beta Pic by GPI: they run and
@@ -74,7 +74,7 @@ def run(source: Path, folder: Path, registered: bool, stand_ins: bool) -> dict[s
     if stand_ins:
         write_stand_ins(folder / "tests" / "data")
     (folder / "registering.py").write_text(_PLUGIN)
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[1]
     path = os.pathsep.join([str(folder), str(root), os.environ.get("PYTHONPATH", "")])
     options = (
         "-q --tb=no -p no:cacheprovider --rootdir . --continue-on-collection-errors "

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pyklip_diffrender.errors import IncompatibleSetupError
-from tests.benchmarks.speed.case import Case
-from tests.benchmarks.speed.images import FORWARD, STEP, forward, step
-from tests.benchmarks.speed.inference import (
+from benchmarks.speed.case import Case
+from benchmarks.speed.images import FORWARD, STEP, forward, step
+from benchmarks.speed.inference import (
     CONTRAST,
     JACOBIAN,
     MAP,
@@ -18,8 +17,9 @@ from tests.benchmarks.speed.inference import (
     refinement,
     snr_map,
 )
-from tests.benchmarks.speed.scaling import SCALING, scaling
-from tests.benchmarks.speed.setting import Setting
+from benchmarks.speed.scaling import SCALING, scaling
+from benchmarks.speed.setting import Setting
+from pyklip_diffrender.errors import IncompatibleSetupError
 
 __all__ = ["ROWS", "Row", "cases_of", "select_rows"]
 

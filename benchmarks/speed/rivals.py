@@ -16,11 +16,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from benchmarks.speed.setting import WAVELENGTH, Arrays
 from pyklip_diffrender.instrument.masks import ROUND_MASKS
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.fourier import kernel
 from pyklip_diffrender.optics.grid import PupilGrid
-from tests.benchmarks.speed.setting import WAVELENGTH, Arrays
 
 __all__ = ["hcipy_image", "load", "paper_recipe", "prysm_image"]
 

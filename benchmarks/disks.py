@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the frames of programme 1184 in ../shared/data/gto1184::
 
-    python -m tests.benchmarks.disks --filter F444W --figure docs/images/au_mic.png
+    python -m benchmarks.disks --filter F444W --figure docs/images/au_mic.png
 
 It fits the edge-on disk of AU Mic with `reduce(disk=True)`, and subtracts the star with KLIP
 (ADI+RDI: the other roll and four frames of two other stars). It prints the 5-sigma limits of both

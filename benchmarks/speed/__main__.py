@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the package installed:
 
-    python -m tests.benchmarks.speed --quick
+    python -m benchmarks.speed --quick
 
 It prints the table and writes it, with its figure, into a folder. ``--page`` makes the page of the
 documentation from a table that was written before.
@@ -19,12 +19,12 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.speed import Setting, run_bench, write_page, write_table
+from benchmarks.speed.figure import draw
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.plotting import save
-from tests.benchmarks.speed import Setting, run_bench, write_page, write_table
-from tests.benchmarks.speed.figure import draw
 
-COMMAND = "python -m tests.benchmarks.speed"
+COMMAND = "python -m benchmarks.speed"
 
 
 def parser() -> argparse.ArgumentParser:

@@ -21,15 +21,15 @@ from typing import Any
 import torch
 from astropy.table import Table
 
+from benchmarks.provenance import processor
+from benchmarks.speed.case import Accuracy, Case
+from benchmarks.speed.memory import peak_memory
+from benchmarks.speed.page import write_page
+from benchmarks.speed.rows import ROWS, Row, select_rows
+from benchmarks.speed.scaling import SCALING, limits
+from benchmarks.speed.setting import Setting
+from benchmarks.speed.timing import exponent, interleaved
 from pyklip_diffrender.io.files import replacing
-from tests.benchmarks.provenance import processor
-from tests.benchmarks.speed.case import Accuracy, Case
-from tests.benchmarks.speed.memory import peak_memory
-from tests.benchmarks.speed.page import write_page
-from tests.benchmarks.speed.rows import ROWS, Row, select_rows
-from tests.benchmarks.speed.scaling import SCALING, limits
-from tests.benchmarks.speed.setting import Setting
-from tests.benchmarks.speed.timing import exponent, interleaved
 
 __all__ = ["ROWS", "Setting", "run_bench", "write_page", "write_table"]
 

@@ -2,7 +2,7 @@
 
 Run from the root of the project::
 
-    python -m tests.benchmarks.forward_model --trials 12
+    python -m benchmarks.forward_model --trials 12
 
 Every trial simulates two rolls of a star with a planet, and frames of a reference star, all with
 drifted wavefronts; runs `pyklip.fm.klip_dataset` with an `FMPlanetPSF` whose position and flux are

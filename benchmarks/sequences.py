@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the frames of programme 1184 in ../shared/data/gto1184::
 
-    python -m tests.benchmarks.sequences --target G-7-34 --references HIP17695
+    python -m benchmarks.sequences --target G-7-34 --references HIP17695
 
 It prints a table of 5-sigma limits and, for the fit of the target, the standard deviation of S/N
 away from candidates and chi-squared per pixel in rings about the star.

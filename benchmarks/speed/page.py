@@ -110,7 +110,7 @@ def page(table: Table, figure: str = "results/performance.png", notes: str = "")
     lines = [
         "# Performance",
         "",
-        "Written by `python -m tests.benchmarks.speed --page` from the table "
+        "Written by `python -m benchmarks.speed --page` from the table "
         "`results/performance.ecsv`; do not edit.",
         "",
         f"- Measured {meta['date']} by `{meta['command']}` in {meta['seconds']} s.",

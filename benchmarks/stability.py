@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the package installed:
 
-    python tests/benchmarks/stability.py
+    python benchmarks/stability.py
 
 It writes reports/stability.md. ``pytest --full -m hard`` holds every line to its limit.
 """
@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from provenance import provenance
 
-TESTS = Path(__file__).resolve().parents[1]
+TESTS = Path(__file__).resolve().parents[1] / "tests"
 sys.path[:0] = [str(TESTS), str(TESTS / "hard")]
 optics = import_module("stability_optics")
 fits = import_module("stability_fits")
@@ -130,7 +130,7 @@ def main() -> None:
         "brighter": fits.error_of(1.01 * star + fits.BACKGROUND),
         "success": fits.SUCCESS,
     }
-    lines = [INTRODUCTION, *provenance("tests/benchmarks/stability.py")]
+    lines = [INTRODUCTION, *provenance("benchmarks/stability.py")]
     lines += [OPTICS.format(npix=optics.NPIX), *optics_table()]
     lines += [FITS.format(**facts), *fits_table(), NOTES.format(**notes())]
     arguments.output.parent.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the frames of programme 1184 in ../shared/data/gto1184::
 
-    python -m tests.benchmarks.forward_model_real --target HIP17695 --filter F444W --trials 8
+    python -m benchmarks.forward_model_real --target HIP17695 --filter F444W --trials 8
 
 Every trial adds a planet to the files of the two rolls of a target, several times as bright as the
 5-sigma limit at its separation, with the wavefront of a fit of the rolls without it. The files are
@@ -29,8 +29,8 @@ from pyklip.fmlib.fmpsf import FMPlanetPSF
 from pyklip.instruments.JWST import JWSTData
 
 import pyklip_diffrender as dr
+from benchmarks.forward_model import STAMP, Errors, Image, Planet, print_statistics
 from pyklip_diffrender.refinement import FrameFit
-from tests.benchmarks.forward_model import STAMP, Errors, Image, Planet, print_statistics
 
 SIDE = 101
 """Pixels of the image that is added to a frame."""

@@ -1,6 +1,6 @@
 """Real frames: is noise being fitted, and what does each part of the model buy?
 
-    python tests/benchmarks/real_frames.py CALINTS OPD
+    python benchmarks/real_frames.py CALINTS OPD
 
 Every row is a fit to one integration, judged on the other, which it has never seen. Both see the
 same star through the same wavefront, so what a fit learns of the first one's noise raises the
@@ -24,7 +24,7 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.wavefront.opd import read_opd
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 from hip65426_pyklip import away_from_companions, residual_share
 
 PRESET = GaussNewton.nircam()

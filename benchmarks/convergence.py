@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the package installed:
 
-    python tests/benchmarks/convergence.py
+    python benchmarks/convergence.py
 
 It writes docs/accuracy.md. poppy's FFT takes about 4 GB of memory at an oversampling of 8, four
 times as much at 16.
@@ -25,7 +25,7 @@ from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_cor
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.optics.system import OpticalSystem
 
-TESTS = Path(__file__).resolve().parents[1]
+TESTS = Path(__file__).resolve().parents[1] / "tests"
 sys.path.insert(0, str(TESTS))
 reference = import_module("poppy_reference")
 
@@ -124,7 +124,7 @@ def main() -> None:
                 "",
                 "Written by a script; do not edit.",
                 "",
-                *provenance("tests/benchmarks/convergence.py"),
+                *provenance("benchmarks/convergence.py"),
                 "",
                 "## Cells in the occulter's disc",
                 "",

@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the frames of programme 1184 in ../shared/data/gto1184::
 
-    python -m tests.benchmarks.operations --target G-7-34 --filter F444W
+    python -m benchmarks.operations --target G-7-34 --filter F444W
 
 Every operation of PyTorch is counted with its floating-point operations and the bytes of its inputs
 and outputs. The predicted time is the sum over operations of the longest of three: operations over

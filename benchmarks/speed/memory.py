@@ -17,13 +17,13 @@ from pathlib import Path
 
 import torch
 
-from tests.benchmarks.speed.case import Case
-from tests.benchmarks.speed.setting import Setting
-from tests.benchmarks.speed.timing import give_back, resident, start_peak
+from benchmarks.speed.case import Case
+from benchmarks.speed.setting import Setting
+from benchmarks.speed.timing import give_back, resident, start_peak
 
 __all__ = ["memory_of", "peak_memory"]
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def memory_of(case: Case, setting: Setting) -> float:
@@ -59,7 +59,7 @@ def peak_memory(case: Case, setting: Setting, timeout: float = 300.0) -> float:
 
 def main() -> None:
     """Measure one case."""
-    from tests.benchmarks.speed.rows import cases_of
+    from benchmarks.speed.rows import cases_of
 
     setting = Setting(**json.loads(sys.argv[1]))
     (case,) = (

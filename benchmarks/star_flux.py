@@ -2,8 +2,8 @@
 
 Run from the root of the project, with the frames of programme 1184 in ../shared/data/gto1184::
 
-    python -m tests.benchmarks.star_flux --target HIP17695 --filter F444W
-    python -m tests.benchmarks.star_flux --frames ../shared/data/hip65426_f444w_calints.fits.gz
+    python -m benchmarks.star_flux --target HIP17695 --filter F444W
+    python -m benchmarks.star_flux --frames ../shared/data/hip65426_f444w_calints.fits.gz
         --opd ../shared/data/opd_2022-07-30.fits.gz
 
 The rolls of a target are fitted by `reduce`, and once more with the star's flux held within 0.3 %

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from benchmarks.speed.case import Accuracy
 from pyklip_diffrender.instrument.masks import ROUND_MASKS
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
 from pyklip_diffrender.io.units import ARCSEC
@@ -21,7 +22,6 @@ from pyklip_diffrender.scene.objects import PAPER_SEGMENT_GAP, Planet, Scene
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
-from tests.benchmarks.speed.case import Accuracy
 
 __all__ = ["Arrays", "Setting"]
 

@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the package and its extra "webbpsf" installed:
 
-    python tests/benchmarks/parity.py --official ../shared/data/stpsf-data
+    python benchmarks/parity.py --official ../shared/data/stpsf-data
 
 It makes an offline STPSF data directory without symmetry, runs the real stpsf on it and on STScI's
 own files, and writes docs/parity.md. At 1024 samples it takes about ten minutes and 6 GB of memory.
@@ -34,7 +34,7 @@ from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
 from pyklip_diffrender.optics.system import OpticalSystem
 
-TESTS = Path(__file__).resolve().parents[1]
+TESTS = Path(__file__).resolve().parents[1] / "tests"
 sys.path.insert(0, str(TESTS))
 reference = import_module("poppy_reference")
 stpsf_data = import_module("stpsf_data")
@@ -305,7 +305,7 @@ def main() -> None:
                 "Written by a script, but for the section on speed, which stays as it is unless "
                 "the script is run with --speed.",
                 "",
-                *provenance("tests/benchmarks/parity.py", ("poppy", "stpsf", "pysiaf")),
+                *provenance("benchmarks/parity.py", ("poppy", "stpsf", "pysiaf")),
                 "",
                 f"{npix} x {npix} samples in the pupil, 80 x 80 pixels, 4.5 um unless another band "
                 "is named. stpsf runs on an offline data directory (`tests/stpsf_data.py`) whose "

@@ -2,7 +2,7 @@
 
 Run from the root of the project::
 
-    python -m tests.benchmarks.faults --seeds 20 --mutations 1000
+    python -m benchmarks.faults --seeds 20 --mutations 1000
 
 Every scenario runs a survey of cheap jobs as real processes, breaks something, and requires that
 no folder is half a product, that finished jobs are kept, and that there is a message. It prints
@@ -30,13 +30,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from benchmarks import mutations
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.surveys import folders
 from pyklip_diffrender.surveys.driver import run_survey
 from pyklip_diffrender.surveys.jobs import Job
-from tests.benchmarks import mutations
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 
 JOBS = 8
 PARTS = 5
@@ -131,7 +131,7 @@ class Trial:
         arguments = [str(self.config), str(output or self.output), "--work", work]
         arguments += ["--scheduler", scheduler] if scheduler else []
         return subprocess.Popen(
-            [sys.executable, "-m", "tests.benchmarks.faults", "--client", *arguments],
+            [sys.executable, "-m", "benchmarks.faults", "--client", *arguments],
             cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
 
