@@ -23,6 +23,7 @@ from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
 from pyklip_diffrender.refinement.systematics import Systematics
+from pyklip_diffrender.scene.agreement import require_agreement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.opd import as_opd_map
 
@@ -115,6 +116,7 @@ def refine(
     observations = [observation] if isinstance(observation, Observation) else list(observation)
     if not observations:
         raise NoValidPixelsError("observation: got an empty sequence, expected at least one")
+    require_agreement(observations)
     adapted = settings_for(observations[0]) if settings is None else settings
     if isinstance(adapted, GaussNewton) and adapted.free == GaussNewton().free:
         # A system without a Lyot stop has no parameters of one.
