@@ -7,8 +7,9 @@ Every public name is loaded when it is first used, so that ``import pyklip_diffr
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
+
+from pyklip_diffrender._version import __version__
 
 if TYPE_CHECKING:
     from pyklip_diffrender.archive import fetch_calints, list_calints
@@ -132,12 +133,6 @@ _NAMES = {
 
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 
-try:
-    __version__ = version("pyklip-diffrender")
-except PackageNotFoundError:
-    # A source tree that was put on the path without being installed.
-    __version__ = "0+unknown"
-
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
@@ -148,4 +143,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)

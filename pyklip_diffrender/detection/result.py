@@ -15,6 +15,7 @@ from astropy.io.fits import Header
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection.calibration import calibration_errors
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import described
@@ -288,8 +289,6 @@ class Detection:
 
     @cached_property
     def _provenance(self) -> dict[str, object]:
-        from pyklip_diffrender import __version__
-
         return {
             "software": f"pyklip_diffrender {__version__}",
             "observations": [f.observation.name for fit in self.fits for f in fit.frames],

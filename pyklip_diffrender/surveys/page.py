@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyklip_diffrender import __version__
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.plotting import draw_limits, to_png
 from pyklip_diffrender.report import pieces
 from pyklip_diffrender.report.pictures import Picture
