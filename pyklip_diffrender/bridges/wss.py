@@ -288,7 +288,7 @@ def _stpsf(purpose: str) -> Any:
     except ImportError as error:
         raise IncompatibleSetupError(
             f"stpsf is needed {purpose} and is not installed ({error}): "
-            'pip install "pyklip-diffrender[webbpsf]"'
+            "python -m pip install stpsf"
         ) from error
     return stpsf
 
