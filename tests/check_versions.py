@@ -6,7 +6,8 @@
 
 Each end gets a fresh virtual environment with this interpreter and is removed afterwards. The
 oldest end pins every lower bound of ``pyproject.toml`` (the dependencies and the extras that users
-have); the newest takes what pip prefers; "plain" does so without the extras, one of which caps numpy.
+have); the newest takes what pip prefers; "plain" does so without the extras, of which one caps
+numpy.
 What follows ``--`` goes to pytest.
 
 At the oldest end, deprecation warnings are not errors: old releases get them from newer libraries

@@ -29,7 +29,7 @@ import torch
 from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parents[1]
-# The scripts in benchmarks by their place, not by the path: a package of that name may be installed,
+# The scripts in benchmarks by their place, not by the path: another package may have that name,
 # and the installed pyklip_diffrender has to come before its source.
 _spec = importlib.util.spec_from_file_location("benchmarks", ROOT / "benchmarks" / "__init__.py")
 assert _spec is not None
