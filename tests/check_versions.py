@@ -7,8 +7,7 @@
 Each end gets a fresh virtual environment with this interpreter and is removed afterwards. The
 oldest end pins every lower bound of ``pyproject.toml`` (the dependencies and the extras that users
 have); the newest takes what pip prefers; "plain" does so without the extras, of which one caps
-numpy.
-What follows ``--`` goes to pytest.
+numpy. What follows ``--`` goes to pytest.
 
 At the oldest end, deprecation warnings are not errors: old releases get them from newer libraries
 underneath, and only their authors could act on them.
