@@ -26,23 +26,23 @@ from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.io.units import require_bound, to_bytes
+from pyklip_diffrender.pattern.choice import (
+    PatternChoice,
+    PatternRequest,
+    choose_systematics,
+)
 from pyklip_diffrender.refinement import (
     GaussNewton,
     Refinement,
-    Systematics,
     refine,
     require_calibrated,
     to_jansky,
     with_star_flux,
 )
-from pyklip_diffrender.refinement.pattern_choice import (
-    PatternChoice,
-    PatternRequest,
-    choose_systematics,
-)
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.map_choice import wavefront_for
 
 __all__ = ["Reduction", "reduce"]

@@ -29,6 +29,7 @@ PACKAGES = (
     "linear",
     "planning",
     "refinement",
+    "pattern",
     "detection",
     "reduction",
     "pyklip_backend",

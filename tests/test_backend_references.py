@@ -23,6 +23,7 @@ from pyklip_diffrender.errors import (
     MissingOPDError,
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.pattern.choice import PatternChoice
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     observation_from_dataset,
@@ -32,9 +33,9 @@ from pyklip_diffrender.pyklip_backend import (
 )
 from pyklip_diffrender.pyklip_backend.frames import frames_of
 from pyklip_diffrender.pyklip_backend.references import ChosenPattern, References, pattern_for
-from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Systematics
-from pyklip_diffrender.refinement.pattern_choice import PatternChoice
+from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 
 CARDS = {"SUBSTRT1": 492, "SUBSTRT2": 1502, "DETECTOR": "NRCALONG"}
 TARGET = {"TARGPROP": "TARGET", "IS_PSF": False, **CARDS}
@@ -248,7 +249,7 @@ def test_which_pattern_is_used(
         made = Systematics(flat, flat + 0.1, (15.5, 15.5), 0.1, provenance={"stars": names})
         return made if names else None
 
-    choosing = "pyklip_diffrender.refinement.pattern_choice"
+    choosing = "pyklip_diffrender.pattern.choice"
     monkeypatch.setattr(f"{choosing}.refine", refine)
     monkeypatch.setattr(f"{choosing}.known_systematics", known)
     zeros = np.zeros((32, 32))
@@ -295,7 +296,7 @@ def test_a_library_of_another_flat_field_is_replaced(monkeypatch: pytest.MonkeyP
     settings = DiffrenderSettings(model=model, fit=fit, max_chi2=np.inf)
     subtract = "pyklip_diffrender.pyklip_backend.subtract"
     monkeypatch.setattr(f"{subtract}.pattern_for", chosen)
-    monkeypatch.setattr("pyklip_diffrender.refinement.pattern_choice.lacks_pattern", lacks)
+    monkeypatch.setattr("pyklip_diffrender.pattern.choice.lacks_pattern", lacks)
     told: list[str] = []
     with pytest.warns(DiffrenderWarning):  # The star is not one of this model.
         result = subtract_by_refinement(simulated, OPD, settings, tell=told.append)

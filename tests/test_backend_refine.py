@@ -28,6 +28,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.pattern.choice import PatternChoice
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     backend,
@@ -38,11 +39,11 @@ from pyklip_diffrender.pyklip_backend import (
 from pyklip_diffrender.pyklip_backend.references import ChosenPattern
 from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
-from pyklip_diffrender.refinement import Adam, GaussNewton, Status, Systematics, refine
-from pyklip_diffrender.refinement.pattern_choice import PatternChoice
+from pyklip_diffrender.refinement import Adam, GaussNewton, Status, refine
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 

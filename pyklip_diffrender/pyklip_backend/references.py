@@ -22,7 +22,7 @@ from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:
     from pyklip_diffrender.optics.system import OpticalSystem
-    from pyklip_diffrender.refinement.pattern_choice import PatternChoice
+    from pyklip_diffrender.pattern.choice import PatternChoice
 
 __all__ = [
     "ChosenPattern",
@@ -181,8 +181,9 @@ def pattern_for(
     IncompatibleSetupError
         If "references" is asked for without any.
     """
-    from pyklip_diffrender.refinement import Adam, Systematics
-    from pyklip_diffrender.refinement.pattern_choice import choose_systematics
+    from pyklip_diffrender.pattern.choice import choose_systematics
+    from pyklip_diffrender.refinement import Adam
+    from pyklip_diffrender.scene.systematics import Systematics
 
     requested = settings.systematics
     if requested is None:

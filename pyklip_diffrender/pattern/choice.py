@@ -13,14 +13,14 @@ from astropy import units as u
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.pattern.library import known_systematics
+from pyklip_diffrender.pattern.placement import place_on_detector
+from pyklip_diffrender.pattern.presence import lacks_pattern
 from pyklip_diffrender.refinement.fitting import refine
-from pyklip_diffrender.refinement.library import known_systematics
-from pyklip_diffrender.refinement.pattern_match import lacks_pattern
-from pyklip_diffrender.refinement.registration import register
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
-from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["PatternChoice", "PatternRequest", "choose_systematics", "require_request"]
@@ -227,7 +227,7 @@ def _registered(
         frame: Observation | None = each
         if each.first_pixel is None:
             with stage(f"1 of 4: place of {each.name} on the detector"):
-                frame = register(_rough_fit(model, each, opd, **common), pattern)
+                frame = place_on_detector(_rough_fit(model, each, opd, **common), pattern)
         if frame is None:
             _log.warning(
                 "%s: the file does not say which pixels of the detector its frames show, and the "
