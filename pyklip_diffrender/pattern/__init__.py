@@ -8,9 +8,11 @@ from __future__ import annotations
 from pyklip_diffrender.pattern.choice import (
     PatternChoice,
     PatternRequest,
+    ReferenceFrames,
     choose_systematics,
     require_request,
 )
+from pyklip_diffrender.pattern.fit import fit_with_pattern
 from pyklip_diffrender.pattern.library import known_systematics, read_patterns, write_patterns
 from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
@@ -26,8 +28,10 @@ __all__ = [
     "MeasuredPattern",
     "PatternChoice",
     "PatternRequest",
+    "ReferenceFrames",
     "choose_systematics",
     "combine_patterns",
+    "fit_with_pattern",
     "known_systematics",
     "lacks_pattern",
     "learn_systematics",
