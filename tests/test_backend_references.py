@@ -32,6 +32,7 @@ from pyklip_diffrender.pyklip_backend import (
     unregister,
 )
 from pyklip_diffrender.pyklip_backend.frames import frames_of
+from pyklip_diffrender.pyklip_backend.references import References
 from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
