@@ -19,10 +19,10 @@ from pyklip_diffrender.refinement.accurate_step import (
     accurate_step,
     conjugate_gradients,
 )
-from pyklip_diffrender.refinement.gauss_newton import Solver
 from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.solver import Solver
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
@@ -250,7 +250,7 @@ def count_linearisations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         calls.append(int(bool(arguments[5])))
         return linearise(*arguments)
 
-    monkeypatch.setattr("pyklip_diffrender.refinement.gauss_newton.linearise", counted)
+    monkeypatch.setattr("pyklip_diffrender.refinement.solver.linearise", counted)
     return calls
 
 
@@ -293,7 +293,7 @@ def test_equations_that_lead_nowhere_are_replaced(monkeypatch: pytest.MonkeyPatc
         step, settled = right(*arguments, **options)
         return (step if calls else -step), settled
 
-    monkeypatch.setattr("pyklip_diffrender.refinement.gauss_newton.accurate_step", wrong)
+    monkeypatch.setattr("pyklip_diffrender.refinement.solver.accurate_step", wrong)
     last, gain = solver._accurate_step(after, 0.01, len(BASIS))
     assert calls == [0]
     assert gain > 0

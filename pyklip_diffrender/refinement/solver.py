@@ -19,7 +19,7 @@ from torch import Tensor
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.linear.noise import Noise
-from pyklip_diffrender.linear.responses import Responses
+from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.refinement.accurate_step import ModelDerivatives, accurate_step
 from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.frame_layout import FrameLayout
@@ -103,7 +103,7 @@ class Solver:
             )
         jacobians = 4.0 * len(problems) * (len(basis) + settings.prior.amplitude_modes(basis))
         jacobians *= math.prod(problems[0].observation.shape)
-        self._responses = responses = Responses(
+        self._responses = responses = ResponseCache(
             problems[0].model,
             basis,
             npix=settings.response_npix,
