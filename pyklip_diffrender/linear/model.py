@@ -195,10 +195,9 @@ class LinearModel:
                 weighted = image * self.frames[k].weight.to(image.dtype)
                 total += (self._weighted_rows[k] @ weighted.flatten(1).T.float()).double()
             return total
-        for k, weighted in self.noise.inverse(images).items():
+        for k, weighted in self.noise.weighted(images).items():
             frame = self.frames[k]
-            pixels = (weighted * frame.weight.to(weighted.dtype)).flatten(1)
-            on_rows = frame.jacobian.flatten(1) @ pixels.T.to(frame.jacobian.dtype)
+            on_rows = frame.jacobian.flatten(1) @ weighted.flatten(1).T.to(frame.jacobian.dtype)
             total += frame.onto_unknowns(on_rows.double(), size)
         return total
 

@@ -209,6 +209,13 @@ class Noise:
             for k, (weight, common) in enumerate(zip(self.weight, self.common, strict=True))
         }
 
+    def weighted(self, images: Mapping[int, Tensor]) -> dict[int, Tensor]:
+        """C^-1 x of images x, as `inverse`."""
+        if self.correlated or self.shares_pattern:
+            inverse = self.inverse(images)
+            return {k: self.weight[k].to(x.dtype) * x for k, x in inverse.items()}
+        return {k: (self.weight[k] ** 2).to(x.dtype) * x for k, x in images.items()}
+
     def whitened(self, images: Mapping[int, Tensor]) -> Tensor:
         """Images in units in which their noise is independent and has a variance of 1.
 
