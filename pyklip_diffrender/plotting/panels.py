@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.io.units import ARCSEC
 
 if TYPE_CHECKING:
@@ -146,9 +147,7 @@ def label_sky(*axes: Axes) -> None:
 
 def turned(places: ArrayLike, frame: Observation, first: Observation) -> NDArray[np.float64]:
     """Rotate positions (k, 2) from the orientation of the first frame to that of another frame."""
-    turn = np.deg2rad(frame.roll_from(first))
-    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    return np.reshape(places, (-1, 2)) @ matrix.T
+    return np.reshape(places, (-1, 2)) @ rotation_matrix(frame.roll_from(first)).T
 
 
 def show(
