@@ -22,6 +22,7 @@ import sys
 import tempfile
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from benchmarks.breakages.catalogue import BREAKAGES, Breakage
 
@@ -35,6 +36,9 @@ LIBRARIES = (
 """Imported once, because that takes longer than most tests."""
 TOO_LONG = 3600
 """Seconds after which tests that hang count as a failure."""
+
+Result = dict[str, Any]
+"""What became of a breakage: the test that noticed it or None, the stage, and the CPU time."""
 
 
 def place_of(breakage: Breakage, root: Path) -> Path:
@@ -85,11 +89,14 @@ def failing_test(copy: Path, arguments: list[str]) -> str | None:
         return None
     text = report.read_text(encoding="utf-8")
     failed = re.search(r"^(?:FAILED|ERROR) (\S+)", text, re.MULTILINE)
-    if failed:
+    if failed and code == 1:
         return failed[1].removeprefix("tests/")
     if code == -signal.SIGALRM:
         return "(no end)"
-    sys.exit(f"pytest cannot run: {text[-2000:]}")
+    if "not found:" in text:
+        return None  # The test of an earlier run is no more.
+    # An error while tests are collected or pytest starts is one that nobody overlooks.
+    return "(collection)"
 
 
 def run_pytest(copy: Path, arguments: list[str]) -> int:
@@ -105,20 +112,35 @@ def run_pytest(copy: Path, arguments: list[str]) -> int:
     return int(pytest.main(["-x", "-q", "-n0", "-p", "no:cacheprovider", *arguments]))
 
 
-def judge(breakage: Breakage, copy: Path, likely_only: bool) -> dict[str, object]:
-    """Break the copy, test it, and mend it."""
+def judge(breakage: Breakage, copy: Path, before: str | None, likely_only: bool) -> Result:
+    """Break the copy, test it, and mend it.
+
+    Parameters
+    ----------
+    breakage : Breakage
+    copy : Path
+    before : str or None
+        The test that noticed it in an earlier run, which is run first.
+    likely_only : bool
+        Leave out the test files that are not named with the breakage.
+    """
     path = place_of(breakage, copy)
     whole = path.read_text(encoding="utf-8")
     began = resource.getrusage(resource.RUSAGE_CHILDREN)
     likely = [f"tests/test_{name}.py" for name in breakage.tests.split()]
     likely = [name for name in likely if (copy / name).is_file()]
-    stage = "likely files"
+    stages = {"likely files": likely}
+    if before and (copy / "tests" / before.split("::")[0]).is_file():
+        stages = {"test of an earlier run": [f"tests/{before}"], **stages}
+    if not likely_only:
+        stages["all quick tests"] = ["tests", *(f"--ignore={name}" for name in likely)]
+    caught, stage = None, "no test"
     try:
         path.write_text(whole.replace(breakage.old, breakage.new), encoding="utf-8")
-        caught = failing_test(copy, likely) if likely else None
-        if caught is None and not likely_only:
-            stage = "all quick tests"
-            caught = failing_test(copy, ["tests", *(f"--ignore={name}" for name in likely)])
+        for stage, arguments in stages.items():
+            caught = failing_test(copy, arguments) if arguments else None
+            if caught:
+                break
     finally:
         path.write_text(whole, encoding="utf-8")
     ended = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -126,7 +148,7 @@ def judge(breakage: Breakage, copy: Path, likely_only: bool) -> dict[str, object
     return {"caught": caught, "stage": stage, "cpu_seconds": round(seconds, 1)}
 
 
-def table(results: dict[str, dict[str, object]]) -> str:
+def table(results: dict[str, Result]) -> str:
     """Markdown, with the number caught."""
     lines = ["| breakage | property | noticed by | CPU, s |", "|---|---|---|---|"]
     known = [(each, results[each.name]) for each in BREAKAGES if each.name in results]
@@ -146,6 +168,9 @@ def main() -> int:
     names = [each.name for each in BREAKAGES]
     parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help="some of them")
     parser.add_argument("--record", type=Path, help="JSON file to add results to, and go on from")
+    parser.add_argument(
+        "--again", action="store_true", help="also what is recorded, the same test first"
+    )
     parser.add_argument("--root", type=Path, default=ROOT, help="checkout; default this one")
     parser.add_argument("--likely-only", action="store_true", help="not the rest of the tests")
     parser.add_argument("--check", action="store_true", help="only look for the texts")
@@ -158,17 +183,18 @@ def main() -> int:
     os.environ |= {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
     for name in LIBRARIES:
         import_module(name)
-    results: dict[str, dict[str, object]] = {}
+    results: dict[str, Result] = {}
     if options.record and options.record.exists():
         results = json.loads(options.record.read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory(prefix="breakages-") as folder:
         copy = copy_of(options.root.resolve(), Path(folder))
         for breakage in chosen:
-            known = results.get(breakage.name)
-            enough = options.likely_only or (known and known["stage"] == "all quick tests")
-            if known and (known["caught"] or enough):
+            known = results.get(breakage.name, {})
+            enough = options.likely_only or known.get("stage") == "all quick tests"
+            if known and (known["caught"] or enough) and not options.again:
                 continue
-            results[breakage.name] = judge(breakage, copy, options.likely_only)
+            before = known.get("caught")
+            results[breakage.name] = judge(breakage, copy, before, options.likely_only)
             print(breakage.name, results[breakage.name], flush=True)
             if options.record:
                 text = json.dumps(results, indent=1) + "\n"
