@@ -20,6 +20,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import traceback
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,15 @@ def failing_test(copy: Path, arguments: list[str]) -> str | None:
             os.dup2(file.fileno(), 1)
             os.dup2(file.fileno(), 2)
             signal.alarm(TOO_LONG)
-            os._exit(run_pytest(copy, arguments))
+            code = 3
+            try:
+                code = run_pytest(copy, arguments)
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                # Nothing of the parent's is done twice, such as removing the copy.
+                sys.stderr.flush()
+                os._exit(code)
     code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
     if code == 0:
         return None
@@ -129,18 +138,17 @@ def judge(breakage: Breakage, copy: Path, before: str | None, likely_only: bool)
     began = resource.getrusage(resource.RUSAGE_CHILDREN)
     likely = [f"tests/test_{name}.py" for name in breakage.tests.split()]
     likely = [name for name in likely if (copy / name).is_file()]
-    stages = {"likely files": likely}
+    stages = {"likely files": likely} if likely else {}
     if before and (copy / "tests" / before.split("::")[0]).is_file():
         stages = {"test of an earlier run": [f"tests/{before}"], **stages}
     if not likely_only:
         stages["all quick tests"] = ["tests", *(f"--ignore={name}" for name in likely)]
-    caught, stage = None, "no test"
+    caught, stage = None, ""
     try:
         path.write_text(whole.replace(breakage.old, breakage.new), encoding="utf-8")
-        for stage, arguments in stages.items():
-            caught = failing_test(copy, arguments) if arguments else None
-            if caught:
-                break
+        while stages and not caught:
+            stage = next(iter(stages))
+            caught = failing_test(copy, stages.pop(stage))
     finally:
         path.write_text(whole, encoding="utf-8")
     ended = resource.getrusage(resource.RUSAGE_CHILDREN)
