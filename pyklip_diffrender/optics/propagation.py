@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.io.units import require_finite, to_metres, to_unit, warn_of_rms
+from pyklip_diffrender.io.units import ARCSEC, require_finite, to_metres, to_unit, warn_of_rms
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.fast.path import LatticeRoute
@@ -28,7 +28,6 @@ from pyklip_diffrender.optics.planes import (
     Plane,
     Values,
     Wavefront,
-    is_occulter,
 )
 from pyklip_diffrender.parameters import parameter
 
@@ -95,6 +94,11 @@ class Propagation:
     def diameter(self) -> float:
         """Side of the pupil array, m."""
         return self.entrance.full.diameter
+
+    @property
+    def resolution(self) -> float:
+        """lambda/D at the mean wavelength, arcsec."""
+        return self.bandpass.mean_wavelength / self.diameter / ARCSEC
 
     @property
     def dtype(self) -> torch.dtype:
@@ -232,7 +236,7 @@ class Propagation:
     @property
     def _last_occulter(self) -> int:
         """Number of planes up to the last occulter."""
-        return max((k + 1 for k, plane in enumerate(self.planes) if is_occulter(plane)), default=0)
+        return max((k + 1 for k, plane in enumerate(self.planes) if plane.focal), default=0)
 
     @property
     def parameters_behind(self) -> frozenset[str]:
@@ -273,7 +277,7 @@ class Propagation:
             As in a call of the system.
         """
         open_path = copy.copy(self)
-        open_path.planes = tuple(each for each in self.planes if not is_occulter(each))
+        open_path.planes = tuple(each for each in self.planes if not each.focal)
         values = self.values(parameters)
         with torch.no_grad():
             wavefront = self.pupil_field(self.opd(opd), self.bandpass.mean_wavelength, values)

@@ -15,7 +15,6 @@ from astropy.io import fits
 from astropy.time import Time
 from astropy.utils.exceptions import AstropyUserWarning
 
-from pyklip_diffrender.bridges.wss import EXTENSION, interpolate_wss
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
@@ -26,6 +25,7 @@ from pyklip_diffrender.io.headers import header_text, merged_header, sensing_dat
 from pyklip_diffrender.io.opd_map import FLAT, OPDMap
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.wavefront.opd import as_opd_map, read_opd
+from pyklip_diffrender.wavefront.wss import EXTENSION, interpolate_wss
 
 __all__ = ["RULES", "Rule", "choose_map", "dated_maps", "wavefront_for"]
 
@@ -41,7 +41,7 @@ _BROKEN = (
     OSError, EOFError, ValueError, TypeError, KeyError, zlib.error, fits.VerifyError,
     AstropyUserWarning,
 )  # fmt: skip
-"""What astropy raises for files that are cut or damaged; it only warns of some."""
+"""Exceptions, and the warning, that astropy raises for files that are cut or damaged."""
 
 _OUTDATED = 200.0
 """Days between a map and the frames above which a warning is given: the telescope is realigned

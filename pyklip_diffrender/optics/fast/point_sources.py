@@ -1,10 +1,22 @@
 """Point sources at every detector pixel, by convolution on a lattice aligned with the pixels.
 
-A source at p tilts the wavefront in the pupil. The propagation (see `occulter`) needs F[E] at the
-cells c of the occulter and F[L E] at the samples x of the detector. For a source at p these are
-F[E](c - p) and F[L E](x - p). If cells, samples and sources are points of one lattice, so are all
-these differences. Both transforms are therefore computed only once, on larger parts of the lattice,
-and every source costs two small FFTs.
+In the notation of `occulter`, a source on the axis has the field
+
+    A(x) = F[L E](x) - sum_c K(x - c) B(c) F[E](c),     K = F[L],   B = (1 - t) cell / lambda.
+
+A source at p multiplies E by exp(-2 pi i p xi / lambda), which shifts its transforms by p:
+
+    A_p(x) = F[L E](x - p) - sum_c K(x - c) B(c) F[E](c - p).
+
+Mask and stop stay where they are, so K and B do not change. If samples x, cells c and sources p are
+points of one lattice, so are x - p and c - p. Both transforms are computed once, on the parts of
+the lattice that hold all differences: for n pixels of k samples, k (2 n - 1) differences x - p; for
+2 h + 1 cells, q per pixel, 2 h + 1 + q (n - 1) differences c - p. For each source, a window of the
+first and one of the second are cut out, and the sum is two FFTs of the size of the detector.
+
+Intensities are added over wavelengths, and binned to pixels in the end. Where B F[E](c - p) changes
+an image by a percent at most (far from the mask), the sum is left out, and all images are one
+array, shifted.
 """
 
 from __future__ import annotations
@@ -22,9 +34,8 @@ from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.batches import batch_of
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.fast.occulter import OcculterLattice
-from pyklip_diffrender.optics.fast.path import LatticeRoute, is_pointwise
+from pyklip_diffrender.optics.fast.path import LatticeRoute
 from pyklip_diffrender.optics.fourier import MatrixFourier
-from pyklip_diffrender.optics.masks import SampledOcculter
 from pyklip_diffrender.optics.planes import CompactOcculter, Plane, Wavefront
 from pyklip_diffrender.optics.system import OpticalSystem, Value
 
@@ -90,10 +101,10 @@ class PointSources:
             if self._opd.ndim != 2:
                 raise ShapeError(f"opd: got shape {tuple(self._opd.shape)}, expected one map")
             self._values = {name: value.detach() for name, value in model.values(fixed).items()}
-            self._radius, self.reach = 0.0, math.inf
+            self._radius, self.reach, self._reduced = 0.0, math.inf, False
             self._waves = self._prepared(sampling)
             self.route = "lattice" if self._waves else "model"
-            if any(isinstance(p, SampledOcculter) for p in model.planes) and not self._agrees():
+            if not self._agrees():
                 self._waves, self.route = [], "model"
             self.reach = self._reach()
         _log.debug("images of point sources: method %r", self.route)
@@ -105,6 +116,7 @@ class PointSources:
             planes = _one_mask(self.model, wavelength)
             if planes is None:
                 return []
+            self._reduced |= planes != list(self.model.planes)
             masks = [plane.radius for plane in planes if isinstance(plane, CompactOcculter)]
             self._radius = max(self._radius, *masks, 0.0)
             waves.append(self._wave(planes, wavelength, sampling))
@@ -112,7 +124,7 @@ class PointSources:
 
     def _agrees(self) -> bool:
         """Whether images agree with those of the model, between the middle and a corner."""
-        if self.route == "model":
+        if self.route == "model" or not self._reduced:
             return True
         ny, nx = self.model.detector.shape
         share = torch.tensor([0.55, 0.65, 0.8, 1.0], dtype=torch.float64)
@@ -240,19 +252,19 @@ class PointSources:
 
 
 def _one_mask(model: OpticalSystem, wavelength: float) -> list[Plane] | None:
-    """Reduce sampled masks to their first part.
+    """Replace focal masks by compact occulters.
 
     Returns None unless the planes are at most one mask between factors in the pupil.
     """
     planes: list[Plane] = []
     for plane in model.planes:
-        if isinstance(plane, SampledOcculter):
-            compact = plane.compact(wavelength, model.dtype, model.device)
-            if compact is None:
-                return None
-            plane = compact
-        planes.append(plane)
-    if LatticeRoute.serves(planes) or all(is_pointwise(plane) for plane in planes):
+        each: Plane | None = plane
+        if plane.focal:
+            each = plane.compact(wavelength, model.dtype, model.device)
+        if each is None:
+            return None
+        planes.append(each)
+    if LatticeRoute.serves(planes) or all(plane.pointwise for plane in planes):
         return planes
     return None
 

@@ -1,0 +1,338 @@
+"""Learning the pattern of the model's error from stars other than the target."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.pattern.pedestal import (
+    light_and_residual,
+    median_variance,
+    pattern_pedestal,
+    rings_about,
+)
+from pyklip_diffrender.refinement.frame_fit import FrameFit
+from pyklip_diffrender.refinement.result import Refinement
+from pyklip_diffrender.scene.systematics import Systematics
+
+__all__ = [
+    "MeasuredPattern",
+    "combine_patterns",
+    "learn_systematics",
+    "measure_patterns",
+]
+
+Image = NDArray[np.float64]
+
+_FEW = 50
+"""Number of pixels below which a ring is not used for that."""
+
+_OUTLIER = 4.0
+"""Standard deviations from the median of the frames beyond which a pixel of a frame is left out:
+a companion or background source of that star, or a cosmic ray."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredPattern:
+    """Residual over star, as one frame shows it.
+
+    Attributes
+    ----------
+    star : str
+    value : ndarray, (ny, nx)
+        Residual over the sum of star and pedestal; 0 where not known.
+    variance : ndarray, (ny, nx)
+        Of the data's noise; inf where not known.
+    center : tuple of float
+        x, y of the star, 0-indexed pixels.
+    first_pixel : tuple of int or None
+        Column and row of the first pixel on the full detector, as of an `Observation`.
+    filter, image_mask : str or None
+    frame, date : str
+        Where and when it was measured.
+    pedestal : float
+        As of `Systematics`.
+    """
+
+    star: str
+    value: Image
+    variance: Image
+    center: tuple[float, float]
+    first_pixel: tuple[int, int] | None = None
+    filter: str | None = None
+    image_mask: str | None = None
+    frame: str = ""
+    date: str = ""
+    pedestal: float = 0.0
+
+
+def learn_systematics(
+    fits: Refinement | Sequence[Refinement], *, name: str | None = None
+) -> Systematics:
+    """Learn the pattern that the star model misses from fits of other stars.
+
+    In every frame the residual is divided by the sum of the star and a pedestal, the same in all of
+    them, see ``pattern.pedestal.pattern_pedestal``. The ratios are averaged with inverse
+    variances, which are those of the data's noise and of the scatter between frames beyond that
+    noise; a zero-mean Gaussian prior, as wide as the ratios scatter over the pixels of a ring,
+    shrinks pixels that were not measured well. The error of the pattern for another frame is that
+    of this average and the scatter between frames.
+
+    Parameters
+    ----------
+    fits : Refinement or sequence of Refinement
+        Of other stars than the one that the pattern will be used for: a planet of the target
+        would be learned as well. Two frames at least; rolls of one star will do, several stars
+        show better how well the pattern carries over.
+    name : str, optional
+        Short label; default the names of the stars.
+
+    Returns
+    -------
+    Systematics
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For fewer than two frames, frames of different filters, or failed fits.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
+    >>> opd = dr.random_opd(1, npix=128)
+    >>> frames = [dr.simulate(model, dr.Scene(), opd, seed=k) for k in (1, 2)]
+    >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> dr.learn_systematics(fit, name="noise")
+    <Systematics 'noise': F444W, 32 x 32 pixels>
+    """
+    patterns = measure_patterns(fits)
+    if len(patterns) < 2:
+        raise IncompatibleSetupError(
+            f"learn_systematics: got {len(patterns)} usable frames, expected at least two, such "
+            "as two rolls of a reference star"
+        )
+    return combine_patterns(patterns, name)
+
+
+def measure_patterns(
+    fits: Refinement | Sequence[Refinement], pedestal: float | None = None
+) -> list[MeasuredPattern]:
+    """Measure the pattern in every frame of the fits that did not fail.
+
+    Parameters
+    ----------
+    fits : Refinement or sequence of Refinement
+    pedestal : float, optional
+        As of `Systematics`, in the unit of the frames. By default it is estimated.
+    """
+    several = [fits] if isinstance(fits, Refinement) else list(fits)
+    usable = [fit for fit in several if fit.status.usable]
+    if pedestal is None:
+        pedestal = pattern_pedestal(usable)
+    return [_measured(frame, pedestal) for fit in usable for frame in fit.frames]
+
+
+def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = None) -> Systematics:
+    """Average measured patterns, see `learn_systematics`.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For none, or patterns of different filters.
+    """
+    filters = {pattern.filter for pattern in patterns}
+    pedestals = {pattern.pedestal for pattern in patterns}
+    if len(pedestals) != 1:
+        raise IncompatibleSetupError(
+            f"systematics: got patterns with pedestals of {sorted(pedestals)}, expected one. "
+            "Measure them with the same value of pedestal"
+        )
+    if len(filters) != 1:
+        raise IncompatibleSetupError(
+            f"systematics: got patterns of {sorted(map(str, filters))}, expected one filter"
+        )
+    values, variances, center, first_pixel = _on_common_pixels(patterns)
+    ring = rings_about(values[0].shape, center)
+    stars = [pattern.star for pattern in patterns]
+    variances = variances * _noise_ratio(values, variances, ring)
+    scatter = _scatter_between_frames(values, variances, stars, ring)
+    variances = np.where(_outliers(values, variances + scatter**2), np.inf, variances)
+    width = _prior_width(values, variances, ring)
+    precision = (1 / (variances + scatter**2)).sum(axis=0)
+    total = precision + width**-2.0
+    pattern = (values / (variances + scatter**2)).sum(axis=0) / total
+    error = np.sqrt(1 / total + np.where(precision > 0, scatter**2, 0.0))
+    names = list(dict.fromkeys(stars))
+    return Systematics(
+        pattern=pattern,
+        error=np.minimum(error, width),
+        center=center,
+        first_pixel=first_pixel,
+        unknown=float(np.median(width)),
+        pedestal=pedestals.pop(),
+        filter=patterns[0].filter,
+        image_mask=patterns[0].image_mask,
+        name=name or ", ".join(names),
+        provenance={
+            "stars": names,
+            "frames": [pattern.frame for pattern in patterns],
+            "dates": [pattern.date for pattern in patterns],
+        },
+    )
+
+
+def _text(value: object) -> str | None:
+    return value if isinstance(value, str) else None
+
+
+def _measured(frame: FrameFit, pedestal: float) -> MeasuredPattern:
+    observation = frame.observation
+    light, left, error, valid = light_and_residual(frame)
+    multiplied = light + pedestal
+    usable = valid & (multiplied > 0)
+    safe = np.where(usable, multiplied, 1.0)
+    x, y = observation.center.mean(axis=0)
+    return MeasuredPattern(
+        star=observation.target,
+        value=np.where(usable, left / safe, 0.0),
+        variance=np.where(usable, (error / safe) ** 2, np.inf),
+        center=(float(x), float(y)),
+        first_pixel=observation.first_pixel,
+        filter=observation.filter,
+        image_mask=_text(observation.header.get("CORONMSK")),
+        frame=observation.name,
+        date="" if observation.date is None else observation.date.isot,
+        pedestal=pedestal,
+    )
+
+
+def _on_common_pixels(
+    patterns: Sequence[MeasuredPattern],
+) -> tuple[Image, Image, tuple[float, float], tuple[int, int] | None]:
+    """Values and variances on an array that holds all patterns, each pixel on one of them.
+
+    Pixels are matched on the detector where all patterns say which ones they have, else by the
+    position of the star.
+
+    Returns
+    -------
+    values, variances : ndarray, (patterns, ny, nx)
+    center : tuple of float
+        The first pattern's star.
+    first_pixel : tuple of int or None
+    """
+    on_detector = all(pattern.first_pixel is not None for pattern in patterns)
+    starts = np.array(
+        [
+            pattern.first_pixel if on_detector else -np.round(pattern.center).astype(int)
+            for pattern in patterns
+        ]
+    )
+    ends = starts + [pattern.value.shape[::-1] for pattern in patterns]
+    left, bottom = starts.min(axis=0)
+    right, top = ends.max(axis=0)
+    values = np.zeros((len(patterns), top - bottom, right - left))
+    variances = np.full(values.shape, np.inf)
+    for k, pattern in enumerate(patterns):
+        ny, nx = pattern.value.shape
+        x, y = starts[k] - (left, bottom)
+        values[k, y : y + ny, x : x + nx] = pattern.value
+        variances[k, y : y + ny, x : x + nx] = pattern.variance
+    x, y = starts[0] - (left, bottom) + patterns[0].center
+    return (
+        values,
+        variances,
+        (float(x), float(y)),
+        (int(left), int(bottom)) if on_detector else None,
+    )
+
+
+def _by_ring(variance: NDArray[np.float64], ring: NDArray[np.int64]) -> Image:
+    """Standard deviations by ring, from variances that may be negative, on the pixels."""
+    return np.sqrt(np.maximum(variance, 0.0))[ring]
+
+
+def _scatter_between_frames(
+    values: Image, variances: Image, stars: Sequence[str], ring: NDArray[np.int64]
+) -> Image:
+    """Standard deviation of the ratio between frames beyond noise, on the pixels.
+
+    From frames of different stars where there are any: frames of one star share what is
+    particular to it.
+    """
+    pairs = [(a, b) for a in range(len(stars)) for b in range(a + 1, len(stars))]
+    across = [(a, b) for a, b in pairs if stars[a] != stars[b]] or pairs
+    count = ring.max() + 1
+    excess, weight = np.zeros(count), np.zeros(count)
+    for a, b in across:
+        noise = variances[a] + variances[b]
+        known = np.isfinite(noise)
+        difference = np.abs(values[a] - values[b])
+        for k in range(count):
+            inside = known & (ring == k)
+            if not inside.any():
+                continue
+            spread = median_variance(difference[inside])
+            share = 1 / np.median(noise[inside]) ** 2
+            excess[k] += share * (spread - np.median(noise[inside]))
+            weight[k] += share
+    return _by_ring(np.divide(excess, 2 * weight, where=weight > 0, out=np.zeros(count)), ring)
+
+
+def _noise_ratio(values: Image, variances: Image, ring: NDArray[np.int64]) -> Image:
+    """Ratio of the noise's variance in a ring to the stated one, if below 1, on the pixels.
+
+    The noise of resampled frames is correlated between neighbours. Errors are such that they hold
+    for an image of several pixels, and the noise of a single pixel is less.
+    """
+    count = ring.max() + 1
+    total, weight = np.zeros(count), np.zeros(count)
+    for a, b in combinations(range(len(values)), 2):
+        noise = variances[a] + variances[b]
+        for k in range(count):
+            inside = np.isfinite(noise) & (ring == k)
+            if inside.sum() < _FEW:
+                continue
+            deviations = (values[a] - values[b])[inside] / np.sqrt(noise[inside])
+            total[k] += inside.sum() * median_variance(deviations)
+            weight[k] += inside.sum()
+    ratio = np.divide(total, weight, where=weight > 0, out=np.ones(count))
+    return np.minimum(ratio, 1.0)[ring]
+
+
+def _outliers(values: Image, variances: Image) -> NDArray[np.bool_]:
+    """Pixels of single frames that are far from the median of the others."""
+    known = np.isfinite(variances)
+    if len(values) < 3:
+        return ~known
+    middle = np.ma.median(np.ma.array(values, mask=~known), axis=0).filled(0.0)
+    return ~known | (np.abs(values - middle) > _OUTLIER * np.sqrt(variances))
+
+
+def _prior_width(values: Image, variances: Image, ring: NDArray[np.int64]) -> Image:
+    """Standard deviation of the pattern over the pixels of a ring.
+
+    From products of different frames, whose noise is independent: where noise dominates, squares of
+    one frame would show how well its errors are known, and not the pattern.
+    """
+    count = ring.max() + 1
+    total, weight = np.zeros(count), np.zeros(count)
+    known = np.isfinite(variances)
+    for a in range(len(values)):
+        for b in range(a + 1, len(values)):
+            both = known[a] & known[b]
+            share = 1 / (variances[a][both] * variances[b][both])
+            product = values[a][both] * values[b][both]
+            total += np.bincount(ring[both], share * product, count)
+            weight += np.bincount(ring[both], share, count)
+    width = np.divide(total, weight, where=weight > 0, out=np.zeros(count))
+    # No ring is taken to be free of the pattern just because it is too faint to show it.
+    seen = width[width > 0]
+    floor = np.median(seen) / 4 if len(seen) else 1e-4
+    return _by_ring(np.maximum(width, floor), ring)

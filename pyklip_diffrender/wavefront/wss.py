@@ -1,0 +1,277 @@
+"""Maps of JWST's wavefront-sensing software (WSS) as archived by MAST.
+
+The steps are those of stpsf's `load_wss_opd`: fill the gaps, interpolate, convert microns, mask,
+and subtract the internal aberration of the sensing camera and the telescope's field dependence,
+both at the sensing field point.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from astropy.time import Time
+from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
+
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    MissingOPDError,
+)
+from pyklip_diffrender.io.files import open_fits, sha256
+from pyklip_diffrender.io.headers import header_text, sensing_date
+from pyklip_diffrender.io.opd_map import OPDMap
+from pyklip_diffrender.io.units import native_float64, require_shape
+from pyklip_diffrender.wavefront.map_files import check_opd
+from pyklip_diffrender.wavefront.sensing import (
+    TO_METRES,
+    finest_pupil,
+    pupil_samples,
+    sensing_terms,
+    stpsf_module,
+)
+
+__all__ = ["EXTENSION", "interpolate_wss", "load_wss_opd", "load_wss_opd_by_date"]
+
+Array = NDArray[np.float64]
+
+EXTENSION = "RESULT_PHASE"
+"""Name of the extension that holds the map; only these files have one."""
+
+
+def load_wss_opd(
+    path: str | os.PathLike[str],
+    *,
+    npix: int | None = None,
+    backout_si_wfe: bool | None = None,
+) -> OPDMap:
+    """Read a wavefront-sensing file.
+
+    Parameters
+    ----------
+    path : path
+        File as MAST has it, such as ``R2022081102-NRCA3_FP1-1.fits``.
+    npix : int, optional
+        Samples across the map. To subtract the sensing terms, stpsf's data must include a pupil
+        with as many. Default that of the finest pupil in stpsf's data, else 1024.
+    backout_si_wfe : bool, optional
+        Subtract the sensing camera's aberration and the telescope's field dependence at the
+        sensing field point, with stpsf's models. False keeps the measured sum. By default they
+        are subtracted if stpsf and its data are installed (``STPSF_PATH``); otherwise the sum is
+        kept, with a warning.
+
+    Returns
+    -------
+    OPDMap
+        The telescope's wavefront without its field dependence, which stpsf adds for the position
+        of each instrument. 0 outside the pupil.
+
+    Raises
+    ------
+    CorruptFileError
+        If it is not a wavefront-sensing file, or stpsf's data are incomplete.
+    IncompatibleSetupError
+        If its unit is not a length, or stpsf is needed and not installed.
+    UnitError, NonFiniteError
+        If the values cannot be a wavefront in that unit.
+
+    Warns
+    -----
+    DiffrenderWarning
+        If the sensing terms are kept because stpsf's models are not available, or if the map
+        seems to be flipped.
+
+    Notes
+    -----
+    At NRCA3_FP1, where most maps are sensed, the terms have 27 nm rms (field dependence of the
+    telescope) and 22 nm rms (NIRCam) in the models of stpsf 2.2. With them a map typically has
+    63 nm rms where the telescope alone has 54 nm rms.
+    """
+    path = Path(path)
+    with open_fits(path) as hdus:
+        if EXTENSION not in hdus:
+            raise CorruptFileError(
+                f"{path}: no extension {EXTENSION}, but {[hdu.name for hdu in hdus]}. Expected a "
+                "wavefront-sensing product of MAST"
+            )
+        coarse = native_float64(hdus[EXTENSION].data)
+        header = hdus[0].header.copy()
+        # MAST's files are in microns and do not say so.
+        unit = header_text(hdus[EXTENSION].header, "BUNIT", path.name) or "micron"
+    require_shape(coarse, (None, None), f"{path}: {EXTENSION}", "It must be an image")
+    if unit.strip().lower() not in TO_METRES:
+        raise IncompatibleSetupError(f"{path}: {EXTENSION} has BUNIT={unit!r}, expected 'micron'")
+    if not coarse.any():
+        raise CorruptFileError(
+            f"{path}: all values of {EXTENSION} are zero, expected a measured wavefront. Fetch "
+            "the file again"
+        )
+    npix = npix or finest_pupil()
+    aperture = header.get("APERNAME", "")
+    pupil = pupil_samples(npix, required=backout_si_wfe is True)
+    opd = _interpolated(_gaps_filled(coarse), npix) * TO_METRES[unit.strip().lower()]
+    history = [
+        f"{path.name} sha256 {sha256(path)}",
+        f"gaps filled, interpolated from {len(coarse)} to {npix} samples, {unit} to m, masked",
+    ]
+    check_opd(np.where(_has_values(coarse, npix), opd, 0), pupil, str(path))
+    opd = opd * pupil
+    if backout_si_wfe is not False:
+        try:
+            terms, source = sensing_terms(aperture, opd, npix, path.name)
+        except (CorruptFileError, IncompatibleSetupError) as error:
+            if backout_si_wfe:
+                raise
+            _warn_of_terms(path.name, error)
+            history.append("kept SI WFE and OTE field dependence at the sensing field point")
+        else:
+            opd = opd - terms * pupil
+            history.append(f"subtracted SI WFE ({source}) and OTE field dependence at {aperture}")
+    date = sensing_date(header, path.name)
+    return OPDMap(opd, date, path.name, sha256(path), aperture, tuple(history))
+
+
+def _warn_of_terms(name: str, reason: Exception) -> None:
+    warnings.warn(
+        f"{name}: the map is what the sensing camera saw. It contains that camera's own "
+        "aberration and the telescope's field dependence at the sensing field point, typically "
+        "63 nm rms in all where the telescope alone has 54 nm rms, because stpsf's models of them "
+        f"are not available ({reason}). A refinement with a wide enough prior corrects for it; "
+        "load_wss_opd(path, backout_si_wfe=False) keeps the terms without this warning",
+        DiffrenderWarning,
+        stacklevel=4,
+    )
+
+
+def load_wss_opd_by_date(
+    date: str | Time,
+    choice: str = "closest",
+    *,
+    npix: int | None = None,
+    backout_si_wfe: bool | None = None,
+    folder: str | os.PathLike[str] | None = None,
+) -> OPDMap:
+    """Read the wavefront-sensing map of a date, through stpsf's own retrieval from MAST.
+
+    Parameters
+    ----------
+    date : str (ISO, UTC) or Time
+    choice : "closest", "before", "after" or "interpolate"
+        Measurement to take; the last interpolates linearly between the two around the date.
+    npix, backout_si_wfe
+        See `load_wss_opd`.
+    folder : path, optional
+        Folder for downloads; default stpsf's own cache.
+
+    Returns
+    -------
+    OPDMap
+
+    Raises
+    ------
+    MissingOPDError
+        If MAST cannot be reached, or has no map.
+    IncompatibleSetupError
+        For another `choice`, or if stpsf is not installed.
+    """
+    if choice not in ("closest", "before", "after", "interpolate"):
+        raise IncompatibleSetupError(
+            f"choice: got {choice!r}, expected 'closest', 'before', 'after' or 'interpolate'"
+        )
+    mast_wss = stpsf_module("to ask MAST").mast_wss
+    when = Time(date)
+    cache = None if folder is None else os.fspath(folder)
+    choices = ("before", "after") if choice == "interpolate" else (choice,)
+    try:
+        paths = [
+            mast_wss.get_opd_at_time(when, choice=which, output_path=cache) for which in choices
+        ]
+    except (OSError, RuntimeError, ValueError, LookupError, TypeError) as error:
+        # No network, an answer from a proxy instead of the service, or no map within a week.
+        raise MissingOPDError(
+            f"no wavefront map for {when.isot} from MAST ({type(error).__name__}: {error}). "
+            "Where the network does not allow it, download the file elsewhere "
+            "(https://mast.stsci.edu, product type OPD) and pass its path to load_wss_opd, or "
+            "to --opd on the command line"
+        ) from error
+    maps = [load_wss_opd(path, npix=npix, backout_si_wfe=backout_si_wfe) for path in paths]
+    return maps[0] if len(maps) == 1 else interpolate_wss(maps[0], maps[1], when)
+
+
+def interpolate_wss(before: OPDMap, after: OPDMap, date: str | Time) -> OPDMap:
+    """Interpolate linearly in time between two maps.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If a map has no date, or the date is not between theirs.
+
+    Warns
+    -----
+    DiffrenderWarning
+        Always: this wavefront was not measured, and segments move in steps.
+    """
+    when = Time(date)
+    if before.date is None or after.date is None:
+        raise IncompatibleSetupError(
+            f"{before.name}, {after.name}: both need a date to interpolate between them"
+        )
+    if not before.date <= when <= after.date or before.date == after.date:
+        raise IncompatibleSetupError(
+            f"{when.isot} is not between {before.date.isot} and {after.date.isot}"
+        )
+    share = float((when - before.date).jd / (after.date - before.date).jd)
+    warnings.warn(
+        f"the wavefront of {when.isot} is an interpolation, {1 - share:.0%} of {before.name} and "
+        f"{share:.0%} of {after.name}: not a measurement, and without steps in between",
+        DiffrenderWarning,
+        stacklevel=2,
+    )
+    data = (1 - share) * before.data + share * after.data
+    return replace(
+        before,
+        data=data,
+        date=when,
+        name=f"{before.name} + {after.name}",
+        sha256=hashlib.sha256(data.tobytes()).hexdigest(),
+        history=(
+            *before.history,
+            *after.history,
+            f"interpolated linearly in time: {1 - share:.6f} and {share:.6f} of the two",
+        ),
+    )
+
+
+def _gaps_filled(opd: Array) -> Array:
+    """Replace blank samples next to valid ones by the mean of their valid neighbours."""
+    valid = opd != 0
+    total, count = np.zeros_like(opd), np.zeros_like(opd)
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            if (dx, dy) != (0, 0):
+                total += np.roll(opd * valid, (dy, dx), axis=(0, 1))
+                count += np.roll(valid, (dy, dx), axis=(0, 1))
+    return np.where(valid, opd, total / np.maximum(count, 1))
+
+
+def _interpolated(opd: Array, npix: int) -> Array:
+    """Interpolate to `npix` samples by a cubic spline, with the shift that stpsf has.
+
+    Output sample i is at ``i dim / npix`` of the input's index and not at the same position in the
+    pupil: the map moves by (1 - dim / npix) / 2 input samples, as in stpsf, for maps to agree.
+    """
+    index = np.arange(len(opd), dtype=float)
+    fine = np.arange(npix) * (len(opd) / npix)
+    return native_float64(RectBivariateSpline(index, index, opd)(fine, fine))
+
+
+def _has_values(coarse: Array, npix: int) -> NDArray[np.bool_]:
+    """Samples of the output at which the map has values."""
+    index = (np.arange(npix) * len(coarse)) // npix
+    return (coarse != 0)[np.ix_(index, index)]
