@@ -228,7 +228,7 @@ def test_the_place_of_shifted_frames_is_known_or_left_to_the_search(
 
 
 def test_a_subarray_that_begins_elsewhere_is_not_believed(tmp_path: Path) -> None:
-    path = aligned_file(tmp_path / "plain.fits", SUBSTRT1=1, SUBSTRT2=1)
+    path = aligned_file(tmp_path / "plain.fits", SUBSTRT1=1, SUBSTRT2=1, SUBARRAY="FULL")
     with fits.open(path, mode="update") as hdus:
         del hdus["IMSHIFTS"]
     assert dr.Observation.from_fits(path).first_pixel is None

@@ -211,6 +211,8 @@ def first_pixel(
         return None
     column, row = (int(each or 0) - 1 for each in start)
     mask = mask_place(header, name)
+    if header_text(header, "SUBARRAY", name) is None:
+        mask = None  # Of a subarray that is not named, the beginning may be anywhere.
     away = 0.0 if mask is None else float(np.abs(np.add(star, (column, row)) - mask).max())
     if away > _NEAR or not on_detector((column, row), shape):
         _log.warning(
@@ -357,7 +359,8 @@ def _spread(squares: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArra
         if not variance.any():
             continue
         kernel = np.zeros_like(variance)
-        kernel[kernel.shape[0] // 2, kernel.shape[1] // 2] = 1.0
+        # Where `fftconvolve` has the origin of a kernel.
+        kernel[(kernel.shape[0] - 1) // 2, (kernel.shape[1] - 1) // 2] = 1.0
         kernel = np.fft.ifft2(fourier_shift(np.fft.fft2(kernel), shift[::-1])).real ** 2
         result[k] = np.maximum(fftconvolve(variance, kernel, mode="same"), 0.0)
     return result

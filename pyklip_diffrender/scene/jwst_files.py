@@ -37,6 +37,9 @@ may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
 BEHIND_THE_MASK = 0.1
 """Largest dither, arcsec, that leaves a star behind the mask; small-grid dithers are of 0.02."""
 
+_CROPPED = 32
+"""Whole pixels beyond which frames were cropped, and not only aligned."""
+
 
 def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[Any] | None]:
     """Read a calints file; see `Observation.from_fits`.
@@ -206,8 +209,9 @@ def on_detector_pixels(
     net = net_shifts(shifts, center, mask)
     pixels = np.round(net.mean(axis=0))
     shifted, sigma, good = undo_shifts(data, error, pixels - net)
-    # The alignment leaves the flags where they were.
-    right, up = (int(each) for each in pixels)
+    # The alignment leaves the flags where they were; a crop takes them along.
+    cropped = np.abs(pixels).max() > _CROPPED
+    right, up = (int(each) for each in (np.round(shifts.mean(axis=0)) if cropped else pixels))
     good &= np.roll(usable, (up, right), axis=(1, 2))
     column, row = (int(each) for each in begin - pixels)
     sure = mask is not None and on_detector((column, row), data.shape[1:])
