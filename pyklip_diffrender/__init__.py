@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     )
     from pyklip_diffrender.reduction import Reduction, reduce
     from pyklip_diffrender.refinement import (
-        Adam,
         GaussNewton,
         Refinement,
         Status,
@@ -56,7 +55,6 @@ if TYPE_CHECKING:
     from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
 
 __all__ = [
-    "Adam",
     "Detection",
     "DiffrenderSettings",
     "Disk",
@@ -116,7 +114,7 @@ _NAMES = {
     "pyklip_backend": "DiffrenderSettings backend observation_from_dataset register unregister",
     "reduction": "Reduction reduce",
     "refinement": (
-        "Adam GaussNewton Refinement Status Systematics known_systematics learn_systematics refine"
+        "GaussNewton Refinement Status Systematics known_systematics learn_systematics refine"
     ),
     "scene.objects": "Planet Scene Star",
     "scene.observation": "Observation",

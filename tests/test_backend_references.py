@@ -32,7 +32,7 @@ from pyklip_diffrender.pyklip_backend import (
 )
 from pyklip_diffrender.pyklip_backend.frames import frames_of
 from pyklip_diffrender.pyklip_backend.references import ChosenPattern, References, pattern_for
-from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Systematics
+from pyklip_diffrender.refinement import GaussNewton, Refinement, Systematics
 from pyklip_diffrender.refinement.pattern_choice import PatternChoice
 from pyklip_diffrender.scene.observation import Observation
 
@@ -311,14 +311,12 @@ def test_references_that_are_asked_for_must_be_there() -> None:
         pattern_for([frame("TARGET")], References(), model, OPD, settings, print)
 
 
-def test_simulations_and_the_adam_recipe_use_no_pattern_by_default() -> None:
+def test_simulations_use_no_pattern_by_default() -> None:
     model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
     simulated = replace(frame("TARGET"), header=fits.Header())
-    for science, fit in ((simulated, None), (frame("TARGET"), Adam())):
-        settings = DiffrenderSettings(fit=fit)
-        chosen = pattern_for([science], References(), model, OPD, settings, print)
-        choice = chosen.choice
-        assert (choice.systematics, choice.settings, chosen.label) == (None, fit, "none")
+    chosen = pattern_for([simulated], References(), model, OPD, DiffrenderSettings(), print)
+    choice = chosen.choice
+    assert (choice.systematics, choice.settings, chosen.label) == (None, None, "none")
 
 
 # Which wavefront map is used
@@ -380,7 +378,6 @@ def test_a_map_needs_a_folder_and_the_frames_a_date(
         ({"model_options": {"npx": 64}}, {}, "npx: not known to nircam_coronagraph"),
         ({"systematics": "maybe"}, {}, "'maybe', expected 'auto', 'references'"),
         ({"max_chi2": -1.0}, {}, "max_chi2: got -1.0"),
-        ({"keep_detected": True, "fit": Adam()}, {}, "no linear model"),
         ({"model": {4.0: "a"}}, {}, "none for wavelength"),
     ],
 )

@@ -38,7 +38,7 @@ from pyklip_diffrender.pyklip_backend import (
 from pyklip_diffrender.pyklip_backend.references import ChosenPattern
 from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
-from pyklip_diffrender.refinement import Adam, GaussNewton, Status, Systematics, refine
+from pyklip_diffrender.refinement import GaussNewton, Status, Systematics, refine
 from pyklip_diffrender.refinement.pattern_choice import PatternChoice
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.objects import Planet
@@ -343,19 +343,6 @@ def test_a_second_fit_that_fails_stops_the_reduction_too(
         subtract_by_refinement(observation, OLD, settings)
 
 
-def test_companions_cannot_be_kept_by_a_method_without_their_errors(
-    small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path
-) -> None:
-    made = dataset(frames, small)
-    made.diffrender = replace(made.diffrender, fit=Adam(iterations=2))
-    with (
-        backend(opd=OLD, keep_detected=True),
-        pytest.raises(IncompatibleSetupError, match=r"'adam'.*GaussNewton"),
-    ):
-        reduce(made, tmp_path)
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_model_without_recipe_is_good_for_its_own_square(
     small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path, caplog: Any
 ) -> None:
@@ -433,10 +420,6 @@ def test_frames_at_one_place_are_averaged_and_all_share_a_fit(
     assert rendered.star.shape == cube.shape
     np.testing.assert_array_equal(rendered.star[0], rendered.star[3])
     assert np.isfinite(rendered.star).all()
-
-    with pytest.warns(DiffrenderWarning, match="COMPLETED"):
-        alone = subtract_by_refinement(observation, OLD, replace(settings, fit=Adam(iterations=1)))
-    assert [each.frames for each in alone.fits] == [(0, 3), (1,), (2,), (4,)]
 
 
 def test_start_plan_and_systematics_reach_the_fit(

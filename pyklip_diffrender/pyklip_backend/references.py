@@ -181,13 +181,12 @@ def pattern_for(
     IncompatibleSetupError
         If "references" is asked for without any.
     """
-    from pyklip_diffrender.refinement import Adam, Systematics
+    from pyklip_diffrender.refinement import Systematics
     from pyklip_diffrender.refinement.pattern_choice import choose_systematics
 
     requested = settings.systematics
     if requested is None:
-        real = science[0].is_nircam and not isinstance(settings.fit, Adam)
-        requested = "auto" if real else "off"
+        requested = "auto" if science[0].is_nircam else "off"
     if requested == "references" and not references:
         raise IncompatibleSetupError(
             "systematics='references' needs frames of reference stars: give them to JWSTData as "

@@ -160,8 +160,7 @@ def subtract_by_refinement(
     Raises
     ------
     IncompatibleSetupError
-        If there is neither a model nor a filter to make one for, or for `keep_detected` with a
-        method that `detect` cannot use.
+        If there is neither a model nor a filter to make one for.
     RefinementError
         If a refinement has no usable or no plausible result.
 
@@ -171,9 +170,6 @@ def subtract_by_refinement(
         If a fit has not converged to a model that explains the data.
     """
     model = model_of(observation, settings)
-    # Takes a second to import, so only after the input has been checked.
-    from pyklip_diffrender.refinement import Adam
-
     groups = list(pointings_of(observation) if pointings is None else pointings)
     windows = [Window.about(g.observation.center[0], model.detector.shape) for g in groups]
     cut = [window.of(group.observation) for window, group in zip(windows, groups, strict=True)]
@@ -184,9 +180,9 @@ def subtract_by_refinement(
         tell("the frames do not show the pattern of the library")
         pattern = pattern_for(cut, references, model, opd, settings, tell, library=False)
         together, results = _refined(pattern, model, opd, settings, tell)
-    adam, seed = isinstance(settings.fit, Adam), _seed_of(settings)
+    seed = _seed_of(settings)
     keep, error_factor = settings.keep_detected, None
-    if (observation.is_nircam and not adam) if keep is None else keep:
+    if observation.is_nircam if keep is None else keep:
         results, error_factor = _with_companions(results, tell)
     star = np.full(observation.data.shape, np.nan)
     fits, fitted = [], []
@@ -221,17 +217,14 @@ def _refined(
     tell: Callable[[str], None],
 ) -> tuple[list[tuple[int, ...]], list[Refinement]]:
     """Fit all pointings; the numbers of those that were fitted together, and the fits."""
-    from pyklip_diffrender.refinement import Adam, refine
+    from pyklip_diffrender.refinement import refine
 
     science = pattern.choice.science
-    adam = isinstance(settings.fit, Adam)
-    # The Adam recipe takes one observation at a time.
-    everything = tuple(range(len(science)))
-    together: list[tuple[int, ...]] = [(k,) for k in everything] if adam else [everything]
+    together = [tuple(range(len(science)))]
     tell(
         f"fitting {_counted(sum(map(len, science)), 'frame')} of "
         f"{_counted(len(science), 'pointing')}"
-        f"{'' if adam or len(science) == 1 else ' together'}, {model.detector.shape[1]} x "
+        f"{'' if len(science) == 1 else ' together'}, {model.detector.shape[1]} x "
         f"{model.detector.shape[0]} pixels, pattern of the model's error: {pattern.label}"
     )
     results: list[Refinement] = []

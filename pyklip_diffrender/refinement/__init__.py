@@ -9,7 +9,7 @@ from pyklip_diffrender.refinement.library import known_systematics
 from pyklip_diffrender.refinement.pattern_match import pattern_size
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
+from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.refinement.star_flux import (
     jansky_per_unit,
     require_calibrated,
@@ -21,7 +21,6 @@ from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.refinement.systematics import Systematics
 
 __all__ = [
-    "Adam",
     "FrameFit",
     "GaussNewton",
     "Refinement",

@@ -18,7 +18,7 @@ from pyklip_diffrender.refinement.library import known_systematics
 from pyklip_diffrender.refinement.pattern_match import lacks_pattern
 from pyklip_diffrender.refinement.registration import register
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
+from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.opd import OPDMap
@@ -55,7 +55,7 @@ class PatternChoice:
         which pixels they have.
     systematics : Systematics or None
         The pattern.
-    settings : GaussNewton, Adam or None
+    settings : GaussNewton or None
         Settings of the target's fit.
     references : tuple of Refinement
         One for each reference star that was fitted.
@@ -67,7 +67,7 @@ class PatternChoice:
 
     science: tuple[Observation, ...]
     systematics: Systematics | None
-    settings: GaussNewton | Adam | None
+    settings: GaussNewton | None
     references: tuple[Refinement, ...] = ()
     failed: tuple[tuple[str, str], ...] = ()
     from_library: bool = False
@@ -99,7 +99,7 @@ def choose_systematics(
     *,
     systematics: PatternRequest = "auto",
     library: bool = True,
-    settings: GaussNewton | Adam | None = None,
+    settings: GaussNewton | None = None,
     memory: float | None = None,
     progress: bool = False,
 ) -> PatternChoice:
@@ -121,7 +121,7 @@ def choose_systematics(
     library : bool
         False leaves the library out, for frames that do not show its pattern, see
         `PatternChoice.is_refuted_by`.
-    settings : GaussNewton or Adam, optional
+    settings : GaussNewton, optional
         Of the fits; default those of `refine`.
     memory : float, optional
         See `GaussNewton.memory`; by default that of the settings.
@@ -166,10 +166,10 @@ def choose_systematics(
 
 
 def _limited(
-    settings: GaussNewton | Adam | None, observation: Observation, memory: float | None
-) -> GaussNewton | Adam | None:
+    settings: GaussNewton | None, observation: Observation, memory: float | None
+) -> GaussNewton | None:
     """Settings with a limit of the memory, if there is one."""
-    if memory is None or isinstance(settings, Adam):
+    if memory is None:
         return settings
     return replace(settings or settings_for(observation), memory=memory)
 
@@ -243,13 +243,11 @@ def _rough_fit(
     observation: Observation,
     opd: OPDMap,
     *,
-    settings: GaussNewton | Adam | None,
+    settings: GaussNewton | None,
     progress: bool,
 ) -> Refinement:
     """A fit until the pattern dominates the residual."""
-    settings = settings or settings_for(observation)
-    if isinstance(settings, GaussNewton):
-        settings = replace(settings, **_ROUGH)
+    settings = replace(settings or settings_for(observation), **_ROUGH)
     return refine(model, observation, opd, settings=settings, progress=progress)
 
 
