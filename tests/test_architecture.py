@@ -28,6 +28,7 @@ PACKAGES = (
     "linear",
     "planning",
     "refinement",
+    "pattern",
     "detection",
     "reduction",
     "pyklip_backend",

@@ -14,11 +14,7 @@ from numpy.typing import NDArray
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 from pyklip_diffrender.pyklip_backend.pointings import Pointing, pointings_of
-from pyklip_diffrender.pyklip_backend.references import (
-    ChosenPattern,
-    References,
-    pattern_for,
-)
+from pyklip_diffrender.pyklip_backend.references import References
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.verdict import (
     require_plausible,
@@ -32,6 +28,7 @@ from pyklip_diffrender.wavefront.opd import OPDMap
 if TYPE_CHECKING:
     from pyklip_diffrender.detection.error_factor import ErrorFactor
     from pyklip_diffrender.optics.system import OpticalSystem
+    from pyklip_diffrender.pattern import PatternChoice, PatternRequest
     from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["FIT_PIXELS", "Fit", "Subtraction", "Subtractor", "subtract_by_refinement"]
@@ -82,7 +79,7 @@ class Subtraction:
     fits : tuple of Fit
         At least one; together they cover all frames.
     systematics : str
-        The pattern of the model's error that was used, in words.
+        Origin of the flat-field pattern that was used, see `PatternChoice.label`.
     references : int
         Number of frames of reference stars that were used.
     pointings : tuple of FittedPointing
@@ -160,7 +157,8 @@ def subtract_by_refinement(
     Raises
     ------
     IncompatibleSetupError
-        If there is neither a model nor a filter to make one for.
+        If there is neither a model nor a filter to make one for, for `keep_detected` with a
+        method that `detect` cannot use, or if "references" is asked for without any.
     RefinementError
         If a refinement has no usable or no plausible result.
 
@@ -170,79 +168,112 @@ def subtract_by_refinement(
         If a fit has not converged to a model that explains the data.
     """
     model = model_of(observation, settings)
+    # Takes a second to import, so only after the input has been checked.
+    from pyklip_diffrender.pattern import fit_with_pattern
+
     groups = list(pointings_of(observation) if pointings is None else pointings)
     windows = [Window.about(g.observation.center[0], model.detector.shape) for g in groups]
     cut = [window.of(group.observation) for window, group in zip(windows, groups, strict=True)]
     references = References() if references is None else references
-    pattern = pattern_for(cut, references, model, opd, settings, tell)
-    together, results = _refined(pattern, model, opd, settings, tell)
-    if any(pattern.choice.is_refuted_by(result) for result in results):
-        tell("the frames do not show the pattern of the library")
-        pattern = pattern_for(cut, references, model, opd, settings, tell, library=False)
-        together, results = _refined(pattern, model, opd, settings, tell)
-    seed = _seed_of(settings)
+
+    def frames_of_references() -> list[Observation]:
+        tell("fitting the reference stars")
+        return references.cut(model.detector.shape, cut[0])
+
+    def fit(choice: PatternChoice, again: bool) -> Refinement:
+        if again:
+            tell("the frames do not show the pattern of the library")
+        elif references and not choice.references:
+            tell("the reference frames are not needed")
+        return _refined(choice, model, opd, settings, tell)
+
+    choice, result = fit_with_pattern(
+        cut,
+        frames_of_references if references else (),
+        model,
+        opd,
+        fit,
+        systematics=_requested_pattern(settings, observation, references),
+        settings=settings.fit,
+    )
     keep, error_factor = settings.keep_detected, None
     if observation.is_nircam if keep is None else keep:
-        results, error_factor = _with_companions(results, tell)
+        result, error_factor = _with_companions(result, tell)
     star = np.full(observation.data.shape, np.nan)
-    fits, fitted = [], []
-    for chosen, result in zip(together, results, strict=True):
-        # It may have been refined again with companions.
-        require_plausible(cut[chosen[0]].name, result, settings.max_chi2)
-        warn_of_status(cut[chosen[0]].name, result)
-        for place, k in enumerate(chosen):
-            away = result.frames[place].observation.center[0] - cut[k].center[0]
-            fitted.append(FittedPointing(result, place, groups[k], windows[k], away))
-            star[groups[k].frames] = fitted[-1].star()
-        frames = np.sort(np.concatenate([groups[k].frames for k in chosen]))
-        status = result.status.name.lower()
-        fits.append(Fit(tuple(map(int, frames)), status, float(result.chi2_per_pixel), result))
+    # It may have been refined again with companions.
+    require_plausible(cut[0].name, result, settings.max_chi2)
+    warn_of_status(cut[0].name, result)
+    fitted = []
+    for k, (group, window) in enumerate(zip(groups, windows, strict=True)):
+        away = result.frames[k].observation.center[0] - cut[k].center[0]
+        fitted.append(FittedPointing(result, k, group, window, away))
+        star[group.frames] = fitted[-1].star()
+    frames = np.sort(np.concatenate([group.frames for group in groups]))
+    status = result.status.name.lower()
     return Subtraction(
         star,
-        results[0].method,
-        seed,
-        tuple(fits),
-        pattern.label,
-        pattern.reference_frames,
+        result.method,
+        _seed_of(settings),
+        (Fit(tuple(map(int, frames)), status, float(result.chi2_per_pixel), result),),
+        choice.label,
+        choice.reference_frames,
         tuple(fitted),
         error_factor,
     )
 
 
+def _requested_pattern(
+    settings: DiffrenderSettings, observation: Observation, references: References
+) -> PatternRequest:
+    """Return the pattern that is asked for: real NIRCam frames get "auto", others "off".
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If "references" is asked for without any.
+    """
+    requested = settings.systematics
+    if requested is None:
+        return "auto" if observation.is_nircam else "off"
+    if requested == "references" and not references:
+        raise IncompatibleSetupError(
+            "systematics='references' needs frames of reference stars: give them to JWSTData as "
+            "psflib_filepaths after register(), and RDI in the mode and psf_library= to "
+            "klip_dataset"
+        )
+    return requested
+
+
 def _refined(
-    pattern: ChosenPattern,
+    choice: PatternChoice,
     model: OpticalSystem,
     opd: OPDMap,
     settings: DiffrenderSettings,
     tell: Callable[[str], None],
-) -> tuple[list[tuple[int, ...]], list[Refinement]]:
-    """Fit all pointings; the numbers of those that were fitted together, and the fits."""
+) -> Refinement:
+    """Fit all pointings together with a pattern."""
     from pyklip_diffrender.refinement import refine
 
-    science = pattern.choice.science
-    together = [tuple(range(len(science)))]
+    science = choice.science
     tell(
         f"fitting {_counted(sum(map(len, science)), 'frame')} of "
         f"{_counted(len(science), 'pointing')}"
         f"{'' if len(science) == 1 else ' together'}, {model.detector.shape[1]} x "
-        f"{model.detector.shape[0]} pixels, pattern of the model's error: {pattern.label}"
+        f"{model.detector.shape[0]} pixels, flat-field pattern: {choice.label}"
     )
-    results: list[Refinement] = []
-    for chosen in together:
-        result = refine(
-            model,
-            [science[k] for k in chosen],
-            opd,
-            settings=pattern.choice.settings,
-            start=settings.start,
-            systematics=pattern.choice.systematics,
-            plan="auto" if settings.plan is None else settings.plan,
-            seed=_seed_of(settings),
-        )
-        require_plausible(science[chosen[0]].name, result, settings.max_chi2)
-        tell(f"{_described(result)}, {result.seconds:.0f} s")
-        results.append(result)
-    return together, results
+    result = refine(
+        model,
+        science,
+        opd,
+        settings=choice.settings,
+        start=settings.start,
+        systematics=choice.systematics,
+        plan="auto" if settings.plan is None else settings.plan,
+        seed=_seed_of(settings),
+    )
+    require_plausible(science[0].name, result, settings.max_chi2)
+    tell(f"{_described(result)}, {result.seconds:.0f} s")
+    return result
 
 
 def _seed_of(settings: DiffrenderSettings) -> int:
@@ -259,27 +290,27 @@ def _counted(number: int, noun: str) -> str:
 
 
 def _with_companions(
-    results: list[Refinement], tell: Callable[[str], None]
-) -> tuple[list[Refinement], ErrorFactor]:
-    """Refine again with the companions that are detected in all fits together.
+    result: Refinement, tell: Callable[[str], None]
+) -> tuple[Refinement, ErrorFactor]:
+    """Refine again with the companions that are detected.
 
-    Also by how much the errors of the search are too small.
+    The second value is the factor by which the errors of the search are too small.
     """
     from pyklip_diffrender.detection import detect
     from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
 
-    # No relinearisation: the fits are refined again below.
+    # No relinearisation: the star is refined again below.
     tell("searching for companions")
-    detection = detect(results, relinearise=math.inf)
+    detection = detect(result, relinearise=math.inf)
     logger.info("companions kept out of the star: %s", detection.table)
     number = _counted(len(detection.candidates), "companion")
-    if not lacks_candidates(results, detection.candidates):
+    if not lacks_candidates([result], detection.candidates):
         tell(f"{number} detected, as many as the fit has")
-        return results, detection.error_factor
-    tell(f"{number} detected, {len(results[0].companions)} in the fit: the star is fitted again")
-    results = with_companions(results, detection.candidates)
-    tell(_described(results[0]))
-    return results, detection.error_factor
+        return result, detection.error_factor
+    tell(f"{number} detected, {len(result.companions)} in the fit: the star is fitted again")
+    (result,) = with_companions([result], detection.candidates)
+    tell(_described(result))
+    return result, detection.error_factor
 
 
 def model_of(observation: Observation, settings: DiffrenderSettings) -> OpticalSystem:
