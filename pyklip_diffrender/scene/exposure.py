@@ -25,6 +25,7 @@ __all__ = [
     "image_mask",
     "is_reference",
     "position_angle",
+    "proper_motion",
     "star_of",
 ]
 
@@ -283,6 +284,12 @@ def _flag(header: fits.Header, key: str) -> bool | None:
     if isinstance(value, bool | int):
         return bool(value)
     return {"T": True, "TRUE": True, "F": False, "FALSE": False}.get(str(value).strip().upper())
+
+
+def proper_motion(header: fits.Header, name: str) -> tuple[float, float] | None:
+    """Proper motion of the star, arcsec per year (MU_RA, which includes cos Dec, and MU_DEC)."""
+    east, north = (header_number(header, key, name) for key in ("MU_RA", "MU_DEC"))
+    return None if east is None or north is None else (east, north)
 
 
 def is_reference(header: fits.Header) -> bool | None:
