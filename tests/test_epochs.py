@@ -42,7 +42,8 @@ def test_a_companion_moves_with_the_star_and_the_background_stays() -> None:
     bound, sky = np.array([0.8, -0.5]), np.array([-1.2, 1.0])
     first = summary(59855.0, [tuple(bound), tuple(sky)])
     second = summary(
-        60280.0, [tuple(sky - np.array(MOTION) * years), tuple(bound + np.array([0.01, -0.01])), (2.0, 2.0)]
+        60280.0,
+        [tuple(sky - np.array(MOTION) * years), tuple(bound + np.array([0.01, -0.01])), (2.0, 2.0)],
     )
     pairs = compare_epochs([first, second], MOTION)
     verdicts = {tuple(pair["candidates"]): pair["verdict"] for pair in pairs}
