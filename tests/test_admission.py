@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
-from calints_files import SIDE, calints, starlight
 
 import pyklip_diffrender as dr
+from benchmarks.calints_files import SIDE, calints, starlight
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.scene.exposure import Exposure, Star, beginning, image_mask
 
