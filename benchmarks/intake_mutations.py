@@ -33,6 +33,8 @@ class Folder:
         Files that must not be used.
     doubtful : set of str
         Files that may be used if the result is that of the unmutated file, or excluded.
+    scaled : set of str
+        Files whose unit is wrong by so little that only other frames of the star show it.
     done : list of str
         What was done.
     """
@@ -41,6 +43,7 @@ class Folder:
     sources: dict[str, str]
     bad: set[str] = field(default_factory=set)
     doubtful: set[str] = field(default_factory=set)
+    scaled: set[str] = field(default_factory=set)
     done: list[str] = field(default_factory=list)
 
     def change(self, name: str, change: Change, rng: np.random.Generator) -> None:
@@ -244,9 +247,6 @@ def _crpix(folder: Folder, name: str, rng: np.random.Generator) -> None:
     def change(hdus: fits.HDUList, rng: np.random.Generator) -> None:
         for key in ("CRPIX1", "CRPIX2"):
             _set(hdus, **{key: float(_card(hdus, key)[key]) + rng.uniform(-3, 3)})
-        for key in ("IMSHIFTS", "MASKOFFS"):
-            if key in hdus:
-                del hdus[key]
 
     folder.change(name, change, rng)
     folder.doubtful.add(name)
@@ -333,8 +333,21 @@ MUTATIONS["a hole at the peak"] = _pixels(_hole, bad=False)
 MUTATIONS["holes"] = _pixels(_holes, bad=False)
 MUTATIONS["a missed cosmic ray"] = _pixels(_cosmic_ray, bad=False)
 MUTATIONS["flagged pixels"] = _pixels(_flags, bad=False)
-for _factor in (1e-3, 0.4, 2.5, 1e3):
+for _factor in (1e-3, 1e3):
     MUTATIONS[f"pixels times {_factor:g}"] = _pixels(_scaled(_factor), bad=True)
+
+
+def _another_unit(factor: float) -> Mutation:
+    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
+        folder.change(name, _scaled(factor), rng)
+        folder.doubtful.add(name)
+        folder.scaled.add(name)
+
+    return mutate
+
+
+MUTATIONS["pixels times 0.4"] = _another_unit(0.4)
+MUTATIONS["pixels times 2.5"] = _another_unit(2.5)
 MUTATIONS["star off the mask"] = _pixels(_moved, bad=True)
 MUTATIONS["errors of another unit"] = _pixels(_errors, bad=True)
 MUTATIONS["no star"] = _pixels(_blank, bad=True)
