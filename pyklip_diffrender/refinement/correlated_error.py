@@ -60,7 +60,8 @@ def _highest(gain: Callable[[float], float], places: tuple[float, ...]) -> tuple
     """Place of the highest value of a function that is 0 at 0, and its value there.
 
     Places are tried in order until the function falls. The result is the maximum of the parabola
-    through the highest value and its neighbours.
+    through the highest value and its neighbours, in the logarithm of the place (plus half of the
+    first one), over which the evidence is nearly symmetric.
     """
     tried, values = [0.0], [0.0]
     for place in places:
@@ -71,7 +72,7 @@ def _highest(gain: Callable[[float], float], places: tuple[float, ...]) -> tuple
     best = int(np.argmax(values))
     if best in (0, len(tried) - 1):
         return tried[best], values[best]
-    around = slice(best - 1, best + 2)
-    second, first, _ = np.polyfit(tried[around], values[around], 2)
-    place = float(-first / (2 * second))
+    around, offset = slice(best - 1, best + 2), places[0] / 2
+    second, first, _ = np.polyfit(np.log(np.add(tried[around], offset)), values[around], 2)
+    place = float(np.exp(-first / (2 * second)) - offset)
     return place, gain(place)
