@@ -92,7 +92,7 @@ def conclude(
         prior_ratios=ratios,
         effective_parameters=update.effective,
         log_evidence=update.log_evidence,
-        linear=linear,
+        stored_linear=linear,
         systematics=problems[0].systematics,
         correlated_error=solver.objective.correlated,
         **about,
