@@ -383,7 +383,7 @@ def test_a_failure_of_klip_does_not_break_the_report(
     def broken(_: dr.Reduction) -> QTable:
         raise ValueError("singular")
 
-    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.klip_curve.klip_curve", broken)
+    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.klip.klip_curve", broken)
     monkeypatch.setattr("pyklip_diffrender.report.write.search_pictures", lambda *_: [])
     whole = reduction()
     sequence = replace(whole.sequence, references=whole.sequence.science)
