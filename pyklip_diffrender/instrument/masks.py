@@ -10,7 +10,14 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 
-__all__ = ["ROUND_MASKS", "RoundMask", "filter_shift", "mask_center", "require_mask_and_filter"]
+__all__ = [
+    "ROUND_MASKS",
+    "RoundMask",
+    "filter_shift",
+    "mask_center",
+    "mask_of_header",
+    "require_mask_and_filter",
+]
 
 _SECOND_ZERO_OF_J1 = 7.015586669815619
 
@@ -19,6 +26,11 @@ LONG_WAVE = (
     "F250M", "F277W", "F300M", "F322W2", "F335M", "F356W", "F360M", "F410M", "F430M", "F444W",
     "F460M", "F480M",
 )  # fmt: skip
+
+
+def mask_of_header(value: object) -> str:
+    """Return the name of a mask without the module, which headers name with it: MASKA335R."""
+    return str(value).strip().upper().replace("MASKA", "MASK")
 
 
 @dataclass(frozen=True)
