@@ -37,12 +37,12 @@ from pyklip_diffrender.pyklip_backend import (
     throughput,
 )
 from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
-from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.refinement import Adam, GaussNewton, Status, refine
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 

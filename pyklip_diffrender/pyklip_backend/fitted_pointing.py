@@ -15,8 +15,8 @@ from torch import Tensor
 
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.pyklip_backend.pointings import Pointing
-from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.scene.detector_pixels import shift_frames
+from pyklip_diffrender.scene.window import Window
 
 if TYPE_CHECKING:
     from pyklip_diffrender.refinement import FrameFit, Refinement

@@ -15,8 +15,8 @@ from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.pyklip_backend.pointings import may_be_one_star
 from pyklip_diffrender.pyklip_backend.source import REFERENCES
-from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.window import Window
 
 __all__ = [
     "References",

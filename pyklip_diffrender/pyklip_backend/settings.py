@@ -110,6 +110,9 @@ class DiffrenderSettings:
         A dataset that has been reduced. Those of the calls are copies of it to which faint sources
         were added; the star is not fitted to them again, but what it takes of the sources follows
         from the linear model of the fit. For contrast curves by injection.
+    files : path or sequence of path, optional
+        Files, or folders with the files, that a `JWSTData` was read from before `register`. The
+        errors and pixels of files in the current folder are found without it.
     threads : int, optional
         Number of threads of a reduction; PyTorch's choice by default. 1 is best on a busy machine.
     model_options : mapping, optional
@@ -143,6 +146,7 @@ class DiffrenderSettings:
     keep_detected: bool | None = None
     max_chi2: float | None = None
     injected_into: Any = None
+    files: str | os.PathLike[str] | tuple[str | os.PathLike[str], ...] = ()
     threads: int | None = None
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
@@ -152,7 +156,7 @@ class DiffrenderSettings:
         merged: dict[str, Any] = {}
         for name in (field.name for field in dataclasses.fields(self)):
             own = getattr(self, name)
-            merged[name] = getattr(other, name) if own is None else own
+            merged[name] = getattr(other, name) if own is None or own == () else own
         merged["model_options"] = {**other.model_options, **self.model_options}
         return DiffrenderSettings(**merged)
 

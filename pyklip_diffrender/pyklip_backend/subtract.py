@@ -20,9 +20,9 @@ from pyklip_diffrender.pyklip_backend.verdict import (
     require_plausible,
     warn_of_status,
 )
-from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
-from pyklip_diffrender.io.units import to_number
 from pyklip_diffrender.instrument.masks import mask_of_header
+from pyklip_diffrender.io.units import to_number
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.scene.observation import Observation
