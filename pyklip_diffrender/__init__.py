@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
+
+from pyklip_diffrender._version import __version__
 
 if TYPE_CHECKING:
     from pyklip_diffrender.archive import fetch_calints, list_calints
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
         wide_field,
     )
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+    from pyklip_diffrender.instrument.star_flux import star_flux_density
     from pyklip_diffrender.linear.model import LinearModel
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pattern import known_systematics, learn_systematics
@@ -100,6 +102,7 @@ __all__ = [
     "refine",
     "register",
     "simulate",
+    "star_flux_density",
     "survey",
     "unregister",
     "wide_field",
@@ -110,6 +113,7 @@ _NAMES = {
     "bridges": "from_poppy from_webbpsf",
     "detection": "Detection Disk WideField contrast_curve detect fit_disk measure wide_field",
     "instrument.nircam": "nircam_coronagraph",
+    "instrument.star_flux": "star_flux_density",
     "linear.model": "LinearModel",
     "optics.system": "OpticalSystem",
     "planning": "Plan plan",
@@ -132,12 +136,6 @@ _NAMES = {
 
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 
-try:
-    __version__ = version("pyklip-diffrender")
-except PackageNotFoundError:
-    # A source tree that was put on the path without being installed.
-    __version__ = "0+unknown"
-
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
@@ -156,7 +154,7 @@ def _watch_in_spawned_process() -> None:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)
 
 
 _watch_in_spawned_process()

@@ -28,11 +28,6 @@ LONG_WAVE = (
 )  # fmt: skip
 
 
-def mask_of_header(value: object) -> str:
-    """Return the name of a mask without the module, which headers name with it: MASKA335R."""
-    return str(value).strip().upper().replace("MASKA", "MASK")
-
-
 @dataclass(frozen=True)
 class RoundMask:
     """A round occulter of NIRCam's module A and its channel.
@@ -131,6 +126,14 @@ def require_mask_and_filter(mask: str | None, name: str) -> RoundMask:
         f"filter: got {name!r} with image mask {mask!r}, which do not go together. Legal "
         f"combinations are {legal}"
     )
+
+
+def mask_of_header(value: object) -> str:
+    """Return the name of an image mask, as ``CORONMSK`` has it, without the module: MASK335R.
+
+    Headers name NIRCam's module A with the mask: MASKA335R.
+    """
+    return str(value).strip().upper().replace("MASKA", "MASK")
 
 
 # J. Leisenring's measurements in flight, as in spaceKLIP's resources crpix_jarron.json and

@@ -7,7 +7,6 @@ of this package: the script that imports it, or a dataset that was read with it.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 
 __all__ = ["announce", "spawned_beside_klip"]
@@ -25,6 +24,5 @@ def announce(takes_klip: bool) -> None:
 
 
 def spawned_beside_klip() -> bool:
-    """Whether this process was spawned by one that takes calls of KLIP."""
-    taker = os.environ.get(_VARIABLE, str(os.getpid()))
-    return multiprocessing.parent_process() is not None and taker != str(os.getpid())
+    """Whether this process was started by one that takes calls of KLIP."""
+    return os.environ.get(_VARIABLE, str(os.getpid())) != str(os.getpid())

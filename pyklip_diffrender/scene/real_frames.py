@@ -80,7 +80,7 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
         "pixelscale": observation.pixelscale,
     }
     if observation.is_nircam:
-        mask_name = str(observation.header.get("CORONMSK", "MASK335R"))
+        mask_name = str(observation.header.get("CORONMSK", "MASK335R")).strip().upper()
         name = overrides.get("image_mask") or mask_of_header(mask_name)
         if name not in ROUND_MASKS:
             raise IncompatibleSetupError(
