@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -146,7 +146,7 @@ class DiffrenderSettings:
     keep_detected: bool | None = None
     max_chi2: float | None = None
     injected_into: Any = None
-    files: str | os.PathLike[str] | tuple[str | os.PathLike[str], ...] = ()
+    files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None
     threads: int | None = None
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None
@@ -156,7 +156,7 @@ class DiffrenderSettings:
         merged: dict[str, Any] = {}
         for name in (field.name for field in dataclasses.fields(self)):
             own = getattr(self, name)
-            merged[name] = getattr(other, name) if own is None or own == () else own
+            merged[name] = getattr(other, name) if own is None else own
         merged["model_options"] = {**other.model_options, **self.model_options}
         return DiffrenderSettings(**merged)
 

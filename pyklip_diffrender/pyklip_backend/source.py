@@ -140,19 +140,19 @@ def keeping_source(readdata: Callable[..., None]) -> Callable[..., None]:
     return readdata_and_source
 
 
-def attach_source(dataset: Any, files: Any = ()) -> None:
+def attach_source(dataset: Any, files: Any = None) -> None:
     """Attach a `SourceFrames` to a `JWSTData` that was read before `register`, if possible.
 
     Parameters
     ----------
     dataset : pyklip.instruments.Instrument.Data
-    files : path or iterable of path
+    files : path or sequence of path, optional
         Files or folders in which the dataset's files are looked for by name, beside the current
         folder.
     """
     if hasattr(dataset, ATTRIBUTE) or hasattr(dataset, REASON) or not _reads_files(dataset):
         return
-    several = [files] if isinstance(files, str | os.PathLike) else list(files)
+    several = [files] if isinstance(files, str | os.PathLike) else list(files or ())
     known: dict[str, str] = {}
     for path in [Path(), *map(Path, several)]:
         inside = path.iterdir() if path.is_dir() else [path]
