@@ -239,8 +239,8 @@ def _fits() -> list[Breakage]:
     return [
         Breakage(
             "template-roll", "planets turn with the sky from frame to frame",
-            "[[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]],\n",
-            "[[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]],\n",
+            "torch.from_numpy(rotation_matrix(self.rolls[k])).T",
+            "torch.from_numpy(rotation_matrix(self.rolls[k]))",
             "detection recovery",
         ),
         Breakage(
