@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.optics import OpticalSystem
 
 Array = NDArray[np.float64]
 
