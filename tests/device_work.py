@@ -15,8 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.linear import parameter_jacobian
-from pyklip_diffrender.linear.response_cache import ResponseCache
+from pyklip_diffrender.linear import ResponseCache, parameter_jacobian
 from pyklip_diffrender.optics import OpticalSystem, PointSources, PupilGrid
 from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.refinement.problem import Problem

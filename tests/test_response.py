@@ -15,13 +15,13 @@ from pyklip_diffrender.instrument import jwst_pupil, nircam_coronagraph
 from pyklip_diffrender.linear import (
     NANOMETRE,
     LastPupil,
+    ResponseCache,
     WavefrontResponse,
     coarse_copy,
     downsample,
     jacobian,
     parameter_jacobian,
 )
-from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.optics import OpticalSystem, PupilGrid
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.wavefront import (

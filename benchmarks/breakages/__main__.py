@@ -97,7 +97,7 @@ def failing_test(copy: Path, arguments: list[str]) -> str | None:
     if code == 0:
         return None
     text = report.read_text(encoding="utf-8")
-    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", text, re.MULTILINE)
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+::\S+)", text, re.MULTILINE)
     if failed and code == 1:
         return failed[1].removeprefix("tests/")
     if code == -signal.SIGALRM:

@@ -14,7 +14,7 @@ from pyklip_diffrender.linear.response import (
     coarse_npix,
     downsample,
 )
-from pyklip_diffrender.linear.responses import Responses
+from pyklip_diffrender.linear.response_cache import ResponseCache
 
 __all__ = [
     "NANOMETRE",
@@ -22,7 +22,7 @@ __all__ = [
     "LinearFrame",
     "LinearModel",
     "ModeFields",
-    "Responses",
+    "ResponseCache",
     "Unknown",
     "WavefrontResponse",
     "coarse_copy",
