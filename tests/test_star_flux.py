@@ -78,7 +78,7 @@ def _stop(*_: object, **__: object) -> None:
     raise StopIteration
 
 
-@pytest.mark.parametrize("share", [0.98, 1.02])
+@pytest.mark.parametrize("share", [pytest.param(0.98, marks=pytest.mark.slow), 1.02])
 def test_contrasts_refer_to_the_catalogues_star(
     fit: Refinement, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
