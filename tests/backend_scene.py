@@ -10,7 +10,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings, Fit, Subtraction
-from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
+from pyklip_diffrender.wavefront import OPDMap, as_opd_map
 
 SHAPE = (48, 44)
 CENTER = (21.25, 24.5)

@@ -15,16 +15,12 @@ import torch
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
-from pyklip_diffrender.linear.response_cache import ResponseCache
-from pyklip_diffrender.optics.fast.point_sources import PointSources
-from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.linear import ResponseCache, parameter_jacobian
+from pyklip_diffrender.optics import OpticalSystem, PointSources, PupilGrid
 from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.solver import Solver
-from pyklip_diffrender.wavefront.bases import FourierModes
-from pyklip_diffrender.wavefront.priors import WavefrontPrior
+from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior
 
 __all__ = [
     "PLANET", "QUICK", "SIZE", "fit_gradient", "fitted", "frame", "gradient", "image",

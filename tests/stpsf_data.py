@@ -16,9 +16,13 @@ from astropy.io import fits
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from pyklip_diffrender.instrument.jwst import jwst_pupil, jwst_segments, maskrnd_openings
-from pyklip_diffrender.instrument.spectrum import filter_throughput
-from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, polygon_coverage
+from pyklip_diffrender.instrument import (
+    filter_throughput,
+    jwst_pupil,
+    jwst_segments,
+    maskrnd_openings,
+)
+from pyklip_diffrender.optics import JWST_DIAMETER, PupilGrid, polygon_coverage
 
 Array = NDArray[np.float64]
 

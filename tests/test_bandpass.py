@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.instrument.spectrum import filter_bandpass
-from pyklip_diffrender.optics.bandpass import Bandpass
-from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.instrument import filter_bandpass, nircam_coronagraph
+from pyklip_diffrender.optics import Bandpass
+from pyklip_diffrender.wavefront import random_opd
 
 BAND = Bandpass((4.4e-6, 3.9e-6, 4.1e-6, 4.95e-6, 4.7e-6), (0.3, 0.1, 0.25, 0.15, 0.2))
 

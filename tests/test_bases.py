@@ -8,14 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from pyklip_diffrender.instrument.jwst import (
-    TABULATED_GAP,
-    is_jwst_pupil,
-    jwst_pupil,
-    jwst_segments,
-)
-from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid, polygon_coverage, widen_polygon
-from pyklip_diffrender.wavefront.bases import (
+from pyklip_diffrender.instrument import TABULATED_GAP, is_jwst_pupil, jwst_pupil, jwst_segments
+from pyklip_diffrender.optics import JWST_DIAMETER, PupilGrid, polygon_coverage, widen_polygon
+from pyklip_diffrender.wavefront import (
     Basis,
     FourierModes,
     JointBasis,

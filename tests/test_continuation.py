@@ -16,17 +16,13 @@ import torch
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
-from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.optics import OpticalSystem, PupilGrid
 from pyklip_diffrender.planning import Plan
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Status, refine_again
 from pyklip_diffrender.refinement import continuation as continuation_module
 from pyklip_diffrender.refinement.annealing import Annealing
-from pyklip_diffrender.scene.objects import Planet
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.wavefront.bases import FourierModes, default_basis
-from pyklip_diffrender.wavefront.opd import random_opd
-from pyklip_diffrender.wavefront.priors import WavefrontPrior
+from pyklip_diffrender.scene import Observation, Planet
+from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior, default_basis, random_opd
 
 NPIX, SIZE, FLUX, READ_NOISE = 128, 24, 2e9, 42.0
 OFFSET = (0.002, -0.001)

@@ -13,8 +13,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.linear.frames import LinearFrame, Unknown
-from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.linear import LinearFrame, LinearModel, Unknown
 from pyklip_diffrender.linear.noise import UNCORRELATED, CorrelatedError
 from pyklip_diffrender.refinement.correlated_error import fitted_correlated_error
 from pyklip_diffrender.refinement.storage import linear_hdus, linear_of

@@ -10,12 +10,11 @@ from astropy.table import Table
 
 from pyklip_diffrender.demo import DITHERS, draw_demo, run_demo, simulate_references, write_demo
 from pyklip_diffrender.drawing import save
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.io import open_fits
 from pyklip_diffrender.refinement import Status
-from pyklip_diffrender.scene.objects import ALPHA_PICTORIS_W2, Scene, Star
-from pyklip_diffrender.scene.simulation import star_photons
-from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.scene import ALPHA_PICTORIS_W2, Scene, Star, star_photons
+from pyklip_diffrender.wavefront import random_opd
 
 
 def test_references_are_nine_dithered_frames_of_the_reference_star() -> None:

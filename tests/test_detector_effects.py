@@ -12,9 +12,9 @@ from scipy.interpolate import RegularGridInterpolator
 
 from pyklip_diffrender.bridges.rotation import SplineRotation
 from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.optics.detector import Detector
-from pyklip_diffrender.optics.detector_effects import (
+from pyklip_diffrender.optics import (
     ChainDetector,
+    Detector,
     Effect,
     GaussianBlur,
     LinearResampling,

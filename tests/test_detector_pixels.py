@@ -21,7 +21,7 @@ from pyklip_diffrender.errors import (
     NonFiniteError,
     ShapeError,
 )
-from pyklip_diffrender.optics.fast.point_sources import PointSources
+from pyklip_diffrender.optics import PointSources
 from pyklip_diffrender.pattern import (
     MeasuredPattern,
     combine_patterns,

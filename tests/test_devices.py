@@ -22,10 +22,10 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.bridges import from_poppy
 from pyklip_diffrender.bridges.rotation import SplineRotation
 from pyklip_diffrender.detection import wide_field, with_planets
-from pyklip_diffrender.linear.jacobian import jacobian
-from pyklip_diffrender.optics.detector_effects import GaussianBlur, LinearResampling, PixelCrosstalk
+from pyklip_diffrender.linear import jacobian
+from pyklip_diffrender.optics import GaussianBlur, LinearResampling, PixelCrosstalk
 from pyklip_diffrender.refinement import GaussNewton, Refinement
-from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.scene import Systematics
 
 Array = NDArray[np.float64]
 

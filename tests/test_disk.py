@@ -18,7 +18,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection import disk as module
 from pyklip_diffrender.detection.groups import groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.wavefront.opd import random_drift
+from pyklip_diffrender.wavefront import random_drift
 
 ROLLS = (20.0, 32.0)
 STAR = dr.Star(w2_magnitude=5.5)

@@ -23,15 +23,19 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.io.files import embedded_table, open_fits, replacing, sha256, write_fits
-from pyklip_diffrender.io.units import (
+from pyklip_diffrender.io import (
     ARCSEC,
+    embedded_table,
     native_float64,
+    open_fits,
+    replacing,
     require_finite,
     require_shape,
+    sha256,
     to_arcsec,
     to_metres,
     to_unit,
+    write_fits,
 )
 
 

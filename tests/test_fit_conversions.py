@@ -22,13 +22,11 @@ from stpsf_data import lopsided
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf
-from pyklip_diffrender.instrument.jwst import maskrnd_openings
-from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.instrument import maskrnd_openings
+from pyklip_diffrender.optics import OpticalSystem, PupilGrid, polygon_coverage
 from pyklip_diffrender.refinement import GaussNewton, Status
-from pyklip_diffrender.scene.objects import Planet
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.wavefront.bases import FourierModes
+from pyklip_diffrender.scene import Observation, Planet
+from pyklip_diffrender.wavefront import FourierModes
 
 Array = NDArray[np.float64]
 

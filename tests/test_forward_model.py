@@ -22,8 +22,8 @@ from pyklip.parallelized import klip_dataset
 from pyklip_diffrender.detection import measure
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     backend,
@@ -32,9 +32,8 @@ from pyklip_diffrender.pyklip_backend import (
     unregister,
 )
 from pyklip_diffrender.refinement import GaussNewton
-from pyklip_diffrender.scene.objects import Planet
-from pyklip_diffrender.wavefront.bases import default_basis
-from pyklip_diffrender.wavefront.opd import random_drift, random_opd
+from pyklip_diffrender.scene import Planet
+from pyklip_diffrender.wavefront import default_basis, random_drift, random_opd
 
 Image = NDArray[np.float64]
 

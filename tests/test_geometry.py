@@ -11,13 +11,8 @@ import torch
 from astropy.io import fits
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.jwst import (
-    TABULATED_GAP,
-    jwst_pupil,
-    jwst_segments,
-    maskrnd_openings,
-)
-from pyklip_diffrender.optics.grid import (
+from pyklip_diffrender.instrument import TABULATED_GAP, jwst_pupil, jwst_segments, maskrnd_openings
+from pyklip_diffrender.optics import (
     JWST_DIAMETER,
     PupilGrid,
     polygon_coverage,

@@ -13,7 +13,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.optics import OpticalSystem
 
 Array = NDArray[np.float64]
 

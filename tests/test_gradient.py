@@ -23,9 +23,8 @@ from pyklip_diffrender.refinement.normal_equations import NormalEquations, linea
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.solver import Solver
-from pyklip_diffrender.scene.systematics import Systematics
-from pyklip_diffrender.wavefront.bases import default_basis
-from pyklip_diffrender.wavefront.priors import WavefrontPrior
+from pyklip_diffrender.scene import Systematics
+from pyklip_diffrender.wavefront import WavefrontPrior, default_basis
 
 NPIX, SIZE = 64, 32
 BASIS = default_basis(3.0)

@@ -12,14 +12,19 @@ from astropy.io import fits
 from astropy.table import Table
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.aberrations import ChromaticAberration, internal_wavefront_error
-from pyklip_diffrender.instrument.masks import ROUND_MASKS, filter_shift, mask_center
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.instrument.spectrum import filter_throughput
-from pyklip_diffrender.io.files import embedded_table
-from pyklip_diffrender.linear.jacobian import jacobian
-from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.instrument import (
+    ROUND_MASKS,
+    ChromaticAberration,
+    filter_shift,
+    filter_throughput,
+    internal_wavefront_error,
+    mask_center,
+    nircam_coronagraph,
+)
+from pyklip_diffrender.io import embedded_table
+from pyklip_diffrender.linear import jacobian
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.wavefront import random_opd
 
 SMALL = {"npix": 128, "fov_pixels": 24}
 

@@ -19,7 +19,7 @@ from scipy import stats
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.pyklip_backend.klip import klip_curve, small_sample_factor
 from pyklip_diffrender.refinement import FrameFit
 

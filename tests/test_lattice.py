@@ -10,13 +10,10 @@ import pytest
 import torch
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.instrument.masks import ROUND_MASKS
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.instrument import ROUND_MASKS, nircam_coronagraph
+from pyklip_diffrender.optics import OpticalSystem, Plane, PointSources
 from pyklip_diffrender.optics.fast import path as route
-from pyklip_diffrender.optics.fast.point_sources import PointSources
-from pyklip_diffrender.optics.planes import Plane
-from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.wavefront import random_opd
 
 WAVELENGTH = 4.5e-6
 MASK = ROUND_MASKS["MASK335R"]

@@ -19,12 +19,10 @@ from pyklip_diffrender.errors import (
     MissingOPDError,
     RefinementError,
 )
-from pyklip_diffrender.io.headers import sensing_date
-from pyklip_diffrender.optics.grid import resample
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.wavefront.map_choice import choose_map, wavefront_for
-from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, read_opd
+from pyklip_diffrender.io import sensing_date
+from pyklip_diffrender.optics import resample
+from pyklip_diffrender.scene import Observation, Sequence
+from pyklip_diffrender.wavefront import OPDMap, choose_map, random_opd, read_opd, wavefront_for
 
 NPIX = 64
 

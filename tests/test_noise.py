@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pyklip_diffrender.scene.noise import calibrated_errors
+from pyklip_diffrender.scene import calibrated_errors
 
 SCALE = (0.063, 0.063)
 CENTER = np.array([[150.0, 150.0]])

@@ -18,21 +18,20 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.instrument.jwst import jwst_pupil
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.io.files import sha256
-from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, starting_opd
-from pyklip_diffrender.wavefront.bases import SegmentMotions
-from pyklip_diffrender.wavefront.map_choice import wavefront_for
-from pyklip_diffrender.wavefront.opd import (
+from pyklip_diffrender.instrument import jwst_pupil, nircam_coronagraph
+from pyklip_diffrender.io import sha256
+from pyklip_diffrender.optics import PupilGrid, resample
+from pyklip_diffrender.pyklip_backend import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.settings import starting_opd
+from pyklip_diffrender.wavefront import (
     OPDMap,
+    SegmentMotions,
     as_opd_map,
     drift,
     random_drift,
     random_opd,
     read_opd,
-    resample,
+    wavefront_for,
 )
 
 NPIX = 96

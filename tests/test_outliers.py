@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.refinement import refine_again
 
 SIZE, NPIX, SCENE = 32, 64, 5

@@ -15,11 +15,8 @@ import torch
 from stpsf_data import lyot_stop
 
 from pyklip_diffrender.bridges import from_webbpsf
-from pyklip_diffrender.instrument.jwst import maskrnd_openings
-from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
-from pyklip_diffrender.optics.grid import JWST_DIAMETER
-from pyklip_diffrender.optics.planes import LyotStop
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.instrument import FLIGHT_ALIGNMENT, maskrnd_openings, nircam_coronagraph
+from pyklip_diffrender.optics import JWST_DIAMETER, LyotStop, OpticalSystem
 
 NPIX = 256
 CALL = {

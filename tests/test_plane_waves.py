@@ -8,14 +8,10 @@ from typing import Any
 import pytest
 import torch
 
-from pyklip_diffrender.instrument.masks import ROUND_MASKS
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.linear.mode_fields import ModeFields
-from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.planes import Wavefront
-from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
-from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.instrument import ROUND_MASKS, nircam_coronagraph
+from pyklip_diffrender.linear import ModeFields
+from pyklip_diffrender.optics import OpticalSystem, PupilGrid, Wavefront
+from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions, random_opd
 
 NPIX = 128
 MASK = ROUND_MASKS["MASK335R"]

@@ -6,8 +6,7 @@ import logging
 
 import pytest
 
-from pyklip_diffrender.io import progress
-from pyklip_diffrender.io.progress import ProgressBar, stage
+from pyklip_diffrender.io import ProgressBar, progress, stage
 
 
 def last_shown(text: str) -> str:

@@ -8,10 +8,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
-from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
-from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.instrument import (
+    NIRCAM_LW_PIXELSCALE,
+    jwst_pupil,
+    maskrnd_openings,
+    nircam_coronagraph,
+)
+from pyklip_diffrender.optics import OpticalSystem, PupilGrid, polygon_coverage
 
 Array = NDArray[np.float64]
 

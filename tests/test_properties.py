@@ -11,22 +11,28 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.fourier import MatrixFourier
-from pyklip_diffrender.optics.grid import (
+from pyklip_diffrender.instrument import jwst_pupil, maskrnd_openings, nircam_coronagraph
+from pyklip_diffrender.io import ARCSEC
+from pyklip_diffrender.optics import (
     JWST_DIAMETER,
+    MatrixFourier,
+    OpticalSystem,
     PupilGrid,
+    Wavefront,
     polygon_coverage,
+    resample,
     transform_polygons,
 )
-from pyklip_diffrender.optics.planes import Wavefront
-from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.scene.objects import Planet, Scene, Star
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.simulation import expected_photons, planet_photons, star_photons
-from pyklip_diffrender.wavefront.opd import random_opd, resample
+from pyklip_diffrender.scene import (
+    Observation,
+    Planet,
+    Scene,
+    Star,
+    expected_photons,
+    planet_photons,
+    star_photons,
+)
+from pyklip_diffrender.wavefront import random_opd
 
 WAVELENGTH = 4.5e-6
 SCALE = 0.062424185

@@ -20,10 +20,9 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.io.units import to_number, to_pair
+from pyklip_diffrender.io import to_number, to_pair
 from pyklip_diffrender.refinement.problem import Problem
-from pyklip_diffrender.wavefront.bases import SegmentMotions
-from pyklip_diffrender.wavefront.opd import as_opd_map, random_drift
+from pyklip_diffrender.wavefront import SegmentMotions, as_opd_map, random_drift
 
 OPD = dr.random_opd(1, npix=64).data
 

@@ -11,20 +11,28 @@ import torch
 from scipy.stats import multivariate_normal
 
 from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.instrument.jwst import jwst_pupil
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.linear.jacobian import jacobian
-from pyklip_diffrender.linear.last_pupil import LastPupil
-from pyklip_diffrender.linear.mode_fields import NANOMETRE
-from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
-from pyklip_diffrender.linear.response import WavefrontResponse, coarse_copy, downsample
-from pyklip_diffrender.linear.response_cache import ResponseCache
-from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.instrument import jwst_pupil, nircam_coronagraph
+from pyklip_diffrender.linear import (
+    NANOMETRE,
+    LastPupil,
+    ResponseCache,
+    WavefrontResponse,
+    coarse_copy,
+    downsample,
+    jacobian,
+    parameter_jacobian,
+)
+from pyklip_diffrender.optics import OpticalSystem, PupilGrid
 from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
-from pyklip_diffrender.wavefront.opd import random_opd
-from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior, solve_with_evidence
+from pyklip_diffrender.wavefront import (
+    FourierModes,
+    JointBasis,
+    SegmentMotions,
+    WavefrontPrior,
+    learn_prior,
+    random_opd,
+    solve_with_evidence,
+)
 
 NPIX = 256
 BASIS = JointBasis([SegmentMotions(), FourierModes(6)])

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pyklip_diffrender.detection import search
-from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection import Candidates, search
 
 PEAKS = {(10, 20): 8.0, (30, 12): 6.0, (25, 33): 5.5}
 """S/N of the map at three pixels."""

@@ -9,16 +9,20 @@ import numpy as np
 import pytest
 from astropy import units as u
 
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.scene.objects import ALPHA_PICTORIS_W2, UNOCCULTED_PEAK, Planet, Scene, Star
-from pyklip_diffrender.scene.simulation import (
+from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.optics import OpticalSystem
+from pyklip_diffrender.scene import (
+    ALPHA_PICTORIS_W2,
+    UNOCCULTED_PEAK,
+    Planet,
+    Scene,
+    Star,
     expected_photons,
     planet_photons,
     simulate,
     star_photons,
 )
-from pyklip_diffrender.wavefront.opd import drift, random_opd, read_opd
+from pyklip_diffrender.wavefront import drift, random_opd, read_opd
 
 WAVELENGTH = 4.5e-6
 NPIX = 96

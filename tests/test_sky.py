@@ -18,17 +18,16 @@ from astropy.time import Time
 from astropy.wcs import WCS
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.orbits import write_astrometry
 from pyklip_diffrender.detection.sky import Positions, Sky
 from pyklip_diffrender.detection.tables import candidate_table, measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument import ROUND_MASKS
 from pyklip_diffrender.refinement import FrameFit, jansky_per_unit, require_calibrated, to_jansky
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.product_headers import world_coordinates
+from pyklip_diffrender.scene import Observation, world_coordinates
 
 # Of jw01184005001_03106_00001_nrcalong_calints.fits. The linear part of its WCS is the pipeline's,
 # made from the calibrated distortion; ROLL_REF and V3I_YANG are what this package reads.

@@ -23,14 +23,14 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.tables import candidate_table
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.pyklip_backend import backend, reduction
 from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.spaceklip import run
 from pyklip_diffrender.spaceklip.products import complete_header, write_contrast, write_database
 from pyklip_diffrender.spaceklip.sources import source_table
-from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.wavefront import random_opd
 
 pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
 

@@ -12,7 +12,7 @@ from astropy.table import QTable, Table
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
-from pyklip_diffrender.instrument.spectrum import filter_throughput
+from pyklip_diffrender.instrument import filter_throughput
 
 GRID = np.geomspace(1.0, 6.0, 400) * u.micron
 

@@ -169,8 +169,9 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "header-roll", "the position angle of +y follows from ROLL_REF and V3I_YANG",
-            'angle = number("ROLL_REF", np.nan) - number(',
-            'angle = number("ROLL_REF", np.nan) + number(', "observation",
+            'return roll - angle * (-1.0 if parity is None else parity)',
+            'return roll + angle * (-1.0 if parity is None else parity)',
+            "observation exposure admission",
         ),
         Breakage(
             "saturated", "saturated pixels are left out",
@@ -183,8 +184,9 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "dither", "dithers off the mask are no dithers behind it",
-            "if 0 < np.hypot(x, y) < _BEHIND_THE_MASK else None",
-            "if 0 < np.hypot(x, y) else None", "observation",
+            'if 0 < np.hypot(x, y) < BEHIND_THE_MASK else None',
+            'if 0 < np.hypot(x, y) else None',
+            "observation admission",
         ),
         Breakage(
             "read-noise", "simulated errors include the read noise",
@@ -197,8 +199,9 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "unaligned", "shifts of aligned frames are undone, not doubled",
-            "shift_frames(np.nan_to_num(each), pixels - net)",
-            "shift_frames(np.nan_to_num(each), net - pixels)", "detector_pixels",
+            'undo_shifts(data, error, pixels - net)',
+            'undo_shifts(data, error, net - pixels)',
+            "detector_pixels",
         ),
         Breakage(
             "combined", "frames are averaged with inverse variances",
@@ -207,9 +210,10 @@ def _frames_and_files() -> list[Breakage]:
             "observation",
         ),
         Breakage(
-            "other-mask", "frames behind another mask are no references",
-            '("CORONMSK", "PUPIL", "SUBARRAY", "DETECTOR")', '("PUPIL", "SUBARRAY", "DETECTOR")',
-            "sequence",
+            "other-mask", "of several set-ups that of most frames is kept",
+            'majority = max(counts, key=preference)',
+            'majority = min(counts, key=preference)',
+            "sequence admission",
         ),
         Breakage(
             "wcs", "east is left of north in the WCS of products",
@@ -239,8 +243,8 @@ def _fits() -> list[Breakage]:
     return [
         Breakage(
             "template-roll", "planets turn with the sky from frame to frame",
-            "[[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]],\n",
-            "[[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]],\n",
+            "torch.from_numpy(rotation_matrix(self.rolls[k])).T",
+            "torch.from_numpy(rotation_matrix(self.rolls[k]))",
             "detection recovery",
         ),
         Breakage(
@@ -250,8 +254,9 @@ def _fits() -> list[Breakage]:
         ),
         Breakage(
             "mismatch", "a fit that does not explain its data says so",
-            "return Status.CONVERGED if chi2 < _EXPLAINED else Status.MODEL_MISMATCH",
-            "return Status.CONVERGED", "refinement",
+            'return best, Status.CONVERGED if explained else Status.MODEL_MISMATCH',
+            'return best, Status.CONVERGED',
+            "refinement",
         ),
         Breakage(
             "outliers", "hot pixels are left out, planets are not",
@@ -270,8 +275,9 @@ def _fits() -> list[Breakage]:
         ),
         Breakage(
             "own-pattern", "the target's own frames are not in its pattern",
-            "patterns += [each for each in known if _plain(each.star) not in stars]",
-            "patterns += known", "systematics sequence",
+            'each for each in known if not any(same_name(each.star, star) for star in stars)',
+            'each for each in known',
+            "systematics sequence",
         ),
         Breakage(
             "pattern-size", "the size of a pattern is 1 where frames show it",

@@ -1,1 +1,38 @@
 """JWST and NIRCam from embedded tables: mirror, masks, filters, `nircam_coronagraph`."""
+
+from __future__ import annotations
+
+from pyklip_diffrender.instrument.aberrations import ChromaticAberration, internal_wavefront_error
+from pyklip_diffrender.instrument.jwst import (
+    TABULATED_GAP,
+    is_jwst_pupil,
+    jwst_pupil,
+    jwst_segments,
+    maskrnd_openings,
+)
+from pyklip_diffrender.instrument.masks import ROUND_MASKS, filter_shift, mask_center
+from pyklip_diffrender.instrument.nircam import (
+    FLIGHT_ALIGNMENT,
+    NIRCAM_LW_PIXELSCALE,
+    nircam_coronagraph,
+)
+from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, filter_throughput
+
+__all__ = [
+    "FLIGHT_ALIGNMENT",
+    "NIRCAM_LW_PIXELSCALE",
+    "ROUND_MASKS",
+    "TABULATED_GAP",
+    "ChromaticAberration",
+    "blackbody",
+    "filter_bandpass",
+    "filter_shift",
+    "filter_throughput",
+    "internal_wavefront_error",
+    "is_jwst_pupil",
+    "jwst_pupil",
+    "jwst_segments",
+    "mask_center",
+    "maskrnd_openings",
+    "nircam_coronagraph",
+]

@@ -1,1 +1,47 @@
 """What is observed: stars and planets, observed frames, simulated frames."""
+
+from __future__ import annotations
+
+from pyklip_diffrender.scene.detector_pixels import shift_frames
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
+from pyklip_diffrender.scene.noise import calibrated_errors
+from pyklip_diffrender.scene.objects import (
+    ALPHA_PICTORIS_W2,
+    PAPER_SEGMENT_GAP,
+    UNOCCULTED_PEAK,
+    Planet,
+    Scene,
+    Star,
+)
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.product_headers import world_coordinates
+from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.simulation import (
+    expected_photons,
+    planet_photons,
+    simulate,
+    star_photons,
+)
+from pyklip_diffrender.scene.systematics import Systematics
+
+__all__ = [
+    "ALPHA_PICTORIS_W2",
+    "BAD_PIXEL_BITS",
+    "PAPER_SEGMENT_GAP",
+    "UNOCCULTED_PEAK",
+    "Observation",
+    "Planet",
+    "Scene",
+    "Sequence",
+    "Star",
+    "Systematics",
+    "calibrated_errors",
+    "expected_photons",
+    "model_for",
+    "planet_photons",
+    "shift_frames",
+    "simulate",
+    "star_photons",
+    "world_coordinates",
+]

@@ -1,1 +1,43 @@
 """Wavefront maps, the modes that describe their changes, and priors on those."""
+
+from __future__ import annotations
+
+from pyklip_diffrender.wavefront.bases import (
+    Basis,
+    FourierModes,
+    JointBasis,
+    SegmentMotions,
+    default_basis,
+)
+from pyklip_diffrender.wavefront.map_choice import RULES, choose_map, wavefront_for
+from pyklip_diffrender.wavefront.opd import (
+    OPDMap,
+    as_opd_map,
+    drift,
+    random_drift,
+    random_opd,
+    read_opd,
+)
+from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior, solve_with_evidence
+from pyklip_diffrender.wavefront.wss import interpolate_wss
+
+__all__ = [
+    "RULES",
+    "Basis",
+    "FourierModes",
+    "JointBasis",
+    "OPDMap",
+    "SegmentMotions",
+    "WavefrontPrior",
+    "as_opd_map",
+    "choose_map",
+    "default_basis",
+    "drift",
+    "interpolate_wss",
+    "learn_prior",
+    "random_drift",
+    "random_opd",
+    "read_opd",
+    "solve_with_evidence",
+    "wavefront_for",
+]

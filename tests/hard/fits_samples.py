@@ -13,8 +13,8 @@ import numpy as np
 from astropy.io import fits
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, read_opd
+from pyklip_diffrender.scene import Observation
+from pyklip_diffrender.wavefront import OPDMap, random_opd, read_opd
 
 __all__ = ["READERS", "calints", "content", "opd_map", "outcome", "same", "sane", "wavefront"]
 

@@ -14,12 +14,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.optics.bandpass import Bandpass
-from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.wavefront.bases import SegmentMotions
-from pyklip_diffrender.wavefront.opd import random_opd
+from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.optics import Bandpass, OpticalSystem, PupilGrid
+from pyklip_diffrender.wavefront import SegmentMotions, random_opd
 
 DTYPES = (torch.float64, torch.float32)
 WAVELENGTH = 4.5e-6

@@ -17,15 +17,17 @@ import torch
 from hard_cases import WAVELENGTH, segment
 from numpy.typing import NDArray
 
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.optics import OpticalSystem, PupilGrid
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Status, refine
-from pyklip_diffrender.scene.objects import Planet
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
-from pyklip_diffrender.wavefront.opd import random_opd
-from pyklip_diffrender.wavefront.priors import WavefrontPrior
+from pyklip_diffrender.scene import Observation, Planet
+from pyklip_diffrender.wavefront import (
+    FourierModes,
+    JointBasis,
+    SegmentMotions,
+    WavefrontPrior,
+    random_opd,
+)
 
 __all__ = [
     "FITS", "PRIOR", "SUCCESS", "FitRow", "Pistons", "drift_rms", "error_of",

@@ -24,12 +24,14 @@ from hard_cases import (
     worst,
 )
 
-from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
-from pyklip_diffrender.instrument.masks import ROUND_MASKS
-from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
-from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
-from pyklip_diffrender.scene.objects import Planet, Scene
-from pyklip_diffrender.scene.simulation import expected_photons, planet_photons, star_photons
+from pyklip_diffrender.instrument import (
+    NIRCAM_LW_PIXELSCALE,
+    ROUND_MASKS,
+    jwst_pupil,
+    maskrnd_openings,
+)
+from pyklip_diffrender.optics import PupilGrid, polygon_coverage
+from pyklip_diffrender.scene import Planet, Scene, expected_photons, planet_photons, star_photons
 
 __all__ = ["NPIX", "ROWS", "summed_in_float32"]
 

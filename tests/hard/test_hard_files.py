@@ -17,9 +17,9 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.wavefront.opd import read_opd
+from pyklip_diffrender.io import open_fits
+from pyklip_diffrender.scene import Observation
+from pyklip_diffrender.wavefront import read_opd
 
 pytestmark = pytest.mark.hard
 

@@ -29,10 +29,10 @@ from stability_fits import (
 )
 
 from pyklip_diffrender.detection.metrics import psnr, star_model_error, throughput
-from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics import PupilGrid
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
 from pyklip_diffrender.refinement import Refinement, Status
-from pyklip_diffrender.wavefront.bases import FourierModes
+from pyklip_diffrender.wavefront import FourierModes
 
 pytestmark = pytest.mark.hard
 

@@ -15,11 +15,15 @@ from pyklip_diffrender.bridges.image_masks import (
     SampledOcculter,
     SeparablePart,
 )
-from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.fourier import MatrixFourier
-from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
-from pyklip_diffrender.optics.planes import Plane, Wavefront
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.io import ARCSEC
+from pyklip_diffrender.optics import (
+    JWST_DIAMETER,
+    MatrixFourier,
+    OpticalSystem,
+    Plane,
+    PupilGrid,
+    Wavefront,
+)
 
 pytestmark = pytest.mark.hard
 

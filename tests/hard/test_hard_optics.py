@@ -10,10 +10,9 @@ import torch
 from hard_cases import DTYPES, Row, small, system, wavefront, worst
 from stability_optics import ROWS
 
-from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
-from pyklip_diffrender.scene.objects import Planet, Scene
-from pyklip_diffrender.scene.simulation import expected_photons, planet_photons, star_photons
+from pyklip_diffrender.scene import Planet, Scene, expected_photons, planet_photons, star_photons
 
 pytestmark = pytest.mark.hard
 

@@ -19,12 +19,10 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
     ShapeError,
 )
-from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.linear.response import coarse_copy
-from pyklip_diffrender.scene.objects import Scene
-from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.simulation import simulate
-from pyklip_diffrender.wavefront.opd import as_opd_map
+from pyklip_diffrender.instrument import nircam_coronagraph
+from pyklip_diffrender.linear import coarse_copy
+from pyklip_diffrender.scene import Observation, Scene, simulate
+from pyklip_diffrender.wavefront import as_opd_map
 
 pytestmark = pytest.mark.hard
 
