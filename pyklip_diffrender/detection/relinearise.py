@@ -5,20 +5,75 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import has_only_reference_stars
 from pyklip_diffrender.refinement import Refinement, refine_again
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["lacks_candidates", "with_companions", "without_light"]
+__all__ = [
+    "has_unconfirmed_companions",
+    "lacks_candidates",
+    "with_companions",
+    "without_light",
+]
+
+_NEAR = 0.25
+"""lambda/D between a companion of a fit and a candidate that are the same source. Positions of
+sources above the threshold are known to a tenth of it."""
+
+_SIMILAR = 0.1
+_SIGMAS = 5.0
+"""Relative difference of their contrasts, and in standard deviations of that of the companion,
+beyond which the fit has not found the source."""
 
 
 def lacks_candidates(fits: Sequence[Refinement], candidates: Candidates) -> bool:
-    """Whether a fit of the target has another number of companions than there are candidates."""
+    """Return True if the companions of a fit of the target are not the candidates.
+
+    They are if every companion is at the place of one candidate and about as bright, and the other
+    way round.
+
+    Parameters
+    ----------
+    fits : sequence of Refinement
+    candidates : Candidates
+        Positions refer to the first frame of the first fit.
+    """
     return any(
-        len(fit.companions) != len(candidates) for fit in fits if not has_only_reference_stars(fit)
+        len(fit.companions) != len(candidates) or bool((~_confirmed(fit, fits, candidates)).any())
+        for fit in fits
+        if not has_only_reference_stars(fit)
     )
+
+
+def has_unconfirmed_companions(fits: Sequence[Refinement], candidates: Candidates) -> bool:
+    """Return True if a fit of the target has a companion that is not one of the candidates.
+
+    It is most often an error of the star, and would remain in the star's image, in files and plots.
+    """
+    return any(
+        bool((~_confirmed(fit, fits, candidates)).any())
+        for fit in fits
+        if not has_only_reference_stars(fit)
+    )
+
+
+def _confirmed(
+    fit: Refinement, fits: Sequence[Refinement], candidates: Candidates
+) -> NDArray[np.bool_]:
+    """Which companions of a fit are candidates, (companions,)."""
+    roll = fit.frames[0].observation.roll_from(fits[0].frames[0].observation)
+    places = np.array([planet.offset for planet in candidates.planets(roll)]).reshape(1, -1, 2)
+    contrasts = candidates.contrasts.numpy()
+    near = np.hypot(*np.moveaxis(fit.companions[:, None, 1:] - places, -1, 0))
+    difference = np.abs(fit.companions[:, None, 0] - contrasts)
+    allowed = np.hypot(_SIMILAR * contrasts, _SIGMAS * fit.companion_errors[:, None, 0])
+    same = (near < _NEAR * fit.model.resolution) & (difference < allowed)
+    return np.asarray(same.any(axis=1))
 
 
 def with_companions(

@@ -25,7 +25,12 @@ from pyklip_diffrender.detection.field import (
 from pyklip_diffrender.detection.groups import Group, groups_of, weigh
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.measurement import contrasts_at
-from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
+from pyklip_diffrender.detection.relinearise import (
+    has_unconfirmed_companions,
+    lacks_candidates,
+    with_companions,
+)
+from pyklip_diffrender.detection.rescue import with_raised_peaks
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.tables import measured_table
@@ -115,6 +120,13 @@ def detect(
     _require_positive(threshold=threshold, inner=inner, scatter=scatter)
     maps = Maps(groups_of(fits), progress)
     candidates, factor = _search(maps, fits, threshold, inner, scatter, Candidates.of_fit(fits[0]))
+    if not len(candidates):
+        better = with_raised_peaks(fits, maps, inner, progress)
+        if better is not None:
+            fits = better
+            maps = Maps(groups_of(fits), progress)
+            first = Candidates.of_fit(fits[0])
+            candidates, factor = _search(maps, fits, threshold, inner, scatter, first)
     if not all(fit.status.calibrated for fit in fits):
         relinearise = min(relinearise, threshold)
     bright = candidates.snr(factor) > relinearise
@@ -124,7 +136,9 @@ def detect(
             "not refined with them in the model",
             len(candidates),
         )
-    elif bright.any() and lacks_candidates(fits, candidates):
+    elif has_unconfirmed_companions(fits, candidates) or (
+        bright.any() and lacks_candidates(fits, candidates)
+    ):
         fits = with_companions(fits, candidates, progress)
         maps = Maps(groups_of(fits), progress)
         candidates, factor = _search(maps, fits, threshold, inner, scatter, candidates)
