@@ -13,7 +13,12 @@ from astropy.io import fits
 from astropy.time import Time
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, UnitError
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    DiffrenderWarning,
+    NoValidPixelsError,
+    UnitError,
+)
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import header_number, header_text, merged_header
 from pyklip_diffrender.io.units import native_float64
@@ -27,11 +32,19 @@ from pyklip_diffrender.scene.detector_pixels import (
     undo_shifts,
 )
 from pyklip_diffrender.scene.exposure import beginning, position_angle
+from pyklip_diffrender.scene.integrations import empty_integrations
 from pyklip_diffrender.scene.star_place import measured_offset
 
 _log = logging.getLogger(__name__)
 
-__all__ = ["BAD_PIXEL_BITS", "BEHIND_THE_MASK", "dither", "on_detector_pixels", "read_calints"]
+__all__ = [
+    "BAD_PIXEL_BITS",
+    "BEHIND_THE_MASK",
+    "dither",
+    "on_detector_pixels",
+    "read_calints",
+    "without_empty",
+]
 
 BAD_PIXEL_BITS = 1 | 2 | 512 | 1024
 """JWST data-quality bits that take a pixel out of the fit: DO_NOT_USE, SATURATED, NON_SCIENCE,
@@ -120,6 +133,30 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
             star = np.array([nx - 1, ny - 1]) / 2
         arguments["first_pixel"] = first_pixel(header, star, (ny, nx), path.name)
     return arguments, shifts
+
+
+def without_empty(
+    arguments: dict[str, Any], shifts: NDArray[Any] | None
+) -> tuple[dict[str, Any], NDArray[Any] | None, tuple[str, ...]]:
+    """Leave integrations out that have no usable pixels; see `read_calints` for the arguments."""
+    stacks = [np.asarray(arguments[key]) for key in ("data", "error", "valid")]
+    data, error, valid = (each[None] if each.ndim == 2 else each for each in stacks)
+    if data.ndim != 3 or not data.shape == error.shape == valid.shape:
+        return arguments, shifts, ()
+    usable = valid & np.isfinite(data) & np.isfinite(error) & (error > 0)
+    judgement = empty_integrations(data, usable)
+    if judgement.kept.all():
+        return arguments, shifts, ()
+    name, remarks = arguments["name"], judgement.remarks
+    if not judgement.kept.any():
+        raise NoValidPixelsError(f"{name}: {'; '.join(remarks)}. Look at its SCI, ERR and DQ")
+    for remark in remarks:
+        _log.warning("%s: %s", name, remark)
+    kept = judgement.kept
+    changed = {"data": data[kept], "error": error[kept], "valid": valid[kept]}
+    if arguments["position_angles"] is not None:
+        changed["position_angles"] = arguments["position_angles"][kept]
+    return arguments | changed, None if shifts is None else shifts[kept], remarks
 
 
 def dither(header: fits.Header, name: str) -> tuple[float, float] | None:

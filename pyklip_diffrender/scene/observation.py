@@ -31,42 +31,14 @@ from pyklip_diffrender.io.units import (
     to_unit,
 )
 from pyklip_diffrender.scene.exposure import star_of
-from pyklip_diffrender.scene.integrations import (
-    empty_integrations,
-    judge_integrations,
-    pointings,
-)
-from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints
+from pyklip_diffrender.scene.integrations import judge_integrations, pointings
+from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints, without_empty
 from pyklip_diffrender.scene.noise import calibration
 from pyklip_diffrender.scene.window import Window
 
 __all__ = ["Observation"]
 
 _log = logging.getLogger(__name__)
-
-
-def _without_empty(
-    arguments: dict[str, Any], shifts: NDArray[Any] | None
-) -> tuple[dict[str, Any], NDArray[Any] | None, tuple[str, ...]]:
-    """Leave integrations out that have no usable pixels; see `read_calints` for the arguments."""
-    stacks = [np.asarray(arguments[key]) for key in ("data", "error", "valid")]
-    data, error, valid = (each[None] if each.ndim == 2 else each for each in stacks)
-    if data.ndim != 3 or not data.shape == error.shape == valid.shape:
-        return arguments, shifts, ()
-    usable = valid & np.isfinite(data) & np.isfinite(error) & (error > 0)
-    judgement = empty_integrations(data, usable)
-    if judgement.kept.all():
-        return arguments, shifts, ()
-    name, remarks = arguments["name"], judgement.remarks
-    if not judgement.kept.any():
-        raise NoValidPixelsError(f"{name}: {'; '.join(remarks)}. Look at its SCI, ERR and DQ")
-    for remark in remarks:
-        _log.warning("%s: %s", name, remark)
-    kept = judgement.kept
-    changed = {"data": data[kept], "error": error[kept], "valid": valid[kept]}
-    if arguments["position_angles"] is not None:
-        changed["position_angles"] = arguments["position_angles"][kept]
-    return arguments | changed, None if shifts is None else shifts[kept], remarks
 
 
 def _spread(array: NDArray[np.float64], shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
@@ -277,7 +249,7 @@ class Observation:
         arguments, shifts = read_calints(path)
         remarks: tuple[str, ...] = ()
         if not every_integration:
-            arguments, shifts, remarks = _without_empty(arguments, shifts)
+            arguments, shifts, remarks = without_empty(arguments, shifts)
         observation = cls.from_arrays(**arguments)
         if shifts is not None:
             changes = on_detector_pixels(arguments, observation.center, shifts)

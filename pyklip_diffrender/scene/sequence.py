@@ -15,7 +15,6 @@ from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.admission import (
     EPOCH,
-    Candidate,
     choose_filter,
     choose_target,
     compare_brightness,
@@ -23,12 +22,15 @@ from pyklip_diffrender.scene.admission import (
     exclude_copies,
     exclude_other_setups,
     exclude_unoriented,
-    exclude_unusable,
-    exposures_in,
     judge_frames,
-    require_some,
 )
 from pyklip_diffrender.scene.admission_table import SHORT, Row, rows_table
+from pyklip_diffrender.scene.candidates import (
+    Candidate,
+    exclude_unusable,
+    exposures_in,
+    require_some,
+)
 from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.observation import Observation
 

@@ -1,0 +1,213 @@
+"""Files that may become part of a sequence, and what of them cannot be used or is there twice."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pyklip_diffrender.errors import DiffrenderError, NoValidPixelsError
+from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.io.headers import merged_header
+from pyklip_diffrender.scene.exposure import Exposure
+from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["Candidate", "exclude_unusable", "exposures_in", "left", "require_some"]
+
+_SUFFIXES = (".fits", ".fits.gz")
+
+_USABLE = ("calints", "crfints", "cal", "crf", "rateints", "rate")
+"""Levels of frames that are still those of the detector, the best first."""
+
+_NOT_USABLE = {
+    "i2d": "a resampled image (i2d), whose pixels are not the detector's",
+    "psfsub": "an image from which the star was subtracted (psfsub)",
+    "psfalign": "images of reference stars that were aligned (psfalign)",
+    "psfstack": "a stack of reference stars (psfstack)",
+}
+
+_CORONAGRAPHIC = ("NRC_CORON", "MIR_LYOT", "MIR_4QPM", "NIS_CORON")
+
+_OTHER_TYPES = {
+    "NRC_TACQ": "an image for acquiring the target",
+    "NRC_TACONFIRM": "an image that confirms the acquisition of the target",
+    "NRC_IMAGE": "an image without a coronagraph",
+    "MIR_TACQ": "an image for acquiring the target",
+    "MIR_TACONFIRM": "an image that confirms the acquisition of the target",
+}
+
+
+@dataclass(eq=False)
+class Candidate:
+    """A file that may become part of a sequence.
+
+    Attributes
+    ----------
+    path : Path
+    exposure : Exposure
+    star : str
+        Name of its star, the same for all files of the star.
+    reason : str
+        Why the file is excluded; empty for those that are not.
+    """
+
+    path: Path
+    exposure: Exposure
+    star: str = ""
+    reason: str = field(default="", repr=False)
+
+    @property
+    def name(self) -> str:
+        """Name of the file."""
+        return self.path.name
+
+    def read(self) -> Observation | None:
+        """Read the frames; if they cannot be read, None, with the reason."""
+        try:
+            return Observation.from_fits(self.path)
+        except DiffrenderError as error:
+            self.reason = str(error).removeprefix(f"{self.name}: ")
+            return None
+
+
+def exposures_in(
+    files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+) -> list[Candidate]:
+    """Find FITS files and read what their headers say.
+
+    Parameters
+    ----------
+    files : path or sequence of path
+        Files, or folders of them.
+
+    Raises
+    ------
+    NoValidPixelsError
+        If there are no files.
+    """
+    entries = [files] if isinstance(files, str | os.PathLike) else list(files)
+    paths: list[Path] = []
+    for each in map(Path, entries):
+        if each.is_dir():
+            inside = sorted(p for p in each.iterdir() if p.name.lower().endswith(_SUFFIXES))
+            if not inside:
+                raise NoValidPixelsError(f"{each}: the folder has no FITS files")
+            paths += inside
+        else:
+            paths.append(each)
+    if not paths:
+        raise NoValidPixelsError("files: got none, expected at least one")
+    return [_candidate(path) for path in paths]
+
+
+def _candidate(path: Path) -> Candidate:
+    try:
+        with open_fits(path) as hdus:
+            header, shape = hdus[0].header, ()
+            if "SCI" in hdus:
+                header = merged_header(header, hdus["SCI"].header, path.name)
+                shape = np.shape(hdus["SCI"].data)
+            return Candidate(path, Exposure.of(header, path.name, shape))
+    except DiffrenderError as error:
+        return Candidate(path, Exposure(path.name), reason=str(error))
+
+
+def left(candidates: Iterable[Candidate]) -> list[Candidate]:
+    """Those that are not excluded."""
+    return [each for each in candidates if not each.reason]
+
+
+def exclude_unusable(candidates: Sequence[Candidate]) -> None:
+    """Exclude files that cannot be frames of a star behind a mask, and duplicates."""
+    for each in left(candidates):
+        each.reason = _why_unusable(each.exposure)
+    _exclude_duplicates(left(candidates), lambda each: str(each.path.resolve()), _same_file)
+    # The same file, packed and unpacked.
+    _exclude_duplicates(
+        left(candidates), lambda each: str(each.path.resolve()).removesuffix(".gz"), _same_file
+    )
+    _exclude_duplicates(left(candidates), _moment, _same_exposure)
+
+
+def _why_unusable(exposure: Exposure) -> str:
+    level, kind = exposure.level, exposure.exposure_type
+    if level is not None and level not in _USABLE:
+        what = _NOT_USABLE.get(level, f"a product of another kind ({level})")
+        return f"it is {what}; expected frames of stage 2 (calints)"
+    if kind is not None and kind not in _CORONAGRAPHIC:
+        what = _OTHER_TYPES.get(kind, "no coronagraphic exposure")
+        return f"EXP_TYPE is {kind}: {what}; expected NRC_CORON"
+    if exposure.background:
+        return "BKGDTARG is true: an exposure of the background, without a star"
+    if exposure.mask == "NONE":
+        return "CORONMSK is NONE: the star is not behind a mask"
+    away = float(np.hypot(*exposure.offset))
+    if away >= BEHIND_THE_MASK:
+        x, y = exposure.offset
+        unit = ""
+        if away / 1000 < BEHIND_THE_MASK:
+            unit = ". If these are milliarcseconds, divide them by 1000 in the header"
+        return (
+            f"XOFFSET and YOFFSET are {x:g} and {y:g} arcsec, expected less than "
+            f"{BEHIND_THE_MASK:g} for a star behind the mask{unit}"
+        )
+    return ""
+
+
+def _moment(candidate: Candidate) -> tuple[object, ...] | None:
+    """What the files of one exposure have in common; None if that is not known.
+
+    Copies whose headers were given another roll or date are no files of one exposure.
+    """
+    exposure = candidate.exposure
+    if exposure.identity is None:
+        return None
+    angle, date = exposure.position_angle, exposure.date
+    return (
+        exposure.identity,
+        None if angle is None else round(angle),
+        None if date is None else round(date.mjd, 2),
+    )
+
+
+def _exclude_duplicates(
+    candidates: Sequence[Candidate],
+    key: Callable[[Candidate], object],
+    reason: Callable[[Candidate], str],
+) -> None:
+    """Keep the file of the best level among those with one key."""
+    groups: dict[object, list[Candidate]] = {}
+    for each in candidates:
+        value = key(each)
+        if value is not None:
+            groups.setdefault(value, []).append(each)
+    for group in groups.values():
+        best = min(group, key=lambda each: _rank(each.exposure))
+        for each in group:
+            if each is not best:
+                each.reason = reason(best)
+
+
+def _rank(exposure: Exposure) -> int:
+    # A file whose name does not tell is most probably a copy of calints.
+    level = exposure.level or ("calints" if exposure.unit == "MJy/sr" else "rate")
+    return _USABLE.index(level)
+
+
+def _same_file(best: Candidate) -> str:
+    return f"the same file as {best.name}"
+
+
+def _same_exposure(best: Candidate) -> str:
+    return f"the same exposure as {best.name} ({best.exposure.identity}), which is used"
+
+
+def require_some(candidates: Sequence[Candidate]) -> None:
+    """Raise `NoValidPixelsError`, with the reasons, if every file is excluded."""
+    if not left(candidates):
+        reasons = "; ".join(f"{each.name}: {each.reason}" for each in candidates)
+        raise NoValidPixelsError(f"none of {len(candidates)} files can be used: {reasons}")
