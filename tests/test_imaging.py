@@ -1,0 +1,161 @@
+"""The image of the sky: linear, turned north, and as deep as it says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from astropy.io import fits
+from astropy.wcs import WCS
+from numpy.typing import NDArray
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.errors import RefinementError
+from pyklip_diffrender.imaging import SkyModel, sky_images
+from pyklip_diffrender.imaging.interpolation import interpolation_matrix
+
+SIZE, NPIX = 24, 64
+PLACE = (0.35, 0.2)
+"""x, y arcsec of a planet from the star in the first frame."""
+
+
+@cache
+def fit() -> dr.Refinement:
+    """Two rolls of a star with a faint planet, fitted without it."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE)
+    opd = dr.random_opd(1, npix=NPIX)
+    frames = []
+    for k, angle in enumerate((0.0, 30.0)):
+        turn = np.radians(angle)
+        # On the detector, the sky turns clockwise as the position angle of +y grows.
+        x, y = np.array(PLACE) @ np.array([[np.cos(turn), -np.sin(turn)],
+                                           [np.sin(turn), np.cos(turn)]])  # fmt: skip
+        scene = dr.Scene(
+            star=dr.Star(flux=1e9), planets=(dr.Planet.from_offset(2e-4, float(x), float(y)),)
+        )
+        shot = dr.simulate(model, scene, opd, seed=k)
+        frames.append(replace(shot, position_angles=np.full(len(shot), angle)))
+    settings = dr.GaussNewton(cycles=3, max_companions=0)
+    return dr.refine(model, frames, opd, settings=settings, plan="off")
+
+
+@cache
+def sky() -> SkyModel:
+    return SkyModel([fit()])
+
+
+def dense(model: SkyModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The estimate as a matrix that multiplies the data, and the covariance Sigma of these."""
+    linear, _ = model.groups[0]
+    ny, nx = linear.frames[0].residual.shape
+    n = ny * nx
+    h = np.concatenate([model._onto_frames[0][k].toarray() for k in (0, 1)])
+    inverse = np.zeros((2 * n, 2 * n))
+    for k in (0, 1):
+        unit = torch.eye(n, dtype=torch.float64).reshape(n, ny, nx)
+        cleaned = linear.clean({k: unit})
+        for j in (0, 1):
+            part = (linear.frames[j].weight * cleaned[j]).flatten(1).numpy()
+            inverse[j * n : (j + 1) * n, k * n : (k + 1) * n] = part.T
+    side = model.shape[0]
+    blur = model._sky(np.eye(side * side).reshape(-1, side, side)).reshape(side * side, -1).T
+    prior = blur @ blur.T
+    estimate = np.linalg.solve(
+        np.eye(len(prior)) + prior @ h.T @ inverse @ h, prior @ h.T @ inverse
+    )
+    return estimate, inverse
+
+
+def test_the_estimate_and_its_deviation_are_those_of_the_closed_form() -> None:
+    model = sky()
+    estimate, inverse = dense(model)
+    data = np.concatenate([model.light()[0][k][0].numpy().ravel() for k in (0, 1)])
+    expected = (estimate @ data).reshape(model.shape)
+    # Conjugate gradients end at a thousandth.
+    np.testing.assert_allclose(model.estimate()[0], expected, atol=2e-3 * np.abs(expected).max())
+    # Sigma^-1 has no inverse where the star's flux and place have no prior.
+    covariance = estimate @ np.linalg.pinv(inverse, rcond=1e-10) @ estimate.T
+    deviation = np.sqrt(np.diag(covariance)).reshape(model.shape)
+    ours = model.deviation()
+    inner = np.hypot(*np.moveaxis(model.grid, -1, 0)) < 0.6
+    inner &= model.covered
+    # Interpolated between every other pixel, and combs whose members are 12 pixels apart.
+    np.testing.assert_allclose(ours[inner], deviation[inner], rtol=0.1)
+
+
+def test_a_planet_is_where_it_is_on_the_sky_with_the_stated_throughput() -> None:
+    model = sky()
+    _, templates = model.groups[0]
+    contrast = 1e-3
+    light = {k: contrast * each for k, each in templates.at(torch.tensor([PLACE]).double()).items()}
+    plain = model.estimate()[0]
+    data = model.light()
+    added = model.estimate([{k: data[0][k] + light[k] for k in light}])[0] - plain
+    row, column = np.unravel_index(added.argmax(), added.shape)
+    # To half a pixel; the first frame has north up.
+    np.testing.assert_allclose(model.grid[row, column], PLACE, atol=0.5 * model.pixelscale)
+    first = model.groups[0][1].origin
+    away = np.hypot(*(first.grid - PLACE).transpose(2, 0, 1))
+    peak = float(light[0][0].max())
+    kept = added.max() / peak
+    stated = model.throughput()[np.unravel_index(away.argmin(), away.shape)]
+    assert 0.3 < kept < 1.1
+    # Between places 2 pixels apart, and for a place between pixels.
+    assert stated == pytest.approx(kept, rel=0.15)
+
+
+def test_the_planet_stands_out_of_its_error() -> None:
+    model = sky()
+    snr = model.estimate()[0] / model.deviation()
+    snr = np.where(model.covered, snr, 0.0)
+    row, column = np.unravel_index(snr.argmax(), snr.shape)
+    np.testing.assert_allclose(model.grid[row, column], PLACE, atol=model.pixelscale)
+    distance = np.hypot(*(model.grid - PLACE).transpose(2, 0, 1))
+    field = model.covered & (distance > 0.3)
+    # The noise that the model knows is all that there is.
+    assert 0.7 < snr[field].std() < 1.3
+
+
+def test_files_have_north_up(tmp_path: Path) -> None:
+    detection = dr.detect(fit())
+    images = sky_images(detection)
+    paths = images.write(tmp_path)
+    assert [path.name for path in paths] == ["cleaned.fits", "flux.fits"]
+    for path in paths:
+        with fits.open(path) as hdus:
+            names = [hdu.name for hdu in hdus[1:]]
+            assert names == ["IMAGE", "ERROR", "THROUGHPUT"][: len(names)]
+            header, image = hdus["IMAGE"].header, hdus["IMAGE"].data
+            star = WCS(header).wcs.crpix - 1
+            y, x = np.unravel_index(np.nanargmax(image / hdus["ERROR"].data), image.shape)
+            place = (np.array([x, y]) - star) * sky().pixelscale
+            np.testing.assert_allclose(place, PLACE, atol=1.1 * sky().pixelscale)
+    # The planet's flux, as the brightest pixel of it without a mask, within 4 standard deviations.
+    error = images.flux_error[y, x]
+    truth = (
+        2e-4
+        * images.flux[y, x]
+        / detection.contrast[
+            np.nanargmax(detection.snr) // SIZE, np.nanargmax(detection.snr) % SIZE
+        ]
+    )
+    assert abs(images.flux[y, x] - truth) < 4 * error
+
+
+def test_interpolation_turns_a_smooth_image_exactly_enough() -> None:
+    y, x = np.indices((21, 23)).astype(float)
+    image = np.exp(-((x - 11.3) ** 2 + (y - 9.6) ** 2) / (2 * 1.5**2))
+    places = np.random.default_rng(1).uniform(4, 16, (50, 2))
+    expected = np.exp(-((places - (11.3, 9.6)) ** 2).sum(axis=1) / (2 * 1.5**2))
+    found = interpolation_matrix(places, image.shape) @ image.ravel()
+    # Lanczos' kernel of three pixels, for a source of 3.5 pixels FWHM.
+    np.testing.assert_allclose(found, expected, atol=6e-3)
+
+
+def test_a_fit_without_a_linear_model_has_no_image() -> None:
+    with pytest.raises(RefinementError, match="linear model"):
+        SkyModel([replace(fit(), linear=None)])
