@@ -103,11 +103,6 @@ def sky_images(detection: Detection) -> SkyImages:
     ----------
     detection : Detection
         With its fits.
-
-    Raises
-    ------
-    RefinementError
-        If a fit has no linear model.
     """
     fits_ = detection.fits
     model, first = SkyModel(fits_), fits_[0].frames[0]

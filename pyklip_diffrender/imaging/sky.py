@@ -29,7 +29,6 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from pyklip_diffrender.detection.groups import groups_of
-from pyklip_diffrender.errors import RefinementError
 from pyklip_diffrender.imaging.interpolation import interpolation_matrix
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.refinement import Refinement
@@ -72,7 +71,6 @@ class SkyModel:
     Parameters
     ----------
     fits : sequence of Refinement
-        With linear models.
     strength : float
         Standard deviation of the prior over the noise of the frames.
 
@@ -87,19 +85,9 @@ class SkyModel:
     grid : ndarray, (ny, nx, 2)
         x, y of the sky's pixels from the star, arcsec; y to the north and x to the west if the
         orientation of the frames is known, else along the axes of the first frame.
-
-    Raises
-    ------
-    RefinementError
-        If a fit has no linear model.
     """
 
     def __init__(self, fits: Sequence[Refinement], strength: float = _STRENGTH) -> None:
-        for fit in fits:
-            if fit.linear is None:
-                raise RefinementError(
-                    "an image of the sky needs the linear model of a fit by GaussNewton", fit
-                )
         self.groups = groups_of(fits)
         first = fits[0].frames[0]
         self.pixelscale = math.sqrt(math.prod(first.observation.pixelscale))

@@ -39,16 +39,15 @@ def image_of(settings: DiffrenderSettings, subtraction: Subtraction, real: bool)
     Raises
     ------
     IncompatibleSetupError
-        If the image that is asked for needs a linear model, and a fit has none.
+        If the image that is asked for needs a linear model, and there is none.
     """
-    fits = [part.result for part in subtraction.pointings]
-    linear = bool(fits) and all(fit.linear is not None for fit in fits)
+    fitted = bool(subtraction.pointings)
     if settings.image is None:
-        return "cleaned" if linear and real else "subtracted"
-    if settings.image != "subtracted" and not linear:
+        return "cleaned" if fitted and real else "subtracted"
+    if settings.image != "subtracted" and not fitted:
         raise IncompatibleSetupError(
-            f"image: {settings.image!r} needs the linear model of a fit by GaussNewton, which a "
-            "subtractor of your own and the Adam recipe do not have. Use image='subtracted'"
+            f"image: {settings.image!r} needs the linear model of a fit, which a subtractor of "
+            "your own does not have. Use image='subtracted'"
         )
     return settings.image
 
@@ -59,7 +58,7 @@ class ProductImages:
     Parameters
     ----------
     subtraction : Subtraction
-        With linear models.
+        With the fits of its pointings.
     """
 
     def __init__(self, subtraction: Subtraction) -> None:
