@@ -292,7 +292,7 @@ def _read(path: str, dataset: Any) -> _File:
         center += offset / np.sqrt(science["PIXAR_A2"])
     centers = np.tile(center, (len(as_read), 1))
     try:
-        frames = Observation.from_fits(path)
+        frames = Observation.from_fits(path, every_integration=True)
     except (CorruptFileError, NoValidPixelsError) as reason:
         # Such as a file without errors, or a frame of which all pixels are flagged.
         logger.warning("only the pixels and flags are used: %s", reason)
