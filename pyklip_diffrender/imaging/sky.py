@@ -61,6 +61,9 @@ _STEP = 2
 _APART = 6
 """Places of one comb are this many steps apart, so far that they do not matter to each other."""
 
+_DRAWS = 3
+"""Random signs of a comb for the noise, over which the result is averaged."""
+
 _BATCH = 12
 """Right-hand sides that are solved together."""
 
@@ -286,31 +289,39 @@ class SkyModel:
             light.append({k: torch.stack(each) for k, each in sums.items()})
         return light, peaks
 
-    def deviation(self) -> Image:
+    def deviation(self, seed: int = 0) -> Image:
         """Standard deviation of the estimate from noise and star, (ny, nx).
 
         The covariance of the estimate u is A^-1 - A^-2 with A = 1 + B^T Sigma^-1 B. Its diagonal
-        is found with combs of places that are too far apart to be correlated.
+        is found with combs of places so far apart that the noise is hardly correlated. They have
+        random signs, so that what correlation the star leaves averages out.
+
+        Parameters
+        ----------
+        seed : int
+            Of the signs.
         """
         side = self.shape[0]
         nodes = np.arange(self.center % _STEP, side, _STEP)
         number = np.arange(len(nodes)) % _APART
+        generator = np.random.default_rng(seed)
         variance = np.zeros((len(nodes), len(nodes)))
-        pairs = [(a, b) for a in range(_APART) for b in range(_APART)]
-        for some in _batches(np.arange(len(pairs))):
-            combs = np.zeros((len(some), *self.shape))
-            for comb, k in zip(combs, some, strict=True):
-                a, b = pairs[int(k)]
-                comb[np.ix_(nodes[number == a], nodes[number == b])] = 1.0
-            once = self._solved(self._white(combs))
+        pairs = [(a, b) for a in range(_APART) for b in range(_APART)] * _DRAWS
+        for start in range(0, len(pairs), _BATCH):
+            combs = []
+            for a, b in pairs[start : start + _BATCH]:
+                places = np.outer(number == a, number == b)
+                signs = places * generator.choice([-1.0, 1.0], places.shape)
+                combs.append(np.zeros(self.shape))
+                combs[-1][np.ix_(nodes, nodes)] = signs
+            once = self._solved(self._white(np.array(combs)))
             spread = self._sky(once - self._solved(once))
-            for image, k in zip(spread, some, strict=True):
-                a, b = pairs[int(k)]
-                inside = np.ix_(nodes[number == a], nodes[number == b])
-                variance[np.ix_(number == a, number == b)] = image[inside]
+            for comb, image in zip(combs, spread, strict=True):
+                variance += (comb * image)[np.ix_(nodes, nodes)] / _DRAWS
         between = RegularGridInterpolator(
-            (nodes, nodes), np.sqrt(np.maximum(variance, 0.0)), bounds_error=False, fill_value=None
-        )
+            (nodes, nodes), np.sqrt(np.maximum(gaussian_filter(variance, _SMOOTH / _STEP), 0.0)),
+            bounds_error=False, fill_value=None,
+        )  # fmt: skip
         every = np.moveaxis(np.indices(self.shape), 0, -1)
         return np.where(self.covered, between(every), np.nan)
 
