@@ -24,7 +24,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
@@ -56,13 +55,13 @@ _TOLERANCE = 1e-3
 _ITERATIONS = 200
 
 _STEP = 2
-"""Pixels between the places at which throughput and noise are computed."""
+"""Pixels between the places at which the throughput is computed."""
 
 _APART = 6
 """Places of one comb are this many steps apart, so far that they do not matter to each other."""
 
-_DRAWS = 3
-"""Random signs of a comb for the noise, over which the result is averaged."""
+_FEW = 4
+"""Number of places in a ring below which its throughput is that of its neighbours."""
 
 _BATCH = 12
 """Right-hand sides that are solved together."""
@@ -83,8 +82,8 @@ class SkyModel:
         (ny, nx) of the sky.
     center : int
         Row and column of the star in it.
-    pixelscale : float
-        arcsec.
+    pixelscale, resolution : float
+        Side of a pixel and lambda/D, arcsec.
     grid : ndarray, (ny, nx, 2)
         x, y of the sky's pixels from the star, arcsec; y to the north and x to the west if the
         orientation of the frames is known, else along the axes of the first frame.
@@ -107,9 +106,9 @@ class SkyModel:
             for _, templates in self.groups
         ]  # fmt: skip
         model = first.model
-        resolution = float(model.bandpass.mean_wavelength) / model.diameter / ARCSEC
+        self.resolution = float(model.bandpass.mean_wavelength) / model.diameter / ARCSEC
         # The FWHM of a point source is lambda/D.
-        width = resolution / self.pixelscale / math.sqrt(8 * math.log(2))
+        width = self.resolution / self.pixelscale / math.sqrt(8 * math.log(2))
         frequency = np.fft.fftfreq(side)[:, None] ** 2 + np.fft.rfftfreq(side) ** 2
         core = np.exp(-2 * (math.pi * width) ** 2 * frequency)
         self._core = core / np.linalg.norm(np.fft.irfft2(core, s=self.shape))
@@ -138,15 +137,6 @@ class SkyModel:
                 information += np.asarray(matrix.T @ weight).reshape(self.shape)
         information = gaussian_filter(np.maximum(information, 0.0), _SMOOTH)
         return np.asarray(np.maximum(information, 1e-6 * information.max()) ** -0.5)
-
-    @property
-    def covered(self) -> NDArray[np.bool_]:
-        """Pixels of the sky that at least one frame shows, (ny, nx)."""
-        total = np.zeros(self.shape)
-        for matrices in self._onto_frames:
-            for matrix in matrices.values():
-                total += np.asarray(matrix.sum(axis=0)).reshape(self.shape)
-        return total > 0.5
 
     def light(self) -> Light:
         """What the frames show beside the star, (1, ny, nx) by frame."""
@@ -232,10 +222,10 @@ class SkyModel:
         return self._sky(self._solved(self._white(self._collected(images))))
 
     def throughput(self, seed: int = 0) -> Image:
-        """Fraction of the peak of a faint point source that the estimate keeps.
+        """Fraction of the peak of a faint point source that the estimate keeps, by separation.
 
-        Sources in combs, with random signs, are measured together; between them the fraction is
-        interpolated.
+        Sources in combs, with random signs, are measured together. What they change in the star
+        at each other's places averages out over the median of a ring of lambda/D.
 
         Parameters
         ----------
@@ -249,7 +239,7 @@ class SkyModel:
         """
         first = self.groups[0][1].origin
         ny, nx = first.observation.shape
-        rows, columns = (np.unique(np.append(np.arange(0, n, _STEP), n - 1)) for n in (ny, nx))
+        rows, columns = (np.arange(0, n, _STEP) for n in (ny, nx))
         y, x = (each.ravel() for each in np.meshgrid(rows, columns, indexing="ij"))
         comb = (y // _STEP % _APART) * _APART + x // _STEP % _APART
         signs = np.random.default_rng(seed).choice([-1.0, 1.0], len(y))
@@ -263,8 +253,11 @@ class SkyModel:
                 places = self.places(first.grid[y[chosen], x[chosen]], angle)
                 seen = interpolation_matrix(places, self.shape) @ sky.ravel()
                 kept[chosen] = signs[chosen] * seen / peak
-        between = RegularGridInterpolator((rows, columns), kept.reshape(len(rows), len(columns)))
-        return np.asarray(between(np.moveaxis(np.indices((ny, nx)), 0, -1)))
+        distance = np.hypot(*np.moveaxis(first.grid, -1, 0)) / self.resolution
+        ring = distance[y, x].astype(np.int64)
+        known = [k for k in np.unique(ring) if (ring == k).sum() >= _FEW]
+        medians = [float(np.median(kept[ring == k])) for k in known]
+        return np.asarray(np.interp(distance, np.array(known) + 0.5, medians))
 
     def _sources(
         self,
@@ -288,42 +281,6 @@ class SkyModel:
                     peaks.append(seen[np.arange(len(chosen)), rows[chosen], columns[chosen]])
             light.append({k: torch.stack(each) for k, each in sums.items()})
         return light, peaks
-
-    def deviation(self, seed: int = 0) -> Image:
-        """Standard deviation of the estimate from noise and star, (ny, nx).
-
-        The covariance of the estimate u is A^-1 - A^-2 with A = 1 + B^T Sigma^-1 B. Its diagonal
-        is found with combs of places so far apart that the noise is hardly correlated. They have
-        random signs, so that what correlation the star leaves averages out.
-
-        Parameters
-        ----------
-        seed : int
-            Of the signs.
-        """
-        side = self.shape[0]
-        nodes = np.arange(self.center % _STEP, side, _STEP)
-        number = np.arange(len(nodes)) % _APART
-        generator = np.random.default_rng(seed)
-        variance = np.zeros((len(nodes), len(nodes)))
-        pairs = [(a, b) for a in range(_APART) for b in range(_APART)] * _DRAWS
-        for start in range(0, len(pairs), _BATCH):
-            combs = []
-            for a, b in pairs[start : start + _BATCH]:
-                places = np.outer(number == a, number == b)
-                signs = places * generator.choice([-1.0, 1.0], places.shape)
-                combs.append(np.zeros(self.shape))
-                combs[-1][np.ix_(nodes, nodes)] = signs
-            once = self._solved(self._white(np.array(combs)))
-            spread = self._sky(once - self._solved(once))
-            for comb, image in zip(combs, spread, strict=True):
-                variance += (comb * image)[np.ix_(nodes, nodes)] / _DRAWS
-        between = RegularGridInterpolator(
-            (nodes, nodes), np.sqrt(np.maximum(gaussian_filter(variance, _SMOOTH / _STEP), 0.0)),
-            bounds_error=False, fill_value=None,
-        )  # fmt: skip
-        every = np.moveaxis(np.indices(self.shape), 0, -1)
-        return np.where(self.covered, between(every), np.nan)
 
     def pixels_in_frame(self, grid: Image, angle: float) -> Image:
         """Row and column in a frame, (ny, nx, 2), of the pixels of the sky.

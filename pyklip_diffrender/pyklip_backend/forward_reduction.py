@@ -20,7 +20,6 @@ from pyklip_diffrender.pyklip_backend.forward_model import (
     is_planet,
     planet_in_frames,
 )
-from pyklip_diffrender.pyklip_backend.frames import Frames
 from pyklip_diffrender.pyklip_backend.placement import fill
 from pyklip_diffrender.pyklip_backend.planet_fit import planet_cards
 from pyklip_diffrender.pyklip_backend.reduction import Reduction
@@ -43,7 +42,7 @@ class ForwardReduction(Reduction):
         check_forward_model(self.fm_class, self.settings)
         super()._check()
 
-    def _image(self, subtraction: Subtraction, frames: Frames) -> str:
+    def _image(self, subtraction: Subtraction) -> str:
         """Return "subtracted": the forward model is that of a planet in the frames minus star."""
         return "subtracted"
 

@@ -308,9 +308,9 @@ class Reduction:
         kept = throughput_map(result)
         return np.ones_like(kept) if record.image == "flux" else kept
 
-    def _image(self, subtraction: Subtraction, frames: Frames) -> str:
+    def _image(self, subtraction: Subtraction) -> str:
         """Return which image the products carry."""
-        return image_of(self.settings, subtraction, frames.observation.is_nircam)
+        return image_of(self.settings, subtraction)
 
     def _settings_at(self, wave: float) -> DiffrenderSettings:
         """The settings with the model for this wavelength."""
@@ -370,7 +370,7 @@ class Reduction:
                 subtraction.worst.result,
             )
         filled = sum(map(fill, residuals, observation.valid))
-        image = self._image(subtraction, frames)
+        image = self._image(subtraction)
         record = ReductionRecord(frames, opd, subtraction, filled, image)
         if image != "subtracted":
             self._tell(f"image of the products: {image}")

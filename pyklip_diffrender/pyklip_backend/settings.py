@@ -104,12 +104,12 @@ class DiffrenderSettings:
         NIRCam frames, else False. Undetected companions still lose light, as much as the
         throughput map says.
     image : {"cleaned", "subtracted", "flux"}, optional
-        Image that the products carry. "cleaned", the default for real NIRCam frames, is the
-        posterior mean of the sky from all rolls together, see `imaging.SkyModel`; every frame has
-        it on its own pixels, so that pyKLIP's mean or median of the frames is the same image.
-        "subtracted", the default for others and always the image of forward models, is each frame
-        minus its star. "flux" is the brightest pixel, without a mask, of the point source at every
-        pixel that fits the frames best. Pixels beyond the fitted square have the frames minus star.
+        Image that the products carry. "subtracted", the default and always that of forward models,
+        is each frame minus its star. "cleaned" is the posterior mean of the sky from all rolls
+        together, see `imaging.SkyModel`; every frame has it on its own pixels, so that pyKLIP's
+        mean or median of the frames is the same image. "flux" is the brightest pixel, without a
+        mask, of the point source at every pixel that fits the frames best. Pixels beyond the
+        fitted square have the frames minus star.
     max_chi2 : float, optional
         Reduced chi-squared above which a fit is implausible and the reduction stops with a
         `RefinementError`; 100 by default, inf for no limit.
