@@ -32,6 +32,7 @@ PACKAGES = (
     "refinement",
     "pattern",
     "detection",
+    "imaging",
     "reduction",
     "pyklip_backend",
     "spaceklip",

@@ -251,8 +251,9 @@ def test_a_concatenation_from_frames_to_sources(
     )  # fmt: skip
     database.obs[KEY] = concatenation(files)
     detections = spaceklip.run_obs(
-        database, opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED, save_rolls=True
-    )
+        database, opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED, save_rolls=True,
+        image="subtracted",
+    )  # fmt: skip
     assert list(detections) == list(database.red) == [KEY]
     (sources,) = database.src[KEY] if kind == "real" else database.src[KEY].values()
     assert len(sources) == 1
@@ -344,14 +345,16 @@ def test_spaceklips_own_injections_need_one_fit(
         "mode": "ADI", "annuli": 1, "subsections": 1, "numbasis": [1], "movement": 1,
         "calibrate_flux": False, "highpass": False, "verbose": False, "outputdir": f"{tmp_path}/",
     }  # fmt: skip
-    with backend(opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED):
+    with backend(
+        opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED, image="subtracted"
+    ):
         dataset = JWST.JWSTData(files, None, highpass=False)
         before = copy.deepcopy(dataset)
         klip_dataset(dataset, fileprefix="once", **options)
     monkeypatch.setattr(reduction, "subtract_by_refinement", None)
     y, x = np.indices((25, 25)) - 12
     peak = 1e-3 * FLUX * float(model(OPD.data, star_offset=(0.8, 0.0)).max())
-    with backend(injected_into=dataset):
+    with backend(injected_into=dataset, image="subtracted"):
         _, _, injected, retrieved = tools.inject_and_recover(
             before, np.exp(-(x**2 + y**2) / 2), np.array([8.0, 13.0]), np.array([20.0, 250.0]),
             None, np.full(2, peak), {**options, "algo": "klip"}, 2.35,

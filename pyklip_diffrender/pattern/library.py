@@ -1,4 +1,4 @@
-"""Patterns of the model's error that were measured on other stars and come with the package.
+"""Flat-field patterns that were measured on other stars and come with the package.
 
 The table was made by ``examples/make_pattern_library.py`` from frames of JWST programme 1184.
 """
@@ -39,7 +39,7 @@ def known_systematics(
     *,
     library: bool = True,
 ) -> Systematics | None:
-    """Pattern of the model's error from reference stars and from the package's own library.
+    """Combine the flat-field pattern of reference stars and that of the package's own library.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Learning the pattern of the model's error from stars other than the target."""
+"""Learn the flat-field pattern from stars other than the target."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pattern.pedestal import (
+    FEW_PIXELS,
+    OUTLIER,
     light_and_residual,
     median_variance,
     pattern_pedestal,
@@ -28,13 +30,6 @@ __all__ = [
 ]
 
 Image = NDArray[np.float64]
-
-_FEW = 50
-"""Number of pixels below which a ring is not used for that."""
-
-_OUTLIER = 4.0
-"""Standard deviations from the median of the frames beyond which a pixel of a frame is left out:
-a companion or background source of that star, or a cosmic ray."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +210,7 @@ def _measured(frame: FrameFit, pedestal: float) -> MeasuredPattern:
 def _on_common_pixels(
     patterns: Sequence[MeasuredPattern],
 ) -> tuple[Image, Image, tuple[float, float], tuple[int, int] | None]:
-    """Values and variances on an array that holds all patterns, each pixel on one of them.
+    """Put values and variances on an array that holds all patterns, each pixel on one of them.
 
     Pixels are matched on the detector where all patterns say which ones they have, else by the
     position of the star.
@@ -297,7 +292,7 @@ def _noise_ratio(values: Image, variances: Image, ring: NDArray[np.int64]) -> Im
         noise = variances[a] + variances[b]
         for k in range(count):
             inside = np.isfinite(noise) & (ring == k)
-            if inside.sum() < _FEW:
+            if inside.sum() < FEW_PIXELS:
                 continue
             deviations = (values[a] - values[b])[inside] / np.sqrt(noise[inside])
             total[k] += inside.sum() * median_variance(deviations)
@@ -312,7 +307,7 @@ def _outliers(values: Image, variances: Image) -> NDArray[np.bool_]:
     if len(values) < 3:
         return ~known
     middle = np.ma.median(np.ma.array(values, mask=~known), axis=0).filled(0.0)
-    return ~known | (np.abs(values - middle) > _OUTLIER * np.sqrt(variances))
+    return ~known | (np.abs(values - middle) > OUTLIER * np.sqrt(variances))
 
 
 def _prior_width(values: Image, variances: Image, ring: NDArray[np.int64]) -> Image:

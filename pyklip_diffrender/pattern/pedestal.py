@@ -1,4 +1,4 @@
-"""The pedestal of a pattern: light that it multiplies besides the star."""
+"""The pedestal of a pattern: light besides the star that the pattern multiplies."""
 
 from __future__ import annotations
 
@@ -13,7 +13,14 @@ from scipy.optimize import minimize_scalar
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.result import Refinement
 
-__all__ = ["light_and_residual", "median_variance", "pattern_pedestal", "rings_about"]
+__all__ = [
+    "FEW_PIXELS",
+    "OUTLIER",
+    "light_and_residual",
+    "median_variance",
+    "pattern_pedestal",
+    "rings_about",
+]
 
 Image = NDArray[np.float64]
 
@@ -24,8 +31,8 @@ _FIRST_RING = 2
 """First ring from which the pedestal is estimated: closer to the star, residuals are
 also those of the wavefront."""
 
-_FEW = 50
-"""Number of pixels below which a ring is not used for that."""
+FEW_PIXELS = 50
+"""Number of pixels below which no scatter is estimated in a ring."""
 
 _RING_TO_RING = 0.2
 """Relative error of a ring's mean product, because the pattern is not the same in all of them."""
@@ -36,7 +43,7 @@ _DIFFERENT = 1.5
 _ROBUST = 2.0
 """Deviation, in standard deviations, of half weight."""
 
-_OUTLIER = 4.0
+OUTLIER = 4.0
 """Standard deviations from the median of the frames beyond which a pixel of a frame is left out:
 a companion or background source of that star, or a cosmic ray."""
 
@@ -134,11 +141,11 @@ def _products(fit: Refinement) -> list[tuple[float, float, float, float]]:
         for k in range(_FIRST_RING, ring.max() + 1):
             inside = (ring == k) & valid & valid_b
             products = (left * left_b)[inside]
-            if len(products) < _FEW:
+            if len(products) < FEW_PIXELS:
                 continue
             # Clipped, because companions and outliers are no part of the pattern.
             variances = [median_variance(each[inside]) for each in (left, left_b)]
-            limit = _OUTLIER * np.sqrt(np.prod(variances))
+            limit = OUTLIER * np.sqrt(np.prod(variances))
             mean = float(np.clip(products, -limit, limit).mean())
             scatter = float(np.sqrt((noise**2).mean() * (noise_b**2).mean() / len(products)))
             rings.append(

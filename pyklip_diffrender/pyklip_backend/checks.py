@@ -11,6 +11,7 @@ import numpy as np
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
 from pyklip_diffrender.pyklip_backend.frames import require_frames
+from pyklip_diffrender.pyklip_backend.images import IMAGES
 from pyklip_diffrender.pyklip_backend.references import require_same_setup
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE as SOURCE
@@ -75,6 +76,15 @@ def check_settings(settings: DiffrenderSettings) -> None:
     """Raise for settings of the default subtractor that it could not use."""
     if settings.threads is not None and settings.threads < 1:
         raise IncompatibleSetupError(f"threads: got {settings.threads}, expected 1 or more")
+    if settings.image not in (None, *IMAGES):
+        raise IncompatibleSetupError(
+            f"image: got {settings.image!r}, expected one of {', '.join(IMAGES)}"
+        )
+    if settings.image == "flux" and settings.injected_into is not None:
+        raise IncompatibleSetupError(
+            "image='flux': for copies with added sources there are the images 'cleaned' and "
+            "'subtracted' only"
+        )
     if settings.subtractor is not None:
         return
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph

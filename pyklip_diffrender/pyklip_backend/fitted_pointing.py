@@ -174,6 +174,13 @@ class FittedPointing:
             fov_pixels=box.shape, center=(x, y), background=False, source=source
         )
 
+    def mean_light(self, light: Image) -> Image:
+        """Average light in all frames, (n, Ny, Nx), as the fit averages the frames: (ny, nx)."""
+        group = self.pointing.observation
+        weight = np.where(group.valid, group.error, np.inf) ** -2.0
+        total = np.sum(weight * np.nan_to_num(light[self.pointing.frames]), axis=0)
+        return self.cut(total / np.maximum(weight.sum(axis=0), np.finfo(float).tiny))
+
     def cut(self, image: Image) -> Image:
         """Cut the fitted square out of a frame, as it was fitted: (ny, nx)."""
         cut = self.window.cut(image[np.newaxis], 0.0)

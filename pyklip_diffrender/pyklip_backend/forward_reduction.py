@@ -24,6 +24,7 @@ from pyklip_diffrender.pyklip_backend.placement import fill
 from pyklip_diffrender.pyklip_backend.planet_fit import planet_cards
 from pyklip_diffrender.pyklip_backend.reduction import Reduction
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["ForwardReduction"]
@@ -40,6 +41,10 @@ class ForwardReduction(Reduction):
     def _check(self) -> None:
         check_forward_model(self.fm_class, self.settings)
         super()._check()
+
+    def _image(self, subtraction: Subtraction) -> str:
+        """Return "subtracted": the forward model is that of a planet in the frames minus star."""
+        return "subtracted"
 
     @property
     def _verbose(self) -> bool:

@@ -46,12 +46,7 @@ def subtract_from_copy(record: ReductionRecord, frames: Frames) -> Subtraction:
         parts = [part for part in before.pointings if part.result is result]
         light = {}
         for part in parts:
-            group = part.pointing.observation
-            # As the frames of a pointing are averaged for the fit.
-            weight = np.where(group.valid, group.error, np.inf) ** -2.0
-            total = np.sum(weight * np.nan_to_num(added[part.pointing.frames]), axis=0)
-            mean = total / np.maximum(weight.sum(axis=0), np.finfo(float).tiny)
-            light[part.index] = torch.from_numpy(part.cut(mean))[None]
+            light[part.index] = torch.from_numpy(part.mean_light(added))[None]
         change = result.linear.response(light)[:, 0]
         for part in parts:
             star[part.pointing.frames] += part.change_in_frames(change)

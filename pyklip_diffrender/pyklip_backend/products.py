@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from astropy.time import Time
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.pyklip_backend.frames import Frames
+from pyklip_diffrender.pyklip_backend.images import ProductImages
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.wavefront.opd import OPDMap
 
@@ -38,12 +40,20 @@ class ReductionRecord:
         The fitted star.
     filled : int
         Flagged pixels that were replaced after the subtraction.
+    image : str
+        Image that the products carry, see `DiffrenderSettings`.
     """
 
     frames: Frames
     opd: OPDMap
     subtraction: Subtraction
     filled: int
+    image: str = "subtracted"
+
+    @cached_property
+    def images(self) -> ProductImages:
+        """Other images of the frames."""
+        return ProductImages(self.subtraction)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ReductionRecord:
         """Itself: it never changes, and a contrast curve copies its dataset 120 times."""
@@ -138,6 +148,7 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         ),
         ("DRPIXELS", _shared(r.frames.pixels for r in records), "pixels that were fitted"),
         ("DRFILLED", sum(r.filled for r in records), "flagged pixels replaced by neighbours"),
+        ("DRIMAGE", _shared(r.image for r in records), "image in the products"),
         ("DRNOISE", _shared(r.frames.noise for r in records), "where the errors came from"),
     ]
     dates = [pointing.observation.date for pointing in first.frames.pointings]

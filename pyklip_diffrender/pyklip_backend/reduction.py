@@ -27,6 +27,7 @@ from pyklip_diffrender.pyklip_backend.checks import (
     check_settings,
 )
 from pyklip_diffrender.pyklip_backend.frames import Frames, date_of_frames, frames_of
+from pyklip_diffrender.pyklip_backend.images import image_of
 from pyklip_diffrender.pyklip_backend.injections import subtract_from_copy
 from pyklip_diffrender.pyklip_backend.placement import (
     aligned_before,
@@ -54,7 +55,7 @@ from pyklip_diffrender.pyklip_backend.settings import (
     thread_limit,
 )
 from pyklip_diffrender.pyklip_backend.source import attach_source
-from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
+from pyklip_diffrender.pyklip_backend.subtract import Subtraction, subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.throughput import (
     on_product,
     throughput_map,
@@ -280,10 +281,10 @@ class Reduction:
         self._tell("throughput of faint sources")
         dataset, maps = self.dataset, []
         center = np.asarray(dataset.output_centers[0], dtype=float)
-        for k, result in enumerate(results):
+        for k, (record, result) in enumerate(zip(self.records, results, strict=True)):
             frame = result.frames[0].observation
             turned = on_product(
-                throughput_map(result),
+                self._throughput(record, result),
                 frame.center[0],
                 dataset.output.shape[-2:],
                 center,
@@ -299,6 +300,17 @@ class Reduction:
         )
         cube = np.where(np.isnan(cube), 1.0, np.where(np.isinf(cube), np.nan, cube))
         write_throughput(stage / f"{prefix}-throughput.fits", cube, center)
+
+    def _throughput(self, record: ReductionRecord, result: Any) -> NDArray[np.float64]:
+        """Fraction of a faint source's peak that the products have, on the first frame's pixels."""
+        if record.image == "cleaned":
+            return record.images.sky.throughput()
+        kept = throughput_map(result)
+        return np.ones_like(kept) if record.image == "flux" else kept
+
+    def _image(self, subtraction: Subtraction) -> str:
+        """Return which image the products carry."""
+        return image_of(self.settings, subtraction)
 
     def _settings_at(self, wave: float) -> DiffrenderSettings:
         """The settings with the model for this wavelength."""
@@ -358,7 +370,15 @@ class Reduction:
                 subtraction.worst.result,
             )
         filled = sum(map(fill, residuals, observation.valid))
-        self.records.append(ReductionRecord(frames, opd, subtraction, filled))
+        image = self._image(subtraction)
+        record = ReductionRecord(frames, opd, subtraction, filled, image)
+        if image != "subtracted":
+            self._tell(f"image of the products: {image}")
+            # The model of the sky is that of the fit, also for copies with added sources.
+            original = before[len(self.records)] if before else record
+            added = frames.data - original.frames.data if before else None
+            original.images.put_into(residuals, image, added)
+        self.records.append(record)
         residuals *= frames.factor[:, np.newaxis, np.newaxis]
         if self._filter is not None:
             residuals = np.array([self._filter(residual) for residual in residuals])

@@ -1,0 +1,139 @@
+"""Depth of the image in pyKLIP's products: this package and KLIP, by pyKLIP's own yardstick.
+
+Run from the root of the project, with the frames of programme 1184 in ../shared/data/gto1184::
+
+    python -m benchmarks.images --target G-7-34 --filter F444W
+
+The rolls of a target are reduced with KLIP (ADI+RDI, all other stars as references, 1 to 5 modes)
+and with this package (image "cleaned"). The noise of each product is that
+of `pyklip.klip.meas_contrast`; its throughput is that of planets injected with
+`fakes.inject_planet`, a few times brighter than the noise so that both algorithms are linear, and
+measured with `fakes.retrieve_planet_flux`. It prints 5-sigma limits in the unit of the injected
+peaks, raw and after the Gaussian filter of `meas_contrast`, which both products get then.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import copy
+import io
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pyklip import fakes
+from pyklip.instruments.JWST import JWSTData
+from pyklip.klip import meas_contrast
+from pyklip.parallelized import klip_dataset
+
+import pyklip_diffrender as dr
+
+Image = NDArray[np.float64]
+
+SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])
+ANGLES = np.arange(20.0, 380.0, 60.0)
+MODES = [1, 2, 3, 4, 5]
+STRENGTH = 8.0
+"""Peaks of the injected planets over the standard deviation of the pixels of the ring."""
+
+
+def reduced(dataset: Any, algo: str, modes: list[int]) -> Image:
+    """Run `klip_dataset`; the images by number of modes, (modes, ny, nx)."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        contextlib.redirect_stdout(io.StringIO()),
+        contextlib.redirect_stderr(io.StringIO()),
+    ):
+        klip_dataset(
+            dataset, mode="ADI+RDI", outputdir=folder, fileprefix="x", annuli=1, subsections=1,
+            numbasis=modes, movement=0, numthreads=1, psf_library=dataset.psflib,
+            time_collapse="mean", algo=algo, verbose=False,
+        )  # fmt: skip
+    return np.asarray(np.nanmean(dataset.output[:, :, 0], axis=1), dtype=float)
+
+
+def limits(image: Image, center: Image, scale: float, fwhm: float, smooth: bool) -> Image:
+    """5-sigma limits of `meas_contrast` at the separations, before throughput."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # Rings without pixels.
+        seps, contrast = meas_contrast(
+            image, SEPARATIONS[0] / scale - fwhm, SEPARATIONS[-1] / scale + 2 * fwhm, fwhm,
+            center=tuple(center), low_pass_filter=smooth,
+        )  # fmt: skip
+    return np.interp(SEPARATIONS, seps * scale, contrast)
+
+
+def main() -> None:
+    """Compare the depths at several separations."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--frames", type=Path, default=Path("../shared/data/gto1184"))
+    parser.add_argument("--opd", type=Path, default=Path("../shared/data/opd_2022-08-14.fits.gz"))
+    parser.add_argument("--target", default="G-7-34")
+    parser.add_argument("--filter", default="F444W")
+    options = parser.parse_args()
+    sequence = dr.Sequence.from_files(options.frames, target=options.target, filter=options.filter)
+    names = [
+        [str(next(options.frames.rglob(Path(each.name).name))) for each in part]
+        for part in (sequence.science, sequence.references)
+    ]
+    dr.register(opd=options.opd)
+    dataset = JWSTData(*names, center_include_offset=False)
+    plain = {"KLIP": copy.deepcopy(dataset), "cleaned": copy.deepcopy(dataset)}
+    plain["cleaned"].diffrender = dr.DiffrenderSettings(image="cleaned")
+    images = {
+        "KLIP": reduced(plain["KLIP"], "klip", MODES),
+        "cleaned": reduced(plain["cleaned"], "diffrender", [1]),
+    }
+    fit = plain["cleaned"].diffrender_results[0].subtraction.fits[0].result
+    model = fit.model
+    scale = float(np.mean(model.detector.pixelscale))
+    resolution = float(model.bandpass.mean_wavelength) / model.diameter
+    fwhm = float(np.degrees(resolution)) * 3600 / scale
+    center = np.asarray(plain["KLIP"].output_centers[0], dtype=float)
+    print(f"{options.target} {options.filter}: {fit!r}")
+    kept = {name: np.zeros((len(each), len(SEPARATIONS))) for name, each in images.items()}
+    noise = limits(images["KLIP"][0], center, scale, fwhm, False) / 5
+    for angle in ANGLES:
+        for k, separation in enumerate(SEPARATIONS):
+            peak = STRENGTH * noise[k]
+            place = (separation / scale, angle + 137.5 * k)
+            for name in images:
+                copied = copy.deepcopy(dataset)
+                if name == "cleaned":
+                    copied.diffrender = dr.DiffrenderSettings(
+                        image="cleaned", injected_into=plain["cleaned"]
+                    )
+                fakes.inject_planet(
+                    copied.input, copied.centers, [peak] * len(copied.input), copied.wcs,
+                    *place, fwhm=fwhm,
+                )  # fmt: skip
+                algo, modes = ("klip", MODES) if name == "KLIP" else ("diffrender", [1])
+                for m, image in enumerate(reduced(copied, algo, modes) - images[name]):
+                    flux = fakes.retrieve_planet_flux(
+                        image, center, copied.output_wcs[0], *place, searchrad=4, guessfwhm=fwhm
+                    )
+                    kept[name][m, k] += flux / peak / len(ANGLES)
+    for smooth in (False, True):
+        best = {
+            name: np.min(
+                [limits(image, center, scale, fwhm, smooth) / np.maximum(left, 1e-3)
+                 for image, left in zip(each, kept[name], strict=True)],
+                axis=0,
+            )
+            for name, each in images.items()
+        }  # fmt: skip
+        ratio = best["KLIP"] / best["cleaned"]
+        print("after the Gaussian filter" if smooth else "raw", "KLIP, cleaned, ratio, kept")
+        for k, separation in enumerate(SEPARATIONS):
+            values = best["KLIP"][k], best["cleaned"][k], ratio[k]
+            print(f"{separation:.1f}  {values[0]:.3g}  {values[1]:.3g}  {values[2]:.2f}  "
+                  f"{kept['cleaned'][0, k]:.2f}")  # fmt: skip
+        print(f"median ratio {np.median(ratio):.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,7 @@
+"""The image of the sky about a star: everything that is neither the star nor the detector."""
+
+from __future__ import annotations
+
+from pyklip_diffrender.imaging.sky import SkyModel
+
+__all__ = ["SkyModel"]
