@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.scene.systematics import Systematics
     from pyklip_diffrender.surveys import survey
     from pyklip_diffrender.wavefront.map_choice import choose_map
-    from pyklip_diffrender.wavefront.opd import drift, random_opd, read_opd
+    from pyklip_diffrender.wavefront.opd import random_opd, read_opd
     from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
 
 __all__ = [
@@ -77,7 +77,6 @@ __all__ = [
     "choose_map",
     "contrast_curve",
     "detect",
-    "drift",
     "fetch_calints",
     "fit_disk",
     "from_poppy",
@@ -122,7 +121,7 @@ _NAMES = {
     "scene.systematics": "Systematics",
     "wavefront.map_choice": "choose_map",
     "surveys": "survey",
-    "wavefront.opd": "drift random_opd read_opd",
+    "wavefront.opd": "random_opd read_opd",
     "wavefront.priors": "WavefrontPrior learn_prior",
 }
 """Public names by the module they are in."""
