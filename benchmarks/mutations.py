@@ -140,4 +140,4 @@ def _fit(path: Path) -> None:
     opd = dr.random_opd(1, npix=128)
     frame = dr.simulate(model, dr.Scene(dr.Star(exposure=20.0)), opd, seed=3)
     settings = dr.GaussNewton(cycles=3, max_iterations=3)
-    dr.refine(model, frame, opd, settings=settings, plan="off").write(path)
+    dr.refine(model, frame, opd, settings=settings).write(path)

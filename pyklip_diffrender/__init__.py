@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from pyklip_diffrender.linear.model import LinearModel
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pattern import known_systematics, learn_systematics
-    from pyklip_diffrender.planning import Plan, plan
     from pyklip_diffrender.pyklip_backend import (
         DiffrenderSettings,
         backend,
@@ -61,7 +60,6 @@ __all__ = [
     "LinearModel",
     "Observation",
     "OpticalSystem",
-    "Plan",
     "Planet",
     "Reduction",
     "Refinement",
@@ -89,7 +87,6 @@ __all__ = [
     "model_for",
     "nircam_coronagraph",
     "observation_from_dataset",
-    "plan",
     "random_opd",
     "read_opd",
     "reduce",
@@ -108,7 +105,6 @@ _NAMES = {
     "instrument.nircam": "nircam_coronagraph",
     "linear.model": "LinearModel",
     "optics.system": "OpticalSystem",
-    "planning": "Plan plan",
     "pyklip_backend": "DiffrenderSettings backend observation_from_dataset register unregister",
     "reduction": "Reduction reduce",
     "pattern": "known_systematics learn_systematics",

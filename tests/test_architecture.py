@@ -26,7 +26,6 @@ PACKAGES = (
     "wavefront",
     "scene",
     "linear",
-    "planning",
     "refinement",
     "pattern",
     "detection",
