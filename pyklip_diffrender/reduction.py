@@ -12,6 +12,7 @@ from typing import Any
 from astropy import units as u
 from astropy.table import QTable
 
+from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import (
     Detection,
     Disk,
@@ -158,6 +159,10 @@ class Reduction:
             written.append(folder / "injections.ecsv")
             with replacing(written[-1]) as temporary:
                 self.injections.write(temporary, format="ascii.ecsv", overwrite=True)
+        figure, axes = drawing.new_figure(1, 2)
+        self.detection.plot(axes)
+        written.append(folder / "detection.png")
+        drawing.save(figure, written[-1])
         return written + report.write_report(self, folder, written)
 
 

@@ -314,9 +314,9 @@ def test_companions_are_kept_by_default_in_real_frames_only(
 ) -> None:  # fmt: skip
     calls: list[int] = []
 
-    def search(results: Any, tell: Any) -> Any:
-        calls.append(len(results))
-        return results, None
+    def search(result: Any, tell: Any) -> Any:
+        calls.append(len(result.frames))
+        return result, None
 
     monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract._with_companions", search)
     star = FLUX * small(OLD.data).numpy() + SKY
@@ -332,8 +332,8 @@ def test_companions_are_kept_by_default_in_real_frames_only(
 def test_a_second_fit_that_fails_stops_the_reduction_too(
     small: OpticalSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def worse(results: Any, tell: Any) -> Any:
-        return [replace(each, status=Status.DIVERGED) for each in results], None
+    def worse(result: Any, tell: Any) -> Any:
+        return replace(result, status=Status.DIVERGED), None
 
     monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract._with_companions", worse)
     star = FLUX * small(OLD.data).numpy() + SKY

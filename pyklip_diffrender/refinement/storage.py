@@ -252,7 +252,7 @@ def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Obs
     )
 
 
-_FRAME_ARRAYS = ("residual", "weight", "jacobian", "rows", "drift", "common")
+_FRAME_ARRAYS = ("residual", "weight", "jacobian", "rows", "drift", "common", "light")
 
 
 def linear_hdus(linear: LinearModel) -> list[Any]:
