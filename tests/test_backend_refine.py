@@ -379,7 +379,7 @@ def test_a_fit_whose_algebra_breaks_down_says_what_to_check(
     def fit(*args: Any, **kw: Any) -> None:
         torch.linalg.cholesky(-torch.eye(2))
 
-    monkeypatch.setattr("pyklip_diffrender.refinement.fitting.fit_problems", fit)
+    monkeypatch.setattr("pyklip_diffrender.refinement.fitting.fit_in_stages", fit)
     observation = Observation.from_arrays(frames, np.sqrt(frames), pixelscale=0.0624, name="roll")
     settings = DiffrenderSettings(model=small)
     with pytest.raises(RefinementError, match=r"roll: the fit broke down.*Check the star's"):

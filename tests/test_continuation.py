@@ -84,32 +84,21 @@ def pulls(fit: Refinement, k: int) -> np.ndarray:
 
 # -- more modes ----------------------------------------------------------------------------------
 
-BRANCHES = [
-    pytest.param(grown, planet, count, marks=[] if grown and count == 1 else [pytest.mark.slow])
-    for grown in (False, True)
-    for planet in (None, PLANET)
-    for count in (1, 2)
-]
 
-
-@pytest.mark.parametrize(("grown", "planet", "count"), BRANCHES)
+@pytest.mark.parametrize(
+    ("grown", "count"),
+    [pytest.param(False, 1, marks=pytest.mark.slow), (True, 1), (False, 2)],
+)
 def test_every_way_a_fit_can_go_on(
-    monkeypatch: pytest.MonkeyPatch, grown: bool, planet: Planet | None, count: int
+    monkeypatch: pytest.MonkeyPatch, grown: bool, count: int
 ) -> None:
-    """Basis grown or not, a companion found or not, one frame or two."""
+    """Basis grown or not, one frame or two."""
     monkeypatch.setattr(continuation_module, "_STRUCTURE", 0.0 if grown else math.inf)
-    frames = [shot(k, planet) for k in range(count)]
+    frames = [shot(k) for k in range(count)]
     fit = dr.refine(model(), frames, before(), settings=settings())
     assert fit.status is Status.CONVERGED
     assert len(fit.basis) == len(default_basis(CYCLES[grown]))
     assert fit.settings.cycles == CYCLES[grown:]
-    assert len(fit.companions) == (planet is not None)
-    if planet is not None:
-        ((contrast, *place),) = fit.companions
-        error = fit.companion_errors[0]
-        # The derivatives of two frames come from coarser copies than those of one.
-        assert abs(contrast - planet.contrast) < 4 * error[0] + 0.03 * planet.contrast
-        assert np.abs(np.array(place) - planet.offset).max() < 0.005
     for k, frame in enumerate(fit.frames):
         np.testing.assert_allclose(frame.render(), frame.star, rtol=1e-9)
         # Most of a star model's error is that of the modes that the data determine.
@@ -117,7 +106,6 @@ def test_every_way_a_fit_can_go_on(
     assert len(fit.linear.vector) == len(fit.linear.unknowns)
     again = refine_again(fit, max_iterations=4)
     assert len(again.basis) == len(fit.basis)
-    assert len(again.companions) == len(fit.companions)
     assert len(dr.measure(fit, [[0.3, -0.5]])) == 1
 
 
