@@ -17,7 +17,7 @@ from astropy.io import fits
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.surveys import folders
 from pyklip_diffrender.surveys.config import read_config
-from pyklip_diffrender.surveys.jobs import plan_jobs
+from pyklip_diffrender.surveys.jobs import jobs_of
 
 __all__ = ["run"]
 
@@ -109,7 +109,7 @@ def _kinds(folder: Path) -> dict[str, tuple[bytes, Callable[[Path], Any]]]:
         "calints.fits": Observation.from_fits,
         "opd.fits": read_opd,
         "fit.fits": Refinement.read,
-        "survey.toml": lambda path: plan_jobs(read_config(path)),
+        "survey.toml": lambda path: jobs_of(read_config(path)),
         # A damaged record is a job that is missing.
         folders.RECORD: lambda path: folders.read_record(path.parent),
     }
@@ -140,4 +140,4 @@ def _fit(path: Path) -> None:
     opd = dr.random_opd(1, npix=128)
     frame = dr.simulate(model, dr.Scene(dr.Star(exposure=20.0)), opd, seed=3)
     settings = dr.GaussNewton(cycles=3, max_iterations=3)
-    dr.refine(model, frame, opd, settings=settings, plan="off").write(path)
+    dr.refine(model, frame, opd, settings=settings).write(path)

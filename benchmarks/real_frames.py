@@ -71,7 +71,7 @@ def main() -> None:
         model = model_for(observation, **model_changes)
         settings = GaussNewton.nircam(**fit_changes)
         for fitted in (0, 1) if name == "as published here" else (0,):
-            fit = refine(model, one_frame(observation, fitted), opd, settings=settings, plan="off")
+            fit = refine(model, one_frame(observation, fitted), opd, settings=settings)
             keep = away_from_companions(fit)
             frames = observation.data - fit.frames[0].companion_image
             shares = [

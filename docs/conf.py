@@ -51,7 +51,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     ("py:obj", r"[^.]*"),
     ("py:obj", r"(poppy|pyklip|spaceKLIP|stpsf|torch|webbpsf)\..*"),
-    ("py:obj", r"(GaussNewton|RoundMask|calibration|contrast|planning|spectrum)\..*"),
+    ("py:obj", r"(GaussNewton|RoundMask|calibration|contrast|spectrum)\..*"),
     ("py:obj", r"pyklip_diffrender\.(linear|pyklip_backend\.subtract|scene\.noise)\..*"),
 ]
 myst_enable_extensions = ["colon_fence", "dollarmath"]

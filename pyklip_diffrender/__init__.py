@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from pyklip_diffrender.linear.model import LinearModel
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pattern import known_systematics, learn_systematics
-    from pyklip_diffrender.planning import Plan, plan
     from pyklip_diffrender.pyklip_backend import (
         DiffrenderSettings,
         backend,
@@ -53,7 +52,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.scene.systematics import Systematics
     from pyklip_diffrender.surveys import survey
     from pyklip_diffrender.wavefront.map_choice import choose_map
-    from pyklip_diffrender.wavefront.opd import drift, random_opd, read_opd
+    from pyklip_diffrender.wavefront.opd import random_opd, read_opd
     from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
 
 __all__ = [
@@ -64,7 +63,6 @@ __all__ = [
     "LinearModel",
     "Observation",
     "OpticalSystem",
-    "Plan",
     "Planet",
     "Reduction",
     "Refinement",
@@ -80,7 +78,6 @@ __all__ = [
     "choose_map",
     "contrast_curve",
     "detect",
-    "drift",
     "fetch_calints",
     "fit_disk",
     "from_poppy",
@@ -93,7 +90,6 @@ __all__ = [
     "model_for",
     "nircam_coronagraph",
     "observation_from_dataset",
-    "plan",
     "random_opd",
     "read_opd",
     "reduce",
@@ -114,7 +110,6 @@ _NAMES = {
     "instrument.star_flux": "star_flux_density",
     "linear.model": "LinearModel",
     "optics.system": "OpticalSystem",
-    "planning": "Plan plan",
     "pyklip_backend": "DiffrenderSettings backend observation_from_dataset register unregister",
     "reduction": "Reduction reduce",
     "pattern": "known_systematics learn_systematics",
@@ -127,7 +122,7 @@ _NAMES = {
     "scene.systematics": "Systematics",
     "wavefront.map_choice": "choose_map",
     "surveys": "survey",
-    "wavefront.opd": "drift random_opd read_opd",
+    "wavefront.opd": "random_opd read_opd",
     "wavefront.priors": "WavefrontPrior learn_prior",
 }
 """Public names by the module they are in."""

@@ -28,7 +28,6 @@ PACKAGES = (
     "wavefront",
     "scene",
     "linear",
-    "planning",
     "refinement",
     "pattern",
     "detection",

@@ -1,26 +1,21 @@
-"""Fits that go on from one another: a plan that is given up, more modes, other settings."""
+"""Fits that go on from one another: more modes, other settings."""
 
 from __future__ import annotations
 
-import itertools
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics import OpticalSystem, PupilGrid
-from pyklip_diffrender.planning import Plan
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Status, refine_again
 from pyklip_diffrender.refinement import continuation as continuation_module
-from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior, default_basis, random_opd
 
@@ -74,21 +69,6 @@ def shot(k: int = 0, planet: Planet | None = None) -> Observation:
     )
 
 
-@cache
-def coarse_plan() -> Plan:
-    """Half of the pupil samples: the star is off by 0.8 sigma rms, and fits still converge."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DiffrenderWarning)
-        return dr.plan(
-            model(),
-            shot(),
-            before(),
-            keep={"npix": NPIX // 2, "cycles": CYCLES[0], "multifidelity": False},
-            cycles=CYCLES,
-            response_npix=64,
-        )
-
-
 def settings(**changes: object) -> GaussNewton:
     return GaussNewton(**{"cycles": CYCLES, "response_npix": 64, **changes})  # type: ignore[arg-type]
 
@@ -98,125 +78,68 @@ def pulls(fit: Refinement, k: int) -> np.ndarray:
     return (fit.frames[k].star - star()) / np.sqrt(star() + READ_NOISE**2)
 
 
-# -- plans ---------------------------------------------------------------------------------------
-
-QUICK = ((False, False, None, 2), (True, True, None, 1))
-"""The others need ``--full``."""
-
-BRANCHES = [
-    pytest.param(*branch, marks=[] if branch in QUICK else [pytest.mark.slow])
-    for branch in itertools.product((False, True), (False, True), (None, PLANET), (1, 2))
-]
+# -- more modes ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("abandoned", "grown", "planet", "count"), BRANCHES)
-def test_every_way_a_planned_fit_can_end(
-    monkeypatch: pytest.MonkeyPatch,
-    abandoned: bool,
-    grown: bool,
-    planet: Planet | None,
-    count: int,
+@pytest.mark.parametrize(
+    ("grown", "count"),
+    [pytest.param(False, 1, marks=pytest.mark.slow), (True, 1), (False, 2)],
+)
+def test_every_way_a_fit_can_go_on(
+    monkeypatch: pytest.MonkeyPatch, grown: bool, count: int
 ) -> None:
-    """Plan kept or given up, basis grown or not, a companion found or not, one frame or two."""
-    monkeypatch.setattr(Plan, "allows", lambda plan, error: not abandoned)
+    """Basis grown or not, one frame or two."""
     monkeypatch.setattr(continuation_module, "_STRUCTURE", 0.0 if grown else math.inf)
-    bases = []
-
-    class Recording(Annealing):
-        def __init__(self, *args: Any) -> None:
-            super().__init__(*args)
-            bases.append((self.problems[0].model.npix, len(self.basis)))
-
-    monkeypatch.setattr(continuation_module, "Annealing", Recording)
-    frames = [shot(k, planet) for k in range(count)]
-    fit = dr.refine(model(), frames, before(), settings=settings(), plan=coarse_plan())
-    few, many = (len(default_basis(cycles)) for cycles in CYCLES)
-    # What went on, went on with the basis that was reached.
-    assert bases == [
-        (NPIX // 2, few),
-        *([(NPIX // 2, many)] if grown else []),
-        *([(NPIX, many if grown else few)] if abandoned else []),
-    ]
+    frames = [shot(k) for k in range(count)]
+    fit = dr.refine(model(), frames, before(), settings=settings())
     assert fit.status is Status.CONVERGED
-    assert fit.plan is not None
-    assert fit.plan.abandoned is abandoned
-    assert fit.plan.final_error is not None
-    assert 0.3 < fit.plan.final_error.rms < 3
-    assert len(fit.basis) == bases[-1][1]  # type: ignore[arg-type]
-    assert isinstance(fit.settings, GaussNewton)
+    assert len(fit.basis) == len(default_basis(CYCLES[grown]))
     assert fit.settings.cycles == CYCLES[grown:]
-    assert len(fit.companions) == (planet is not None)
-    if planet is not None:
-        ((contrast, *place),) = fit.companions
-        error = fit.companion_errors[0]
-        # The derivatives of two frames come from coarser copies than those of one.
-        assert abs(contrast - planet.contrast) < 4 * error[0] + 0.03 * planet.contrast
-        assert np.abs(np.array(place) - planet.offset).max() < 0.005
     for k, frame in enumerate(fit.frames):
-        # On the model as given, wherever the fit was done.
-        assert frame.model is model()
-        assert frame.opd.shape == (NPIX, NPIX)
         np.testing.assert_allclose(frame.render(), frame.star, rtol=1e-9)
-        # The coarse star was 0.8 sigma off; what was fitted to it is not much further.
-        assert np.sqrt(np.mean(pulls(fit, k) ** 2)) < (0.6 if abandoned else 1.5)
+        # Most of a star model's error is that of the modes that the data determine.
+        assert np.sqrt(np.mean(pulls(fit, k) ** 2)) < 0.6
     assert len(fit.linear.vector) == len(fit.linear.unknowns)
     again = refine_again(fit, max_iterations=4)
-    assert len(again.basis) == len(fit.basis)  # type: ignore[arg-type]
-    assert len(again.companions) == len(fit.companions)
-    assert again.frames[0].opd.shape == (NPIX, NPIX)
+    assert len(again.basis) == len(fit.basis)
     assert len(dr.measure(fit, [[0.3, -0.5]])) == 1
 
 
 @pytest.mark.slow
-def test_drifts_and_a_known_companion_go_on_when_a_plan_is_given_up(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(Plan, "allows", lambda plan, error: False)
+def test_drifts_and_a_known_companion_go_on() -> None:
     drift = WavefrontPrior(scales={"segment": 0.5, "texture": 0.02})
     fit = dr.refine(
         model(),
         [shot(k, PLANET) for k in range(2)],
         before(),
         settings=settings(cycles=4.0, drift=drift, drift_cycles=2.0, companions=(PLANET,)),
-        plan=coarse_plan(),
     )
     assert fit.status is Status.CONVERGED
-    assert fit.plan is not None
-    assert fit.plan.abandoned
-    assert isinstance(fit.settings, GaussNewton)
-    assert fit.settings.drift is not None
-    # The scales of both priors went on from where the planned fit had left them.
-    assert fit.settings.drift.scales != drift.scales
     assert set(fit.scales) == {"segment", "texture", "segment drift", "texture drift"}
-    ((contrast, *_),) = fit.companions
+    again = refine_again(fit, max_iterations=4)
+    assert again.settings.drift is not None
+    # The scales of both priors go on from where the fit had left them.
+    assert again.settings.drift.scales != drift.scales
+    ((contrast, *_),) = again.companions
     assert contrast == pytest.approx(PLANET.contrast, rel=0.03)
 
 
-@pytest.mark.parametrize("allowed", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_a_companion_can_be_added_to_a_planned_fit(
-    monkeypatch: pytest.MonkeyPatch, allowed: bool
-) -> None:
-    monkeypatch.setattr(Plan, "allows", lambda plan, error: allowed)
+def test_a_companion_can_be_added_to_a_fit() -> None:
     faint = replace(PLANET, contrast=3e-4)
     kept = settings(companions_if_stalled=False, grow_basis=False, cycles=4.0)
-    fit = dr.refine(model(), shot(0, faint), before(), settings=kept, plan=coarse_plan())
+    fit = dr.refine(model(), shot(0, faint), before(), settings=kept)
     assert not len(fit.companions)
     again = refine_again(fit, companions=(faint,))
     assert len(again.companions) == 1
     assert abs(again.companions[0, 0] - 3e-4) < 4 * again.companion_errors[0, 0]
     assert again.chi2_per_pixel < fit.chi2_per_pixel
-    assert again.frames[0].model is model()
-    # A plan that was given up is not tried again.
-    assert (again.plan is not None) == allowed
 
 
 @pytest.mark.slow
-def test_a_planned_fit_that_fails_is_on_the_model_as_given() -> None:
+def test_a_fit_that_fails_is_not_searched() -> None:
     dark = replace(shot(), data=-shot().data)
-    fit = dr.refine(model(), dark, before(), settings=settings(), plan=coarse_plan())
+    fit = dr.refine(model(), dark, before(), settings=settings())
     assert fit.status is Status.DIVERGED
-    assert fit.frames[0].model is model()
-    assert fit.frames[0].opd.shape == (NPIX, NPIX)
     with pytest.raises(IncompatibleSetupError, match="the fit failed"):
         dr.detect(fit)
 
@@ -229,7 +152,6 @@ def test_a_fit_with_a_basis_of_its_own_can_go_on(change: dict[str, bool]) -> Non
     """A basis without segments: the prior of those stays as it was."""
     own = settings(basis=FourierModes(3), max_iterations=6, **change)
     fit = dr.refine(model(), shot(), before(), settings=own)
-    assert fit.plan is None
     again = refine_again(fit, wavefront=True, max_iterations=12)
     assert again.chi2_per_pixel < 1.001 * fit.chi2_per_pixel
     assert isinstance(again.settings, GaussNewton)
@@ -253,7 +175,7 @@ def test_a_fit_goes_on_from_where_it_ended() -> None:
         companions_if_stalled=False,
         prior=WavefrontPrior({"segment": 10.0, "texture": 6.0}, fit_scales=False),
     )  # fmt: skip
-    fit = dr.refine(model(), frame, before(), settings=settings, plan="off")
+    fit = dr.refine(model(), frame, before(), settings=settings)
     assert fit.status is Status.MODEL_MISMATCH
     kappas = [step["kappa"] for step in fit.history]
     assert kappas[0] > 0.05
@@ -267,7 +189,7 @@ def test_a_fit_goes_on_from_where_it_ended() -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ({"plan": "cheap"}, r"plan: got 'cheap', expected 'auto', 'off' or a Plan"),
+        ({"plan": "cheap"}, r"plan: got 'cheap', expected 'auto' or 'off'"),
         ({"settings": "gauss-newton"}, r"settings: got a str, expected GaussNewton"),
         ({"start": [{}, {}, {}]}, r"start: got 3 dicts for 2 observations"),
     ],
@@ -279,10 +201,7 @@ def test_arguments_that_do_not_go_together_are_refused(
         dr.refine(model(), [shot(0), shot(1)], before(), **arguments)  # type: ignore[arg-type]
 
 
-def test_a_plan_for_something_else_is_refused() -> None:
-    other = model().with_fidelity(npix=NPIX // 2)
-    with pytest.raises(IncompatibleSetupError, match="plan: it was made for"):
-        dr.refine(other, shot(), before(), plan=coarse_plan())
+def test_arguments_in_another_order_are_refused() -> None:
     with pytest.raises(IncompatibleSetupError, match="order of the arguments"):
         dr.refine(before(), shot(), model())  # type: ignore[arg-type]
 

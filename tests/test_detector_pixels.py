@@ -338,7 +338,7 @@ def test_templates_of_rolled_frames_stand_where_the_planet_is() -> None:
         replace(dr.simulate(system(), dr.Scene(), opd, seed=seed), position_angles=np.array([roll]))
         for seed, roll in ((1, 0.0), (2, 10.0))
     ]
-    fit = dr.refine(system(), frames, opd, settings=dr.GaussNewton(cycles=4), plan="off")
+    fit = dr.refine(system(), frames, opd, settings=dr.GaussNewton(cycles=4))
     templates = Templates(fit, fit.frames[0])
     rows, columns = np.array([6, 16, 25]), np.array([16, 28, 8])
     images = templates.at_pixels(rows, columns)
@@ -380,7 +380,7 @@ def test_lost_pixels_are_found_by_the_pattern(moved: tuple[float, float] | None)
         header=fits.Header({"DETECTOR": "NRCALONG"}),
     )
     settings = dr.GaussNewton(cycles=6, min_model_error=0.05)
-    fit = dr.refine(system(), observation, opd, settings=settings, plan="off")
+    fit = dr.refine(system(), observation, opd, settings=settings)
     known = dr.Systematics(
         flat, np.full(flat.shape, 0.01), (18.5, 18.5), unknown=0.06, first_pixel=(100, 200)
     )

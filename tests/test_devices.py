@@ -24,7 +24,7 @@ from pyklip_diffrender.bridges.rotation import SplineRotation
 from pyklip_diffrender.detection import wide_field, with_planets
 from pyklip_diffrender.linear import jacobian
 from pyklip_diffrender.optics import GaussianBlur, LinearResampling, PixelCrosstalk
-from pyklip_diffrender.refinement import GaussNewton, Refinement
+from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene import Systematics
 
 Array = NDArray[np.float64]
@@ -170,19 +170,6 @@ def test_what_a_search_leaves_behind(tmp_path: Path) -> None:
     read = Refinement.read(tmp_path / "fit.fits")
     assert read.model.device.type == "cpu"
     np.testing.assert_array_equal(read.frames[0].star, fit.frames[0].star)
-
-
-@pytest.mark.slow
-def test_planning_and_the_full_model() -> None:
-    scene = dr.Scene(dr.Star(exposure=20.0))
-    seen = dr.simulate(model_on("cpu", npix=256), scene, dr.random_opd(1, npix=256), seed=3)
-
-    def reduced(device: Any) -> list[float]:
-        model = model_on(device, npix=256)
-        simple = GaussNewton(cycles=4)
-        return reached(dr.refine(model, seen, dr.random_opd(1, npix=256), settings=simple))
-
-    agree(reduced, rtol=1e-4)
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ def fitted(brightness: float = BRIGHTNESS) -> tuple[dr.Refinement, dr.Disk]:
     frames, _ = rolls(brightness)
     model = dr.nircam_coronagraph("F444W", **OPTIONS)
     settings = dr.GaussNewton(cycles=10)
-    fit = dr.refine(model, frames, dr.random_opd(1, npix=128), settings=settings, plan="off")
+    fit = dr.refine(model, frames, dr.random_opd(1, npix=128), settings=settings)
     return fit, dr.fit_disk(fit)
 
 
@@ -112,7 +112,7 @@ def small_fit() -> dr.Refinement:
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
     opd = dr.random_opd(1, npix=128)
     frame = dr.simulate(model, dr.Scene(star=STAR), opd, seed=1)
-    return dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=4), plan="off")
+    return dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=4))
 
 
 def test_products_and_refusals(tmp_path: Path) -> None:

@@ -18,13 +18,10 @@ NAMES = sorted(
 
 
 def takes_long(name: str) -> bool:
-    """Whether the examples of a name fit or plan, which takes seconds."""
+    """Whether the examples of a name fit, which takes seconds."""
     text = inspect.getdoc(getattr(dr, name)) or ""
     return any(
-        call in line
-        for line in text.splitlines()
-        for call in ("dr.refine(", "dr.plan(")
-        if "SKIP" not in line
+        call in line for line in text.splitlines() for call in ("dr.refine(",) if "SKIP" not in line
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from functools import partial
 from typing import Any
 
 import pytest
@@ -12,7 +11,6 @@ import torch
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.instrument import ROUND_MASKS, nircam_coronagraph
 from pyklip_diffrender.optics import OpticalSystem, Plane, PointSources
-from pyklip_diffrender.optics.fast import path as route
 from pyklip_diffrender.wavefront import random_opd
 
 WAVELENGTH = 4.5e-6
@@ -246,81 +244,6 @@ def test_full_size_error_of_the_default() -> None:
     opd = torch.from_numpy(random_opd(5).data)
     truth = planes(opd)
     assert float((fast(opd) - truth).abs().max() / truth.max()) < 1e-8
-
-
-@pytest.mark.parametrize("settings", [{}, {"npix": 127, **SIAF, "oversample": 2}], ids=str)
-@pytest.mark.parametrize("absorbs", [False, True])
-def test_blocks_of_rows_give_what_the_whole_pupil_gives(
-    settings: dict[str, Any], absorbs: bool
-) -> None:
-    """They differ by rounding only."""
-    model = system(**settings)
-    opd = torch.from_numpy(random_opd(5, npix=model.npix).data)
-    opd = torch.complex(opd, 0.3 * opd.flip(0)) if absorbs else opd
-    for offset in (None, torch.tensor([0.03, -0.01], dtype=torch.float64)):
-        values = {} if offset is None else {"star_offset": offset}
-        (streamed,) = model.fields(opd, **values)
-        whole = whole_pupil(model, opd, values)
-        error = (streamed - whole).abs().max() / streamed.abs().max()
-        assert float(error) < 1e-11
-
-
-def whole_pupil(
-    model: OpticalSystem, opd: torch.Tensor, values: dict[str, torch.Tensor]
-) -> torch.Tensor:
-    """The field on the detector without blocks of rows."""
-    (wavelength,) = model.bandpass.wavelengths
-    return model.propagate(model.pupil_field(opd, wavelength, values), values)
-
-
-@pytest.mark.parametrize(
-    ("settings", "limit"),
-    [
-        ({}, 1e-11),
-        ({"npix": 127, **SIAF, "oversample": 2}, 1e-11),
-        ({"dtype": torch.float32}, 2e-4),
-    ],
-    ids=str,
-)
-def test_reverse_mode_by_blocks_of_rows_is_that_of_the_whole_pupil(
-    settings: dict[str, Any], limit: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """For the OPD, the offset, both, and once more for second derivatives."""
-    monkeypatch.setattr(route, "_LARGE", 1)
-    model = system(**settings)
-    opd = torch.from_numpy(random_opd(5, npix=model.npix).data)
-    offset = torch.tensor([0.03, -0.01], dtype=torch.float64)
-    change = torch.from_numpy(random_opd(6, npix=model.npix).data)
-
-    def derivatives(field: Any, *varied: str) -> list[torch.Tensor]:
-        here = [
-            t.clone().requires_grad_(name in varied)
-            for t, name in ((opd, "opd"), (offset, "offset"))
-        ]
-        found = field(here[0], {"star_offset": here[1]})
-        # Real and imaginary parts both matter to this number.
-        number = (found.abs().square() * found.real).sum()
-        variables = [t for t in here if t.requires_grad]
-        first = torch.autograd.grad(number, variables, retain_graph=True)
-        again = torch.autograd.grad(number, variables, create_graph=True)
-        directions = {"opd": change, "offset": offset}
-        along = torch.stack(
-            [(t * directions[name]).sum() for name, t in zip(varied, again, strict=True)]
-        ).sum()
-        return [*first, *again, *torch.autograd.grad(along, variables)]
-
-    def streamed(opd: torch.Tensor, values: dict[str, torch.Tensor]) -> torch.Tensor:
-        (found,) = model.fields(opd, **values)
-        assert "ReverseMode" in type(found.grad_fn).__name__
-        return found
-
-    for varied in (("opd",), ("offset",), ("opd", "offset")):
-        mine = derivatives(streamed, *varied)
-        truth = derivatives(partial(whole_pupil, model), *varied)
-        for one, other in zip(mine, truth, strict=True):
-            assert one.dtype == other.dtype
-            away = (one - other).detach().norm() / other.detach().norm()
-            assert float(away) < limit
 
 
 # torch 2.14 compiles the rules of its own `jvp` by what it calls deprecated.

@@ -24,10 +24,8 @@ from pyklip_diffrender.optics import PupilGrid, resample
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.settings import starting_opd
 from pyklip_diffrender.wavefront import (
-    OPDMap,
     SegmentMotions,
     as_opd_map,
-    drift,
     random_drift,
     random_opd,
     read_opd,
@@ -347,19 +345,6 @@ def test_resampling_to_fewer_pixels_takes_means(opd: np.ndarray) -> None:
 
 
 # -- drift -----------------------------------------------------------------------------------
-
-
-def test_drift_is_linear_in_time(opd: np.ndarray) -> None:
-    later = opd + random_drift(9, 86.0, npix=NPIX).data
-    np.testing.assert_array_equal(drift(opd, later, 0.0), opd)
-    np.testing.assert_allclose(drift(opd, later, 86.0), later, rtol=1e-12, atol=1e-22)
-    np.testing.assert_allclose(drift(opd, later, 43.0), (opd + later) / 2, rtol=1e-12, atol=1e-22)
-    np.testing.assert_allclose(
-        drift(as_opd_map(opd), OPDMap(later, None, "later", ""), -10.0, interval=20.0),
-        1.5 * opd - 0.5 * later,
-        rtol=1e-12,
-        atol=1e-22,
-    )
 
 
 def test_random_drift_grows_in_proportion_to_time() -> None:

@@ -24,7 +24,6 @@ from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS, parameter
-from pyklip_diffrender.planning.systems import CheapSystem
 from pyklip_diffrender.wavefront.opd import random_opd
 
 WAVELENGTH = 4.5e-6
@@ -175,7 +174,7 @@ def test_defaults_stay_with_copies_of_another_fidelity(opd: torch.Tensor) -> Non
     coarse = model.with_fidelity(npix=96)
     torch.testing.assert_close(coarse(opd), small()(opd, **FLIGHT_ALIGNMENT), rtol=0, atol=0)
     assert not model.with_fidelity(defaults=None).defaults
-    cheap = CheapSystem(coarse).with_fidelity(fov_pixels=20)
+    cheap = coarse.with_fidelity(fov_pixels=20)
     expected = small(fov_pixels=20)(opd, **FLIGHT_ALIGNMENT)
     torch.testing.assert_close(cheap(opd), expected, rtol=0, atol=0)
 

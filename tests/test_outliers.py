@@ -47,7 +47,7 @@ def spoiled(frame: dr.Observation, sigmas: float) -> dr.Observation:
 
 def fitted(*frames: dr.Observation, name: str = "F444W", **changes: object) -> dr.Refinement:
     settings = replace(SETTINGS, **changes)  # type: ignore[arg-type]
-    return dr.refine(model(name), list(frames), start(), settings=settings, plan="off")
+    return dr.refine(model(name), list(frames), start(), settings=settings)
 
 
 def left_out(fit: dr.Refinement, k: int = 0) -> list[tuple[int, int]]:

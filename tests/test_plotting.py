@@ -75,7 +75,7 @@ def frames(model: OpticalSystem) -> list[Observation]:
 def fit(model: OpticalSystem, frames: list[Observation]) -> Refinement:
     first = replace(PLANET, position_angle=PLANET.position_angle - ANGLES[0])
     settings = GaussNewton(basis=FourierModes(2), response_npix=NPIX, companions=(first,))
-    return dr.refine(model, frames, random_opd(3, npix=NPIX).data, settings=settings, plan="off")
+    return dr.refine(model, frames, random_opd(3, npix=NPIX).data, settings=settings)
 
 
 @pytest.fixture(scope="module")

@@ -133,16 +133,6 @@ CASES = {
         {"source": ([3, 4, 6] * u.um, [1e4, 3e4, 2e4] * u.photon / u.s / u.cm**2 / u.m)},
         {"source": ([3e-6, 4e-6, 6e-6], [1, 3, 2])},
     ),
-    "drift": Case(
-        lambda **given: dr.drift(OPD, 2 * OPD, **given),
-        {"hours": 1 * u.day, "interval": 1 * u.week},
-        {"hours": 24, "interval": 168},
-    ),
-    "drift, maps": Case(
-        lambda **given: dr.drift(**given, hours=3),
-        {"before": OPD * 1e9 * u.nm, "after": OPD * 2e6 * u.um},
-        {"before": OPD, "after": 2 * OPD},
-    ),
     "random_opd": Case(
         lambda rms: dr.random_opd(1, npix=32, rms=rms).data, {"rms": 50 * u.nm}, {"rms": 5e-8}
     ),
@@ -257,7 +247,6 @@ def test_another_dimension_is_refused_by_name(name: str) -> None:
         (lambda: dr.reduce("nowhere", OPD, threshold=-5), r"threshold: got -5, expected a pos"),
         (lambda: dr.reduce("nowhere", OPD, threshold=0), r"threshold: got 0, expected a pos"),
         (lambda: dr.WavefrontPrior({"segment": -4}), r"scales: segment: got -4 nm"),
-        (lambda: dr.drift(OPD, OPD, 3, interval=0), r"interval: got 0 h"),
     ],
 )
 def test_values_out_of_bounds_say_what_was_got_and_expected(

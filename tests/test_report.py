@@ -26,7 +26,6 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.pattern import pattern_size
-from pyklip_diffrender.planning.choice import ModelError
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.report import summarise, write_report
 from pyklip_diffrender.report.html import page
@@ -410,15 +409,6 @@ def test_a_report_that_fails_leaves_the_old_one(
 # -- in a notebook ---------------------------------------------------------------------------------
 
 
-def plan() -> dr.Plan:
-    error = ModelError(0.05, 0.2)
-    table = QTable({"what": ["pupil grid"], "why": [HOSTILE], "error": [0.05]})
-    return dr.Plan(
-        cast("Any", None), cast("Any", None), cast("Any", None), {}, table, 0.1, error, error, 2.0,
-        8.0, 0,
-    )  # fmt: skip
-
-
 def shown() -> dict[str, Any]:
     """Everything with a summary in HTML, of frames with a hostile header and name."""
     whole = reduction()
@@ -441,14 +431,14 @@ def shown() -> dict[str, Any]:
         detection.contrast_curve,
     )  # fmt: skip
     disk = dr.Disk(fit, (), flat, flat, flat, np.ones((1, 2)), np.ones(1), 9.0)
-    values = (evil, sequence, fit, detection, again, whole.fit.model, plan(), known, fit.initial,
+    values = (evil, sequence, fit, detection, again, whole.fit.model, known, fit.initial,
               wide, disk)  # fmt: skip
     return {type(value).__name__: value for value in values}
 
 
 @pytest.mark.parametrize(
     "name",
-    ["Observation", "Sequence", "Refinement", "Detection", "Reduction", "OpticalSystem", "Plan",
+    ["Observation", "Sequence", "Refinement", "Detection", "Reduction", "OpticalSystem",
      "Systematics", "OPDMap", "WideField", "Disk"],
 )  # fmt: skip
 def test_a_notebook_shows_a_small_escaped_summary(name: str) -> None:

@@ -18,7 +18,7 @@ SCRIPTS = sorted(
     for path in (ROOT / folder).rglob("*.py")
     if 'if __name__ == "__main__":' in path.read_text(encoding="utf-8")
 )
-WITHOUT_OPTIONS = ("benchmarks/planning.py", "examples/paper/summary.py")
+WITHOUT_OPTIONS = ("examples/paper/summary.py",)
 
 
 def run(script: str) -> None:

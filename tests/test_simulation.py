@@ -22,7 +22,7 @@ from pyklip_diffrender.scene import (
     simulate,
     star_photons,
 )
-from pyklip_diffrender.wavefront import drift, random_opd, read_opd
+from pyklip_diffrender.wavefront import random_opd, read_opd
 
 WAVELENGTH = 4.5e-6
 NPIX = 96
@@ -222,7 +222,8 @@ def test_the_papers_scene_behind_the_official_stop_is_fainter_than_published(
 ) -> None:
     model = nircam_coronagraph("F444W", monochromatic=WAVELENGTH, segment_gap=0.0)
     pair = [read_opd(shared_data / f"opd_2022-08-{day}.fits.gz") for day in (11, 14)]
-    star = star_photons(model, Scene(), drift(*pair, hours=40.0))
+    before, after = (opd.data for opd in pair)
+    star = star_photons(model, Scene(), before + 40 / 86 * (after - before))
     # The paper states 1.12e7 photons in the brightest pixel and 1.2e6 in the ring. Both came out
     # with a stop that was digitised from a figure and stood 2.8 % of the pupil too high.
     assert star.max() == pytest.approx(6.4e6, rel=0.05)

@@ -28,7 +28,7 @@ def fit() -> Refinement:
     frame = dr.simulate(model, dr.Scene(planets=(PLANET,)), opd, seed=3)
     header = fits.Header({"INSTRUME": "NIRCAM", "PIXAR_SR": 9.2e-14})
     frame = replace(frame, unit=u.MJy / u.sr, header=header)
-    return dr.refine(model, frame, opd, settings=SETTINGS, plan="off")
+    return dr.refine(model, frame, opd, settings=SETTINGS)
 
 
 def test_contrasts_of_real_frames_have_the_error_of_the_stars_flux(fit: Refinement) -> None:

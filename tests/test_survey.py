@@ -35,7 +35,7 @@ from pyklip_diffrender.refinement import FrameFit, GaussNewton
 from pyklip_diffrender.surveys import execution, folders, page, runs, work
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.driver import run_survey, survey
-from pyklip_diffrender.surveys.jobs import Injection, Job, plan_jobs
+from pyklip_diffrender.surveys.jobs import Injection, Job, jobs_of
 from pyklip_diffrender.surveys.tables import COLUMNS, table_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,7 +57,7 @@ def _not_drawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
 
 
 def planned(config: dict[str, Any]) -> list[Job]:
-    return plan_jobs(read_config(config))
+    return jobs_of(read_config(config))
 
 
 def hidden(output: Path) -> list[str]:
@@ -72,7 +72,7 @@ def test_a_file_says_the_same_as_a_mapping(tmp_path: Path) -> None:
     config = inputs(tmp_path)
     path = configuration(tmp_path / "survey.toml", config)
     assert read_config(path) == read_config(config)
-    assert [job.key for job in planned(config)] == [job.key for job in plan_jobs(read_config(path))]
+    assert [job.key for job in planned(config)] == [job.key for job in jobs_of(read_config(path))]
 
 
 def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

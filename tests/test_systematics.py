@@ -22,7 +22,7 @@ from pyklip_diffrender.pattern.measure import (
 from pyklip_diffrender.pattern.pedestal import light_and_residual, pattern_pedestal
 from pyklip_diffrender.pattern.presence import lacks_pattern, pattern_size
 from pyklip_diffrender.refinement import GaussNewton, Refinement, Status
-from pyklip_diffrender.refinement.planned import refine_again
+from pyklip_diffrender.refinement.continuation import refine_again
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation

@@ -45,12 +45,12 @@ def searched() -> tuple[Detection, list[dr.Observation]]:
     model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=FITTED)
     settings = dr.GaussNewton(cycles=8)
     cut = [each.cutout(FITTED) for each in frames]
-    fit = dr.refine(model, cut, dr.random_opd(1, npix=128), settings=settings, plan="off")
+    fit = dr.refine(model, cut, dr.random_opd(1, npix=128), settings=settings)
     # As in `reduce`, once more without the light of the sources beyond the fitted pixels.
     cleaned = wide_field(dr.detect(fit), frames).subtracted(frames, cut)
     assert cleaned is not None
     opd = dr.random_opd(1, npix=128)
-    return dr.detect(dr.refine(model, cleaned, opd, settings=settings, plan="off")), frames
+    return dr.detect(dr.refine(model, cleaned, opd, settings=settings)), frames
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,11 @@ from torch import Tensor
 
 from benchmarks.speed.case import Accuracy, Case, missing
 from benchmarks.speed.rivals import hcipy_image, load, paper_recipe, prysm_image
-from benchmarks.speed.setting import CELLS, WAVELENGTH, Arrays, Setting
+from benchmarks.speed.setting import CELLS, WAVELENGTH, Arrays, Setting, coarse_steps
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
 from pyklip_diffrender.linear.response import downsample
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.planning import coarse_steps
 
 __all__ = ["FORWARD", "STEP", "forward", "step"]
 

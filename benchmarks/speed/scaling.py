@@ -14,10 +14,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.speed.case import Case
 from benchmarks.speed.inference import basis_of
-from benchmarks.speed.setting import Setting
+from benchmarks.speed.setting import Setting, coarse_steps
 from benchmarks.speed.timing import interleaved
 from pyklip_diffrender.linear.response import WavefrontResponse, downsample
-from pyklip_diffrender.planning import coarse_steps
 from pyklip_diffrender.refinement import GaussNewton, refine
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.bases import Basis, default_basis

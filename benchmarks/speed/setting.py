@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +24,10 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.simulation import simulate
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 
-__all__ = ["Arrays", "Setting"]
+sys.path.append(str(Path(__file__).parents[2] / "examples" / "paper"))
+from coarse import coarse_steps
+
+__all__ = ["Arrays", "Setting", "coarse_steps"]
 
 Array = NDArray[np.float64]
 

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from coarse import coarse_steps
 from recipe import AdamFit, adam_recipe
 from scene import Frame, Image, Planet, Scene, Setting, Star, planet_photons, star_photons
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.demo import simulate_references
-from pyklip_diffrender.planning import coarse_steps
 from pyklip_diffrender.pyklip_backend.klip import klip_rdi
 from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.scene.objects import ALPHA_PICTORIS_W2

@@ -30,11 +30,14 @@ from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.scene.objects import PAPER_SEGMENT_GAP, Planet, Scene, Star
 from pyklip_diffrender.scene.simulation import planet_photons, simulate, star_photons
-from pyklip_diffrender.wavefront.opd import drift, random_drift, random_opd, read_opd, resample
+from pyklip_diffrender.wavefront.opd import random_drift, random_opd, read_opd, resample
 
 Image = NDArray[np.float64]
 
 WAVELENGTH = 4.5e-6
+
+BETWEEN_MAPS = 86.0
+"""Hours between the two measured maps."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class Setting:
         """The true wavefront, some hours after the map."""
         if self.before:
             later = resample(read_opd(self.after).data, self.model.npix)
-            return drift(self.measured, later, hours)
+            return self.measured + hours / BETWEEN_MAPS * (later - self.measured)
         change = random_drift(self.seed + 1000, hours, npix=self.model.npix).data
         return self.measured + change
 

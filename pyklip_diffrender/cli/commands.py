@@ -266,21 +266,21 @@ Examples:
   pyklip-diffrender survey survey.toml -o products
   pyklip-diffrender survey survey.toml -o products --scheduler tcp://host:8786""",
 )
-@click.argument("plan", type=file_type())
+@click.argument("file", type=file_type())
 @option("-o", "--output", type=file_type(), required=True, metavar="FOLDER",
         help="Folder for jobs and tables. What is finished there is not repeated.")  # fmt: skip
 @option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler; default a local cluster.")
 @common
 @click.pass_obj
-def survey(run: Run, /, plan: Path, output: Path, scheduler: str | None) -> int:
+def survey(run: Run, /, file: Path, output: Path, scheduler: str | None) -> int:
     """Reduce many sequences, with and without injected planets, as jobs.
 
-    PLAN is a TOML file with the sequences and their options. The same command goes on where an
+    FILE is a TOML file with the sequences and their options. The same command goes on where an
     earlier one was stopped.
     """
     from pyklip_diffrender.cli.survey import run as run_survey
 
-    return run_survey(plan, output, scheduler, progress=run.progress)
+    return run_survey(file, output, scheduler, progress=run.progress)
 
 
 def _reduction(

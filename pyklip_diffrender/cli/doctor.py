@@ -159,7 +159,7 @@ def check_fit() -> Iterator[Check]:
     motions = 1e-8 * np.random.default_rng(2).normal(size=len(basis))
     truth = measured + basis.opd(torch.from_numpy(motions), PupilGrid.full(model.npix)).numpy()
     frame = simulate(model, Scene(), truth, seed=1)
-    fit = refine(model, frame, measured, settings=GaussNewton(basis=basis), plan="off")
+    fit = refine(model, frame, measured, settings=GaussNewton(basis=basis))
     lit = model.entrance.lit.numpy()
     before, after = (1e9 * float(np.std((opd - truth)[lit])) for opd in (measured, fit.wavefront))
     text = (

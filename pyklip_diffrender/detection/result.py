@@ -99,7 +99,7 @@ class Detection:
     >>> opd = dr.random_opd(1, npix=128)
     >>> scene = dr.Scene(planets=(dr.Planet(1e-4, 0.5, 54.0),))
     >>> frame = dr.simulate(model, scene, opd, seed=1)
-    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=4), plan="off")
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=4))
     >>> detection = dr.detect(fit)
     >>> print(f"{detection.table['separation'][0]:.2f}, S/N above 5: {len(detection.table)}")
     0.50 arcsec, S/N above 5: 1

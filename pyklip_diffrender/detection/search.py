@@ -220,7 +220,7 @@ def measure(
     >>> opd = dr.random_opd(1, npix=128)
     >>> scene = dr.Scene(planets=(dr.Planet.from_offset(1e-4, 0.3, -0.5),))
     >>> frame = dr.simulate(model, scene, opd, seed=3)
-    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6))
     >>> table = dr.measure(fit, [[0.3, -0.5]])
     >>> print(f"{table['contrast'][0]:.1e}")
     1.0e-04
@@ -292,7 +292,7 @@ def contrast_curve(
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
     >>> opd = dr.random_opd(1, npix=128)
     >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
-    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6))
     >>> curve = dr.contrast_curve(fit, [0.4, 0.8])
     >>> bool(curve["contrast"][0] > curve["contrast"][1])
     True

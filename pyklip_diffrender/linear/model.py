@@ -85,7 +85,7 @@ class LinearModel:
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
     >>> opd = dr.random_opd(1, npix=128)
     >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
-    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6))
     >>> fit.linear
     <LinearModel: 173 unknowns, 1 x 32 x 32 pixels>
     >>> fit.linear.covariance.shape

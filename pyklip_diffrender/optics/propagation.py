@@ -298,11 +298,6 @@ class Propagation:
         values : mapping of str to Tensor
             See `values`.
         """
-        if self._lattice is not None:
-            windows = self.windows(values)
-            field = self._lattice.star(self.entrance, opd, wavelength, values, windows)
-            if field is not None:
-                return field
         return self.propagate(self.pupil_field(opd, wavelength, values), values)
 
     def fields(self, opd: Value | None = None, **parameters: Value) -> list[Tensor]:

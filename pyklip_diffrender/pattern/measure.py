@@ -102,7 +102,7 @@ def learn_systematics(
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
     >>> opd = dr.random_opd(1, npix=128)
     >>> frames = [dr.simulate(model, dr.Scene(), opd, seed=k) for k in (1, 2)]
-    >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=6))
     >>> dr.learn_systematics(fit, name="noise")
     <Systematics 'noise': F444W, 32 x 32 pixels>
     """

@@ -182,10 +182,6 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
                 f"diffrender: frames {', '.join(map(str, fit.frames))}: {fit.status}, "
                 f"chi2/N {fit.chi2:.4g}"
             )
-            plan = getattr(fit.result, "plan", None)
-            if plan is not None:
-                facts = ", ".join(f"{k[5:]} {v}" for k, v in plan.summary().items())
-                header.add_history(f"diffrender: planned: {facts}")
         for line in _fitted(subtraction):
             header.add_history(f"diffrender: {line}")
     return header

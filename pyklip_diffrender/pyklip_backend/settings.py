@@ -30,7 +30,6 @@ from pyklip_diffrender.wavefront.map_choice import RULES, Rule, choose_map, wave
 from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
 
 if TYPE_CHECKING:
-    from pyklip_diffrender.planning import Plan
     from pyklip_diffrender.refinement import GaussNewton
     from pyklip_diffrender.scene.systematics import Systematics
 
@@ -95,9 +94,8 @@ class DiffrenderSettings:
         library, and fits the reference frames only where it has none; "references" fits them in
         any case and uses both; see `reduce`. Reference frames are those of a psf_library that
         `JWSTData` has read, if the mode contains RDI, and any in the dataset.
-    plan : Plan or str, optional
-        "auto" (the default), "off", or an existing plan, which is used for all fits of a
-        reduction; see `refine`.
+    plan : "auto" or "off", optional
+        Has no effect; see `refine`.
     keep_detected : bool, optional
         Search the fit for companions (`detect`) and refine the star once more with them in the
         model, so that none of their light is subtracted with the star; True by default for real
@@ -149,7 +147,7 @@ class DiffrenderSettings:
     fit: GaussNewton | None = None
     start: Mapping[str, Any] | None = None
     systematics: Systematics | Literal["auto", "references", "off"] | None = None
-    plan: Plan | str | None = None
+    plan: str | None = None
     keep_detected: bool | None = None
     image: Literal["cleaned", "subtracted", "flux"] | None = None
     max_chi2: float | None = None

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from pyklip_diffrender.refinement.continuation import refine_again
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.refinement.star_flux import (

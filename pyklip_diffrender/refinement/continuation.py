@@ -9,13 +9,14 @@ from typing import Any
 
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.annealing import Annealing
+from pyklip_diffrender.refinement.breakdown import breakdown_explained
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["continue_from", "fit_in_stages"]
+__all__ = ["continue_from", "fit_in_stages", "refine_again"]
 
 _log = logging.getLogger(__name__)
 
@@ -112,3 +113,28 @@ def fit_in_stages(
             break
     assert fit is not None
     return fit
+
+
+def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> Refinement:
+    """Continue a refinement with other settings.
+
+    Parameters
+    ----------
+    fit : Refinement
+    progress : bool
+        Show progress bars.
+    **changes
+        Fields of `GaussNewton` with other values, such as `companions`.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If the fit was read from a file without its linear model.
+    """
+    settings, warm = continue_from(fit, **changes)
+    problems = [
+        Problem(frame.model, frame.observation, fit.initial, frame.start, fit.systematics)
+        for frame in fit.frames
+    ]
+    with breakdown_explained(problems[0].observation.name):
+        return fit_in_stages(problems, settings, warm, seed=fit.seed, progress=progress)

@@ -15,9 +15,8 @@ from pyklip_diffrender.errors import (
     ShapeError,
 )
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.planning import Plan
 from pyklip_diffrender.refinement.breakdown import breakdown_explained
-from pyklip_diffrender.refinement.planned import choose_plan, fit_problems
+from pyklip_diffrender.refinement.continuation import fit_in_stages
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
@@ -39,7 +38,7 @@ def refine(
     settings: GaussNewton | None = None,
     start: Start | Sequence[Start] | None = None,
     systematics: Systematics | None = None,
-    plan: Plan | str = "auto",
+    plan: str = "auto",
     seed: int = 0,
     progress: bool = False,
 ) -> Refinement:
@@ -65,13 +64,11 @@ def refine(
         is by default that of the star in the observation.
     systematics : Systematics, optional
         Known pattern of the model's error, see `learn_systematics`.
-    plan : "auto", "off" or Plan
-        "auto" first determines, with `pyklip_diffrender.plan`, how much cheaper the model can be
-        without a visible error. "off" fits with `model` itself. The result always refers to
-        `model`. "auto" has no effect if the settings have a basis, no wavefront, or a free pupil
-        amplitude (as in the preset for real frames).
+    plan : "auto" or "off"
+        Has no effect: the fit uses `model` and the modes of the settings, whatever the noise. It is
+        accepted because earlier versions chose a coarser model where the noise allowed one.
     seed : int
-        Seed of the wavefronts that a plan draws; the fit itself is deterministic.
+        Recorded with the result; the fit is deterministic.
     progress : bool
         Show progress bars.
 
@@ -85,7 +82,8 @@ def refine(
     MissingOPDError
         If `opd` is None.
     IncompatibleSetupError
-        For settings, a plan or systematics that do not fit the model and the observations.
+        For settings or systematics that do not fit the model and the observations, and for another
+        value of `plan`.
     ShapeError, UnitError, NonFiniteError, NoValidPixelsError, CorruptFileError
         As their names say.
     RefinementError
@@ -125,14 +123,15 @@ def refine(
         # A system without a Lyot stop has no parameters of one.
         available = (*model.parameters, "flux", "background")
         adapted = replace(adapted, free=tuple(name for name in adapted.free if name in available))
+    if plan not in ("auto", "off"):
+        raise IncompatibleSetupError(f"plan: got {plan!r}, expected 'auto' or 'off'")
     wavefront = as_opd_map(opd)
     problems = [
         Problem(model, each, wavefront, _with_position(model, each, begin), systematics)
         for each, begin in zip(observations, _one_by_one(start, len(observations)), strict=True)
     ]
     with breakdown_explained(observations[0].name):
-        planned = choose_plan(plan, problems, adapted, seed)
-        return fit_problems(problems, adapted, planned, seed=seed, progress=progress)
+        return fit_in_stages(problems, adapted, seed=seed, progress=progress)
 
 
 def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start]:

@@ -12,7 +12,6 @@ from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.linear.response import coarse_copy, downsample
 from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.refinement.problem import Problem
 
@@ -74,15 +73,12 @@ class Forward:
         self.problem, self.model = problem, problem.model
         self.basis, self.responses = responses.basis, responses
         self.coarse = coarse_copy(problem.model, responses.npix)
-        self.full_model = problem.full_model or problem.model
-        self._starting_opds = {
-            model.npix: problem.starting_opd(model.npix) for model in (self.model, self.full_model)
-        }
+        self._starting_opd = problem.starting_opd(self.model.npix)
 
-    def opd(self, unknowns: FrameLayout, vector: Tensor, model: OpticalSystem) -> Tensor:
-        """The wavefront on a model's grid, (npix, npix), m; complex if the amplitude is free."""
-        grid = PupilGrid.full(model.npix, model.diameter)
-        opd = self._starting_opds[model.npix]
+    def opd(self, unknowns: FrameLayout, vector: Tensor) -> Tensor:
+        """Return the wavefront, (npix, npix), m; complex if the pupil's amplitude is free."""
+        grid = PupilGrid.full(self.model.npix, self.model.diameter)
+        opd = self._starting_opd
         coefficients = vector[unknowns.where("modes")]
         if bool((coefficients != 0).any()):
             change = self.basis.opd(coefficients * NANOMETRE, grid)
@@ -101,7 +97,7 @@ class Forward:
 
     def at(self, unknowns: FrameLayout, vector: Tensor) -> Point:
         """Render a point."""
-        values, opd = unknowns.values(vector), self.opd(unknowns, vector, self.model)
+        values, opd = unknowns.values(vector), self.opd(unknowns, vector)
         flux = unknowns.level("flux", vector)
         with torch.no_grad():
             fields = self.model.fields(opd, **values)
@@ -111,14 +107,10 @@ class Forward:
         star = light + unknowns.level("background", vector)
         total = star
         if unknowns.shows_companions and len(unknowns.companions):
-            model = self.full_model
-            full = opd if model.npix == self.model.npix else self.opd(unknowns, vector, model)
             for source in unknowns.sources(vector):
                 source_values = self._towards(values, unknowns.turn @ source[1:])
-                # The full model is needed: an error of a percent is significant for a companion of
-                # S/N 1000.
                 with torch.no_grad():
-                    total = total + flux * source[0] * model(full, **source_values).double()
+                    total = total + flux * source[0] * self.model(opd, **source_values).double()
         return Point(unknowns, vector, opd, fields, image, light, star, total)
 
     def sources(self, point: Point, offsets: Tensor) -> Tensor:

@@ -47,8 +47,6 @@ class Problem:
         Quantities), and of "flux" and "background" where known.
     systematics : Systematics, optional
         What is known of the model's error in these pixels.
-    full_model : OpticalSystem, optional
-        The model that a plan has replaced by the cheaper `model`; it renders the companions.
     """
 
     model: OpticalSystem
@@ -56,7 +54,6 @@ class Problem:
     initial: OPDMap
     start: dict[str, Any] = field(default_factory=dict)
     systematics: Systematics | None = None
-    full_model: OpticalSystem | None = None
 
     def __post_init__(self) -> None:
         if self.observation.shape != self.model.detector.shape:
@@ -102,10 +99,6 @@ class Problem:
         """The starting wavefront on a pupil array of (npix, npix), m."""
         opd = resample(self.initial.data, npix)
         return torch.from_numpy(np.ascontiguousarray(opd)).to(self.model.device)
-
-    def with_model(self, model: OpticalSystem) -> Problem:
-        """The same problem for a cheaper model; companions stay with the present one."""
-        return replace(self, model=model, full_model=self.full_model or self.model)
 
     @property
     def has_free_pedestal(self) -> bool:

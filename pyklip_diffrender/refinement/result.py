@@ -26,7 +26,6 @@ from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.linear.noise import UNCORRELATED, CorrelatedError
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.planning import Plan
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.status import Status
@@ -107,8 +106,6 @@ class Refinement:
         Assumed pattern of the model's error.
     stored_linear : LinearModel or None
         The linear model; None if the fit was read from a file without it.
-    plan : Plan or None
-        The chosen model fidelity; None if the fit used the full model.
     history : list of dict
         One entry for each iteration.
     seconds : float
@@ -120,7 +117,7 @@ class Refinement:
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
     >>> opd = dr.random_opd(1, npix=128)
     >>> frame = dr.simulate(model, dr.Scene(), opd, seed=3)
-    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6), plan="off")
+    >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=6))
     >>> fit.status.usable
     True
     >>> fit.frames[0].star.shape
@@ -148,7 +145,6 @@ class Refinement:
     effective_parameters: float = math.nan
     log_evidence: float = math.nan
     systematics: Systematics | None = None
-    plan: Plan | None = None
     history: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = math.nan
     seed: int = 0
@@ -297,8 +293,6 @@ class Refinement:
         names = [frame.observation.name for frame in self.frames]
         about = {**self.summary(), "observations": names}
         primary = primary_hdu(self.frames[0].observation, about)
-        for key, value in ({} if self.plan is None else self.plan.summary()).items():
-            primary.header[f"HIERARCH {key.upper()}"] = value
         parameters = self.parameters
         parameters["description"].info.format = None  # FITS has no such format.
         hdus = fits.HDUList([primary, fits.BinTableHDU(parameters, name="PARAMETERS")])
@@ -422,5 +416,4 @@ class Refinement:
             "opd": self.initial.name,
             "opd_sha256": self.initial.sha256,
             "systematics": "none" if self.systematics is None else self.systematics.name,
-            **({} if self.plan is None else self.plan.summary()),
         }

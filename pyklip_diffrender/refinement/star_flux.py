@@ -9,8 +9,8 @@ import torch
 from astropy import units as u
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.refinement.continuation import refine_again
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.scene.observation import Observation
 

@@ -19,7 +19,7 @@ from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.surveys.config import Config, read_config
 from pyklip_diffrender.surveys.execution import in_this_process, with_dask
 from pyklip_diffrender.surveys.folders import Record, clean, prepare, read_record, staging
-from pyklip_diffrender.surveys.jobs import Job, plan_jobs
+from pyklip_diffrender.surveys.jobs import Job, jobs_of
 from pyklip_diffrender.surveys.runs import Work
 from pyklip_diffrender.surveys.tables import row, table_of, write_tables
 
@@ -103,8 +103,8 @@ def run_survey(
     progress: bool = False,
 ) -> Table:
     """Run any work as the jobs of a survey; see `survey`."""
-    plan = read_config(config)
-    todo = plan_jobs(plan)
+    read = read_config(config)
+    todo = jobs_of(read)
     # Workers have their own working directory.
     output = Path(output).absolute()
     jobs = prepare(output)
@@ -114,7 +114,7 @@ def run_survey(
     _log.info("%d of %d jobs are finished", len(todo) - len(missing), len(todo))
     try:
         with tqdm(total=len(missing), desc="survey", disable=not progress) as bar:
-            for job, record in _execute(missing, jobs, plan, scheduler, work):
+            for job, record in _execute(missing, jobs, read, scheduler, work):
                 board.add(job, record)
                 bar.set_postfix(failed=board.failures)
                 bar.update()
@@ -125,19 +125,19 @@ def run_survey(
 
 
 def _execute(
-    missing: list[Job], jobs: Path, plan: Config, scheduler: str | None, work: Work
+    missing: list[Job], jobs: Path, config: Config, scheduler: str | None, work: Work
 ) -> Iterator[tuple[Job, Record]]:
     if not missing:
         return iter(())
-    if scheduler is None and plan.workers == 0:
+    if scheduler is None and config.workers == 0:
         return in_this_process(missing, jobs, work)
     return with_dask(
         missing,
         jobs,
         work,
         scheduler=scheduler,
-        workers=plan.workers,
-        memory_limit=plan.memory_limit,
+        workers=config.workers,
+        memory_limit=config.memory_limit,
     )
 
 

@@ -21,7 +21,7 @@ from pyklip_diffrender.io.opd_map import FLAT
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
 from pyklip_diffrender.wavefront.map_choice import dated_maps
 
-__all__ = ["Injection", "Job", "plan_jobs"]
+__all__ = ["Injection", "Job", "jobs_of"]
 
 _SUFFIXES = (".fits", ".fits.gz")
 
@@ -91,7 +91,7 @@ class Job:
         )
 
 
-def plan_jobs(config: Config) -> list[Job]:
+def jobs_of(config: Config) -> list[Job]:
     """Return the jobs of a survey; every injection comes after the job that it starts from.
 
     Raises
@@ -105,11 +105,11 @@ def plan_jobs(config: Config) -> list[Job]:
     digest, date = cache(sha256), cache(_date)
     for sequence in config.sequences:
         try:
-            planned = _jobs(sequence, digest, date)
+            found = _jobs(sequence, digest, date)
         except (DiffrenderError, OSError) as error:
             problems.append(f"{sequence.name}: {error}")
             continue
-        for job in planned:
+        for job in found:
             if job.key in jobs:
                 problems.append(f"{job}: got the same inputs and options as {jobs[job.key]}")
             jobs[job.key] = job

@@ -13,7 +13,6 @@ from pyklip_diffrender.wavefront.map_choice import RULES, choose_map, wavefront_
 from pyklip_diffrender.wavefront.opd import (
     OPDMap,
     as_opd_map,
-    drift,
     random_drift,
     random_opd,
     read_opd,
@@ -32,7 +31,6 @@ __all__ = [
     "as_opd_map",
     "choose_map",
     "default_basis",
-    "drift",
     "interpolate_wss",
     "learn_prior",
     "random_drift",

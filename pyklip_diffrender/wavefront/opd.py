@@ -31,7 +31,7 @@ from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import FourierModes, SegmentMotions
 from pyklip_diffrender.wavefront.wss import EXTENSION, load_wss_opd
 
-__all__ = ["OPDMap", "as_opd_map", "drift", "random_drift", "random_opd", "read_opd", "resample"]
+__all__ = ["OPDMap", "as_opd_map", "random_drift", "random_opd", "read_opd", "resample"]
 
 _FLAT_SAMPLES = 256
 """Samples across a flat wavefront, which is the same with any number."""
@@ -177,37 +177,6 @@ def _checked(raw: OPDMap) -> OPDMap:
     data = np.where(bad, 0.0, data)
     warn_of_rms(float(data[pupil].std()), name, stacklevel=4)
     return replace(raw, data=data)
-
-
-def drift(before: Any, after: Any, hours: float, interval: float = 86.0) -> NDArray[np.float64]:
-    """Interpolate between two measured wavefronts, or extrapolate, linearly in time.
-
-    Parameters
-    ----------
-    before, after : OPDMap or ndarray, (npix, npix)
-        m.
-    hours : float or Quantity
-        Time since `before`, h.
-    interval : float or Quantity
-        Time from `before` to `after`, h.
-
-    Returns
-    -------
-    ndarray, (npix, npix)
-        m.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import pyklip_diffrender as dr
-    >>> before, after = dr.random_opd(1, npix=128), dr.random_opd(2, npix=128)
-    >>> halfway = dr.drift(before, after, hours=43)
-    >>> bool(np.allclose(halfway, (before.data + after.data) / 2))
-    True
-    """
-    first, second = to_metres(before, "before"), to_metres(after, "after")
-    hours = to_number(hours, u.h, "hours")
-    return first + hours / to_number(interval, u.h, "interval", "positive") * (second - first)
 
 
 def random_opd(seed: int, npix: int = 1024, rms: float = 66e-9) -> OPDMap:
