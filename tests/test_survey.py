@@ -53,8 +53,7 @@ def _drawn() -> None:
 @pytest.fixture(autouse=True)
 def _not_drawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "_drawn" not in request.fixturenames:
-        monkeypatch.setattr("pyklip_diffrender.surveys.page.draw_limits", lambda *_: None)
-        monkeypatch.setattr("pyklip_diffrender.surveys.page.to_png", lambda *_, **__: b"no picture")
+        monkeypatch.setattr("pyklip_diffrender.drawing.to_png", lambda *_, **__: b"no picture")
 
 
 def planned(config: dict[str, Any]) -> list[Job]:
@@ -496,9 +495,7 @@ def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, miss
         "pyklip_diffrender.surveys.tables.find_spec", lambda name: None if name == missing else 1
     )
     if missing == "dask":
-        with pytest.raises(
-            IncompatibleSetupError, match=r"pyklip-diffrender\[survey\].*workers = 0"
-        ):
+        with pytest.raises(IncompatibleSetupError, match=r"pip install .dask\[.*workers = 0"):
             run_survey({**config, "workers": 1}, tmp_path / "out", stub)
     assert list(run_survey(config, tmp_path / "out", stub)["status"]) == ["finished"]
     assert (tmp_path / "out" / "results.ecsv").exists()

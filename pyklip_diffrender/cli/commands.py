@@ -66,8 +66,8 @@ def demo(
     Needs no data, half a minute and 2 GB of memory.
     """
     run.claim_folder(output, _DEMO, overwrite)
-    from pyklip_diffrender.demo import run_demo, write_demo
-    from pyklip_diffrender.plotting import draw_demo, save
+    from pyklip_diffrender.demo import draw_demo, run_demo, write_demo
+    from pyklip_diffrender.drawing import save
 
     result = run_demo(
         contrast=contrast,
@@ -323,9 +323,8 @@ def _reduction(
             click.echo(describe_plan(sequence, size, systematics, **parts))
             return
         from pyklip_diffrender.io.progress import stage
-        from pyklip_diffrender.plotting import draw_detection, save
         from pyklip_diffrender.reduction import reduce
-        from pyklip_diffrender.refinement import Systematics
+        from pyklip_diffrender.scene.systematics import Systematics
 
         known: Any = systematics
         if known not in ("auto", "references", "off"):
@@ -347,10 +346,8 @@ def _reduction(
         )
         with stage("4 of 4: products"):
             written = reduction.write(output)
-            figure = output / "detection.png"
-            save(draw_detection(reduction.detection), figure)
         click.echo(f"\n{reduction}")
-        for path in (*written, figure):
+        for path in written:
             click.echo(f"wrote {path}")
     if json:
         summary = loads((output / "summary.json").read_text(encoding="utf-8"))

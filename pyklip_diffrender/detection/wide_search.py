@@ -15,6 +15,7 @@ from astropy.io import fits
 from astropy.table import QTable, vstack
 from numpy.typing import NDArray
 
+from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor, scatter_profile
@@ -169,9 +170,18 @@ class WideField:
 
     def plot(self, ax: Any = None) -> NDArray[Any]:
         """Draw the S/N map with the candidates, and the contrast curve; see `Detection.plot`."""
-        from pyklip_diffrender import plotting
-
-        return plotting.plot_detection(self, ax)
+        axes = drawing.axes_for(ax, 2)
+        drawing.search(
+            axes,
+            self.snr,
+            self.grid,
+            self.table,
+            self.contrast_curve,
+            threshold=self.threshold,
+            north=None if self.observation.position_angles is None else self.north,
+            small_sample=self.error_factor.is_measured,
+        )
+        return np.array(axes)
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables."""

@@ -17,6 +17,7 @@ from astropy.time import Time
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.io.html_repr import html_summary
@@ -36,9 +37,9 @@ from pyklip_diffrender.refinement.storage import (
     reading,
     text_hdu,
 )
-from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.product_headers import primary_hdu
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.opd import OPDMap
 
@@ -358,9 +359,27 @@ class Refinement:
         -------
         ndarray of Axes, (3,)
         """
-        from pyklip_diffrender import plotting
-
-        return plotting.plot_refinement(self, ax, frame=frame)
+        axes = drawing.axes_for(ax, 3)
+        part = self.frames[frame]
+        observation = part.observation.combined()
+        valid, noise = observation.valid[0], observation.error[0]
+        data = np.where(valid, observation.data[0], np.nan)
+        norm, unit = drawing.light_norm(data, noise[valid]), drawing.unit_label(observation.unit)
+        north = None if observation.position_angles is None else observation.position_angle
+        for each, image, title in ((axes[0], data, "data"), (axes[1], part.star, "star model")):
+            drawing.star_image(each, image, part.grid, norm, bar=unit, title=title, north=north)
+        places = observation.turned(self.companions[:, 1:], self.frames[0].observation)
+        drawing.signed_image(
+            axes[2],
+            (data - part.star) / noise,
+            part.grid,
+            5.0,
+            bar="standard deviations",
+            title="residual / noise",
+            places=() if observation.reference else places,
+            north=north,
+        )
+        return np.array(axes)
 
     def summary(self) -> Mapping[str, Any]:
         """Return metadata for a header or a log, without arrays."""

@@ -10,14 +10,16 @@ import numpy as np
 from astropy import units as u
 from astropy.io import fits
 from astropy.time import Time
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     NoValidPixelsError,
     ShapeError,
     UnitError,
 )
+from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import (
     native_float64,
@@ -297,6 +299,22 @@ class Observation:
             return 0.0
         return other.position_angle - self.position_angle
 
+    def turned(self, places: ArrayLike, other: Observation) -> NDArray[np.float64]:
+        """Rotate positions beside the star in another observation to where they are in this one.
+
+        Parameters
+        ----------
+        places : array, (k, 2)
+            x, y in any unit.
+        other : Observation
+
+        Returns
+        -------
+        ndarray, (k, 2)
+        """
+        matrix = rotation_matrix(self.roll_from(other))
+        return np.reshape(places, (-1, 2)) @ matrix.T
+
     def cutout(self, size: int, *, first_pixel: tuple[int, int] | None = None) -> Observation:
         """The `size` x `size` pixels about the star (whole pixels, without resampling).
 
@@ -356,9 +374,21 @@ class Observation:
         -------
         Axes
         """
-        from pyklip_diffrender import plotting
-
-        return plotting.plot_observation(self, ax, frame=frame)
+        (ax,) = drawing.axes_for(ax, 1)
+        valid = self.valid[frame]
+        image = np.where(valid, self.data[frame], np.nan)
+        ny, nx = self.shape
+        pixels = np.stack(np.meshgrid(np.arange(nx), np.arange(ny)), axis=-1)
+        drawing.star_image(
+            ax,
+            image,
+            (pixels - self.center[frame]) * self.pixelscale,
+            drawing.light_norm(image, self.error[frame][valid]),
+            bar=drawing.unit_label(self.unit),
+            title=", ".join(filter(None, (self.target, self.filter))),
+            north=None if self.position_angles is None else float(self.position_angles[frame]),
+        )
+        return ax
 
     def combined(self) -> Observation:
         """One frame, the mean of all weighted by their inverse variances pixel by pixel.
