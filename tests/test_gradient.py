@@ -171,7 +171,7 @@ def test_an_accurate_step_ends_where_that_of_the_model_does(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """In as many iterations as are needed, whatever the coarse copy that preconditions them."""
-    monkeypatch.setattr(accurate, "_ITERATIONS", 60)
+    monkeypatch.setattr(accurate, "_ITERATIONS", 20)
     monkeypatch.setattr(accurate, "_SUFFICIENT", 0.0)
     solver, state = solver_of(1)
     same = of_the_model_itself(solver)
