@@ -14,19 +14,25 @@ WAVELENGTH = 4.5e-6
 DIAMETER = 6.5
 """m; lambda/D is 0.143 arcsec."""
 
+_SAMPLINGS = ((24, 1), (32, 2), (36, 3), (24, 4), (28, 2), (30, 3), (26, 2), (27, 3))
+"""Samples across the pupil, and oversampling."""
+
 Generator = np.random.Generator
 
 
 def draw(generator: Generator) -> poppy.OpticalSystem:
     """Draw a system of up to eight planes between the entrance pupil and the detector."""
-    npix = int(generator.choice([24, 32, 36, 27]))
-    system = poppy.OpticalSystem(
-        oversample=int(generator.choice([1, 2, 3, 4])), npix=npix, verbose=False
-    )
+    # poppy itself cannot pad an odd number of samples to an even one.
+    npix, oversample = _SAMPLINGS[generator.integers(len(_SAMPLINGS))]
+    system = poppy.OpticalSystem(oversample=oversample, npix=npix, verbose=False)
     system.pupil_diameter = DIAMETER * u.m
     system.add_pupil(_entrance(generator))
     for k in range(generator.integers(1, 9)):
         kind = generator.choice(list(_KINDS), p=[0.15, 0.1, 0.3, 0.15, 0.2, 0.1])
+        turns = kind in ("rotation", "inversion")
+        if turns and system.planes[-1].planetype == PlaneType.image and generator.random() < 0.9:
+            # poppy moves an image that it turns by a sample, which is refused.
+            system.add_pupil(poppy.ScalarTransmission(name=f"pupil {k}", transmission=0.9))
         _KINDS[kind](system, generator, f"{kind} {k}")
     if system.planes[-1].planetype == PlaneType.image:
         system.add_pupil(poppy.ScalarTransmission(name="last pupil"))
@@ -80,7 +86,7 @@ def _mask(system: poppy.OpticalSystem, generator: Generator, name: str) -> None:
         lambda: poppy.optics.RectangularFieldStop(
             name=name, width=1 * u.arcsec, height=0.6 * u.arcsec, rotation=generator.uniform(0, 90)
         ),
-        lambda: poppy.optics.CircularOcculter(name=name, radius=5.0),
+        lambda: poppy.CircularOcculter(name=name, radius=0.05 * system.npix),
     )
     system.add_image(optic)
 
