@@ -301,12 +301,12 @@ def reduce(
     def searched(science: tuple[Observation, ...]) -> Detection:
         return detect(fitted(science, choice), threshold=threshold, progress=progress)
 
-    def first_fit(choice: PatternChoice, again: bool) -> list[Refinement]:
+    def first_fit(choice: PatternChoice, again: bool) -> Refinement:
         without = ", without the pattern of the library" if again else ""
         with stage(f"2 of 4: wavefront{without}"):
-            return [fitted(choice.science, choice)]
+            return fitted(choice.science, choice)
 
-    choice, (fit,) = fit_with_pattern(
+    choice, fit = fit_with_pattern(
         cut.science,
         cut.references,
         model,

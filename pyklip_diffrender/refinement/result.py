@@ -23,11 +23,12 @@ from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.linear.noise import UNCORRELATED, CorrelatedError
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.planning import Plan
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.settings import Adam, GaussNewton
+from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.refinement.storage import (
     linear_hdus,
@@ -53,6 +54,7 @@ _PLAIN = (
     "basis",
     "chi2_per_pixel",
     "model_error",
+    "correlated_error",
     *_ARRAYS,
     "scales",
     "prior_ratios",
@@ -75,8 +77,8 @@ class Refinement:
         One for each observation, in the same order.
     initial : OPDMap
         Starting wavefront.
-    settings : GaussNewton or Adam
-    basis : Basis or None
+    settings : GaussNewton
+    basis : Basis
         Wavefront modes that were fitted.
     status : Status
     chi2_per_pixel : float
@@ -84,6 +86,9 @@ class Refinement:
     model_error : float
         Assumed error of the star model, as a fraction of the star's light in a pixel, added in
         quadrature to the noise; 0 if chi-squared per pixel is near 1.
+    correlated_error : CorrelatedError
+        Size of the error of the model that neighbouring pixels share, as a fraction of the
+        starlight, see `GaussNewton.correlated_error`. Errors include it, `chi2_per_pixel` does not.
     companions, companion_errors : ndarray, (companions, 3)
         Companions that were part of the fit: contrast, and x and y from the star in the first
         frame, arcsec.
@@ -98,10 +103,10 @@ class Refinement:
     log_evidence : float
         Logarithm of the evidence of the linearised model, up to a constant of the data. Differences
         compare priors.
-    linear : LinearModel or None
-        Jacobian and covariance of all unknowns, for `detect`; None for the Adam recipe.
     systematics : Systematics or None
         Assumed pattern of the model's error.
+    stored_linear : LinearModel or None
+        The linear model; None if the fit was read from a file without it.
     plan : Plan or None
         The chosen model fidelity; None if the fit used the full model.
     history : list of dict
@@ -129,18 +134,19 @@ class Refinement:
 
     frames: tuple[FrameFit, ...]
     initial: OPDMap
-    settings: GaussNewton | Adam
+    settings: GaussNewton
     status: Status
     chi2_per_pixel: float
-    basis: Basis | None = None
+    basis: Basis
+    stored_linear: LinearModel | None
     model_error: float = math.nan
+    correlated_error: CorrelatedError = UNCORRELATED
     companions: Image = field(default_factory=lambda: np.zeros((0, 3)))
     companion_errors: Image = field(default_factory=lambda: np.zeros((0, 3)))
     scales: dict[str, float] = field(default_factory=dict)
     prior_ratios: dict[str, float] = field(default_factory=dict)
     effective_parameters: float = math.nan
     log_evidence: float = math.nan
-    linear: LinearModel | None = None
     systematics: Systematics | None = None
     plan: Plan | None = None
     history: list[dict[str, Any]] = field(default_factory=list)
@@ -166,6 +172,11 @@ class Refinement:
                 "Frames": ", ".join(frame.observation.name for frame in self.frames),
                 "Chi-squared per pixel": f"{self.chi2_per_pixel:.3g}",
                 "Model error": f"{100 * self.model_error:.2g} % of the star",
+                "Error shared by neighbouring pixels": (
+                    f"{100 * self.correlated_error.total:.2g} % of the starlight"
+                    if self.correlated_error
+                    else None
+                ),
                 "Wavefront map": self.initial.name,
                 "Systematics": None if self.systematics is None else self.systematics.name,
                 "Companions in the fit": len(self.companions) or None,
@@ -186,7 +197,7 @@ class Refinement:
     @property
     def method(self) -> str:
         """Name of the method."""
-        return "adam" if isinstance(self.settings, Adam) else "gauss-newton"
+        return "gauss-newton"
 
     @property
     def planets(self) -> tuple[Planet, ...]:
@@ -194,10 +205,30 @@ class Refinement:
         return tuple(Planet.from_offset(max(c, 0.0), x, y) for c, x, y in self.companions.tolist())
 
     @property
+    def linear(self) -> LinearModel:
+        """Jacobian and covariance of all unknowns, which `detect` uses.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If the fit was read from a file without them.
+        """
+        if self.stored_linear is None:
+            raise IncompatibleSetupError(
+                "this fit was read from a file without its linear model, which write(linear=False) "
+                "leaves out. Fit the frames again, or write the fit with linear=True"
+            )
+        return self.stored_linear
+
+    @property
     def reduced_chi2(self) -> float:
-        """Chi-squared per degree of freedom; NaN if the method has no linear model."""
-        if self.linear is None:
-            return math.nan
+        """Chi-squared per degree of freedom.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            As `linear`.
+        """
         pixels = sum(int((frame.weight > 0).sum()) for frame in self.linear.frames)
         return self.chi2_per_pixel / max(1 - self.effective_parameters / pixels, 1e-3)
 
@@ -208,14 +239,8 @@ class Refinement:
         Raises
         ------
         IncompatibleSetupError
-            If the method has no linear model.
+            As `linear`.
         """
-        if self.linear is None:
-            raise IncompatibleSetupError(
-                f"this fit (method {self.method!r}) has no linear model of its unknowns. Use "
-                "refine(settings=GaussNewton()), the default, and do not write the fit with "
-                "linear=False"
-            )
         if not len(self.companions):
             return self.linear
         light: dict[int, NDArray[np.float64] | Tensor | float] = {
@@ -284,8 +309,8 @@ class Refinement:
         hdus["INITIAL_OPD"].header["BUNIT"] = "m"
         if self.systematics is not None:
             hdus.extend(self.systematics.to_hdus())
-        if linear and self.linear is not None:
-            hdus.extend(linear_hdus(self.linear))
+        if linear and self.stored_linear is not None:
+            hdus.extend(linear_hdus(self.stored_linear))
         date = self.initial.date
         facts = {
             "model": model_facts(self.model),
@@ -325,7 +350,9 @@ class Refinement:
                 for k, about in enumerate(facts["frames"])
             )
             label, sha256, date = facts["initial"]
-            facts = {"prior_ratios": {}} | facts  # Files of version 0.1 do not have it.
+            # Files of earlier versions do not have them.
+            facts.setdefault("prior_ratios", {})
+            facts.setdefault("correlated_error", UNCORRELATED)
             plain: dict[str, Any] = {key: facts[key] for key in _PLAIN}
             plain |= {key: np.reshape(facts[key], (-1, 3)).astype(float) for key in _ARRAYS}
             return cls(
@@ -337,7 +364,7 @@ class Refinement:
                     sha256,
                 ),
                 status=Status[facts["status"]],
-                linear=linear_of(hdus, len(frames), name) if "UNKNOWNS" in hdus else None,
+                stored_linear=linear_of(hdus, len(frames), name) if "UNKNOWNS" in hdus else None,
                 systematics=Systematics.from_hdus(hdus) if "PATTERN" in hdus else None,
                 **plain,
             )
@@ -389,6 +416,7 @@ class Refinement:
             "frames": len(self.frames),
             "chi2_per_pixel": self.chi2_per_pixel,
             "model_error": self.model_error,
+            "correlated_error": self.correlated_error.total,
             "seconds": self.seconds,
             "seed": self.seed,
             "opd": self.initial.name,
