@@ -30,7 +30,11 @@ WAVELENGTH = 4.5e-6
 NPIX = 96
 
 # poppy's anti-aliased circles say that they are only approximate; the same values are used here.
-pytestmark = pytest.mark.filterwarnings("ignore:filled_circle_aa may not yield exact results")
+# Random phase masks may be only a few samples wide, of which poppy warns.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:filled_circle_aa may not yield exact results"),
+    pytest.mark.filterwarnings("ignore:Phase mask is very coarsely sampled"),
+]
 
 
 def make(*planes: Plane, oversample: int = 2, detector: dict[str, Any] | None = None) -> Any:
