@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import poppy
 import poppy_reference as reference
 import pytest
+import random_poppy
 import torch
 from astropy.io import fits
 from numpy.typing import NDArray
@@ -28,7 +30,11 @@ WAVELENGTH = 4.5e-6
 NPIX = 96
 
 # poppy's anti-aliased circles say that they are only approximate; the same values are used here.
-pytestmark = pytest.mark.filterwarnings("ignore:filled_circle_aa may not yield exact results")
+# Random phase masks may be only a few samples wide, of which poppy warns.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:filled_circle_aa may not yield exact results"),
+    pytest.mark.filterwarnings("ignore:Phase mask is very coarsely sampled"),
+]
 
 
 def make(*planes: Plane, oversample: int = 2, detector: dict[str, Any] | None = None) -> Any:
@@ -198,6 +204,36 @@ def test_everything_else(planes: tuple[Plane, ...]) -> None:
     truth = system.calc_psf(WAVELENGTH)[0].data
     model = from_poppy(system, WAVELENGTH)
     assert relative(model.calc_psf()[0].data, truth) < 1e-12
+
+
+def compared(seeds: range) -> int:
+    """Compare random systems with poppy; return how many were converted and not refused."""
+    converted, refusals = 0, []
+    for seed in seeds:
+        system = random_poppy.draw(np.random.default_rng(seed))
+        try:
+            model = from_poppy(system, random_poppy.WAVELENGTH)
+        except IncompatibleSetupError as error:
+            refusals.append(str(error))
+            continue
+        truth = system.calc_psf(random_poppy.WAVELENGTH)[0].data
+        image = model.calc_psf()[0].data
+        # Rounding: up to 1e-13 for these sizes. A mask that lacks light is wrong by 1e-4 and more.
+        # Where masks block all the light, rounding is relative to the light that came in.
+        error = np.abs(image - truth).max() / max(truth.max(), 1e-9)
+        assert error < 1e-10, (seed, error, [plane.name for plane in system.planes])
+        converted += 1
+    assert all(re.search("by one sample|odd number of samples", each) for each in refusals)
+    return converted
+
+
+def test_random_systems() -> None:
+    assert compared(range(12)) >= 8
+
+
+@pytest.mark.slow
+def test_many_random_systems() -> None:
+    assert compared(range(100, 400)) >= 220
 
 
 def test_the_image_is_the_binned_psf() -> None:
@@ -412,6 +448,16 @@ def matrix_fourier() -> Any:
     return poppy.MatrixFTCoronagraph(make(pupil(), spot(), stop()))
 
 
+def semi_analytic() -> Any:
+    return poppy.SemiAnalyticCoronagraph(make(pupil(), spot(), stop()), fpm_index=1)
+
+
+def with_a_mask_on_its_own_samples() -> Any:
+    system = make(pupil(), spot(), stop())
+    system.planes[1].propagation_hint = "MFT"
+    return system
+
+
 @pytest.mark.parametrize(
     ("bad", "complaint"),
     [
@@ -419,7 +465,10 @@ def matrix_fourier() -> Any:
         (without_detector, r"must be a Detector, got .*Add one"),
         (starting_in_an_image, "first plane must be a pupil"),
         (with_unknown_plane, r"'aberrations' \(ZernikeWFE.*not supported. Supported are"),
-        (matrix_fourier, "convert the OpticalSystem that it was made from"),
+        (matrix_fourier, "convert the poppy.OpticalSystem that it was made from"),
+        (semi_analytic, "SemiAnalyticCoronagraph propagates.*convert the poppy.OpticalSystem"),
+        (with_a_mask_on_its_own_samples, "'spot' asks for a matrix transform"),
+        (lambda: make(pupil(), stop(), spot()), "'spot'.*there must be a pupil plane"),
         (lambda: poppy.Instrument(), "expected a poppy.OpticalSystem"),
         (lambda: make(pupil(), spot(), ("invert", "y"), stop()), "moves it by one sample"),
     ],

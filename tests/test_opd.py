@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -203,9 +204,49 @@ def test_a_file_without_a_map_is_refused(tmp_path: Path, opd: np.ndarray) -> Non
         read_opd(tmp_path / "nowhere.fits")
 
 
-def test_a_file_of_zeros_is_refused(tmp_path: Path, opd: np.ndarray) -> None:
-    with pytest.raises(CorruptFileError, match=r"blank\.fits: all values of the map are zero"):
-        read_opd(write(tmp_path / "blank.fits", 0 * opd))
+@pytest.mark.parametrize("name", ["OPD", "opdmap", "WFE", "Wavefront"])
+def test_a_map_behind_the_pupil_is_taken_by_its_name(
+    tmp_path: Path, opd: np.ndarray, name: str
+) -> None:
+    path = tmp_path / "two.fits"
+    images = [fits.ImageHDU(opd, name=name), fits.ImageHDU((opd != 0) * 1.0, name="PUPIL")]
+    images[0].header["BUNIT"] = "m"
+    fits.HDUList([fits.PrimaryHDU(), *images[::-1]]).writeto(path)
+    np.testing.assert_array_equal(read_opd(path).data, opd)
+
+
+@pytest.mark.parametrize("unit", ["m", None])
+@pytest.mark.parametrize(
+    ("change", "values"),
+    [
+        (lambda opd: 0 * opd, "value 0,"),
+        (lambda opd: 0 * opd + 3e-8, "value 3e-08,"),
+        # The pupil itself, and another with wider struts.
+        (lambda opd: (jwst_pupil(len(opd)).numpy() > 0) * 1.0, "value 1,"),
+        (lambda opd: (jwst_pupil(len(opd)).numpy() > 0.999) * 1.0, "values 0 and 1,"),
+    ],
+)
+def test_a_mask_or_a_constant_is_no_wavefront(
+    tmp_path: Path,
+    opd: np.ndarray,
+    change: Callable[[np.ndarray], np.ndarray],
+    values: str,
+    unit: str | None,
+) -> None:
+    path = write(tmp_path / "mask.fits", change(opd), unit)
+    with pytest.raises(CorruptFileError, match=rf"mask\.fits.*no wavefront.*{values}.*extension="):
+        read_opd(path)
+
+
+@pytest.mark.parametrize("shape", [(2, 16, 16), (16, 16)])
+def test_science_frames_are_no_map(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    path = tmp_path / "jw01_nrcalong_calints.fits"
+    primary, frames = fits.PrimaryHDU(), fits.ImageHDU(np.ones(shape), name="SCI")
+    primary.header["EXP_TYPE"] = "NRC_CORON"
+    frames.header["BUNIT"] = "MJy/sr"
+    fits.HDUList([primary, frames]).writeto(path)
+    with pytest.raises(CorruptFileError, match="no wavefront map, but an exposure of type NRC_COR"):
+        read_opd(path)
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from pyklip_diffrender.bridges.image_masks import (
     MaskPart,
     SampledOcculter,
     SeparablePart,
+    padded_pupil,
 )
 from pyklip_diffrender.bridges.orientation import Orientation
 from pyklip_diffrender.bridges.rotation import FreeRotation
@@ -40,6 +41,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, native_float64, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
+from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import Plane
 
 __all__ = ["Conversion"]
@@ -122,26 +124,36 @@ class Conversion:
         planes: list[Plane] = []
         centred = "array_center"
         stack: list[Any] = []
+        # Whether a mask has scattered light beyond the pupil array that no aperture held back.
+        scattered = False
+        pupil = PupilGrid.full(self.npix, self.diameter)
         for k in range(1, len(self.osys.planes) - 1):
             optic, turn = self.osys.planes[k], turns[k]
             if optic.planetype == PlaneType.inversion:
                 planes.append(Gain(optic.name))
             elif optic.planetype == PlaneType.rotation:
                 angle = -optic.angle * turn.sense  # The system's frame is a mirror of poppy's.
+                # poppy rotates the pupil array alone, without the light beyond it.
                 planes.append(
-                    Gain(optic.name)
+                    Gain(optic.name, edge=pupil)
                     if _is_quarter_turn(optic)
                     else FreeRotation(angle, self.npix, self.diameter, optic.name)
                 )
+                scattered = False
             elif optic.planetype == PlaneType.pupil:
                 plane, centred = self._pupil(k, centred)
+                window = plane.window({})
+                scattered &= window is None or window.intersection(pupil) != window
                 planes.append(plane)
             elif self.osys.planes[k + 1].planetype == PlaneType.image:
                 # Successive masks in one image act as one.
                 stack.append(optic)
                 planes.append(Gain(optic.name))
             else:
-                planes.append(self._image(MaskStack.of([*stack, optic]), turn, centred))
+                mask = MaskStack.of([*stack, optic])
+                plane = self._image(mask, turn, centred, scattered)
+                scattered |= plane.focal
+                planes.append(plane)
                 stack = []
         return planes
 
@@ -262,9 +274,16 @@ class Conversion:
         )
         return plane, centred
 
-    def _image(self, optic: Any, turn: Orientation, centred: str) -> Plane:
+    def _image(self, optic: Any, turn: Orientation, centred: str, scattered: bool) -> Plane:
+        """An image plane; `scattered` if light beyond the pupil array reaches it."""
         if isinstance(optic, poppy.ScalarTransmission):
             return Gain(optic.name, complex(optic.transmission))
+        if (self.sampled * self.osys.oversample) % 2:
+            raise IncompatibleSetupError(
+                f"plane {optic.name!r}: poppy places masks half a sample off the axis if the image "
+                f"has an odd number of samples, here {self.sampled} x {self.osys.oversample}; use "
+                "an even npix or oversample"
+            )
         way = self.recipe["propagation"]
         if not isinstance(way, str):
             way = way.get(optic.name, "auto")
@@ -283,7 +302,8 @@ class Conversion:
             self.propagation[optic.name] = "fft"
             return self._fourier(optic, turn, centred)
         self.propagation[optic.name] = "compact"
-        return SampledOcculter(parts, self.sampling, self.diameter, optic.name)
+        grid = padded_pupil(self.npix, self.diameter, self.sampling if scattered else 1)
+        return SampledOcculter(parts, self.sampling, self.diameter, optic.name, grid)
 
     def _parts(self, optic: Any, turn: Orientation) -> list[MaskPart] | None:
         spacing = max(self.bandpass.wavelengths) / self.diameter / self.sampling / ARCSEC

@@ -23,7 +23,15 @@ from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import CompactOcculter, Plane, Values, Wavefront
 
-__all__ = ["Box", "BoxPart", "FourierMask", "MaskPart", "SampledOcculter", "SeparablePart"]
+__all__ = [
+    "Box",
+    "BoxPart",
+    "FourierMask",
+    "MaskPart",
+    "SampledOcculter",
+    "SeparablePart",
+    "padded_pupil",
+]
 
 Box = tuple[float, float, float, float]
 """Lower x, upper x, lower y, upper y in arcsec."""
@@ -39,6 +47,14 @@ def _lattice(low: float, high: float, spacing: float, limit: float) -> Tensor:
     first = max(math.floor(low / spacing), -edge)
     last = min(math.ceil(high / spacing), edge - 1)
     return torch.arange(first, last + 1, dtype=torch.float64) * spacing
+
+
+def padded_pupil(npix: int, diameter: float, padding: float) -> PupilGrid:
+    """Return the pupil array with `padding` times as many samples, as in an FFT."""
+    size = round(npix * padding)
+    # poppy pads by whole samples on both sides, with the odd one, if any, at the end.
+    first = -((size - npix) // 2)
+    return PupilGrid(npix, diameter, (first, first + size), (first, first + size))
 
 
 class MaskPart(Protocol):
@@ -175,12 +191,20 @@ class SampledOcculter(Plane):
         Their complements add up to that of the mask.
     sampling : float
         Lattice points per lambda / `diameter`.
+    grid : PupilGrid
+        The window with all the light in front of the mask: the pupil array, or the padded one if a
+        mask scatters light beyond the pupil array and no aperture holds it back.
     """
 
     focal = True
 
     def __init__(
-        self, parts: Sequence[MaskPart], sampling: float, diameter: float, name: str
+        self,
+        parts: Sequence[MaskPart],
+        sampling: float,
+        diameter: float,
+        name: str,
+        grid: PupilGrid,
     ) -> None:
         if sampling < 1:
             raise IncompatibleSetupError(
@@ -188,7 +212,11 @@ class SampledOcculter(Plane):
                 "cells alias the pupil onto itself; 2 to 8 is usual)"
             )
         self.name, self.parts = name, tuple(parts)
-        self.sampling, self.diameter = sampling, diameter
+        self.sampling, self.diameter, self.grid = sampling, diameter, grid
+
+    def window(self, values: Values) -> PupilGrid:
+        """See `Plane`: the mask acts on all the light in front of it."""
+        return self.grid
 
     def _spacing(self, wavelength: float) -> float:
         return wavelength / self.diameter / self.sampling
@@ -260,10 +288,7 @@ class FourierMask(Plane):
     ) -> None:
         self.name = name
         self.transmission, self.padding = transmission, padding
-        # poppy pads by whole samples on both sides, with the odd one, if any, at the end.
-        first = -((npix * (padding - 1)) // 2)
-        limits = (first, first + npix * padding)
-        self.grid = PupilGrid(npix, diameter, limits, limits)
+        self.grid = padded_pupil(npix, diameter, padding)
         self._latest: Cache[torch.dtype, tuple[Position, Tensor]] = Cache()
 
     def window(self, values: Values) -> PupilGrid:

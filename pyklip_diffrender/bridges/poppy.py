@@ -329,10 +329,10 @@ def check_supported(osys: Any) -> None:
             f"from_poppy: got a {type(osys).__name__}, expected a poppy.OpticalSystem. For an "
             "Instrument, pass what its get_optical_system() returns, or use from_webbpsf"
         )
-    if isinstance(osys, poppy.MatrixFTCoronagraph):
+    if type(osys).propagate is not poppy.OpticalSystem.propagate:
         raise IncompatibleSetupError(
-            f"{osys.name}: poppy.MatrixFTCoronagraph samples its image planes in a way of its "
-            "own; convert the OpticalSystem that it was made from"
+            f"{osys.name}: a {type(osys).__name__} propagates, or samples its image planes, in a "
+            "way of its own; convert the poppy.OpticalSystem that it was made from"
         )
     planes = list(osys.planes)
     if not planes or planes[0].planetype != PlaneType.pupil:
@@ -353,6 +353,11 @@ def check_supported(osys: Any) -> None:
                 f"plane {plane.name!r} ({type(plane).__name__}, {plane.planetype}) is not "
                 f"supported. Supported are {_SUPPORTED}"
             )
+        if getattr(plane, "propagation_hint", None) == "MFT":
+            raise IncompatibleSetupError(
+                f"plane {plane.name!r} asks for a matrix transform on samples of its own "
+                "(propagation_hint 'MFT'), which is not supported; remove the hint"
+            )
         turning = plane.planetype in (PlaneType.rotation, PlaneType.inversion)
         if turning and previous.planetype == PlaneType.image:
             raise IncompatibleSetupError(
@@ -361,3 +366,8 @@ def check_supported(osys: Any) -> None:
                 "or behind the next pupil"
             )
         previous = plane
+    if previous.planetype == PlaneType.image:
+        raise IncompatibleSetupError(
+            f"plane {previous.name!r}: between an image plane and the detector there must be a "
+            "pupil plane, as in poppy. Add one, such as poppy.ScalarTransmission()"
+        )

@@ -297,14 +297,22 @@ class Gain(Plane):
     name : str
     factor : complex
         Amplitude transmission.
+    edge : PupilGrid or None
+        A window outside which the field is cut off.
     """
 
     name: str
     factor: complex = 1.0
+    edge: PupilGrid | None = None
     pointwise = True
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Multiply."""
+        if self.edge is not None:
+            grid = wavefront.grid.intersection(self.edge)
+            wavefront = replace(
+                wavefront, field=wavefront.grid.crop(wavefront.field, grid), grid=grid
+            )
         if self.factor == 1:
             return wavefront
         return replace(wavefront, field=wavefront.field * self.factor)

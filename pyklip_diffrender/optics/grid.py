@@ -99,6 +99,13 @@ class PupilGrid:
             columns=(max(0, self.columns[0] - extra), min(self.npix, self.columns[1] + extra)),
         )
 
+    def intersection(self, other: PupilGrid) -> PupilGrid:
+        """Return the part that this window shares with another, empty if they are apart."""
+        pairs = [(self.rows, other.rows), (self.columns, other.columns)]
+        starts = [max(mine[0], its[0]) for mine, its in pairs]
+        stops = [max(start, min(p[0][1], p[1][1])) for start, p in zip(starts, pairs, strict=True)]
+        return replace(self, rows=(starts[0], stops[0]), columns=(starts[1], stops[1]))
+
     def crop(self, array: Tensor, to: PupilGrid) -> Tensor:
         """Cut the window `to` out of an array on this window, with zeros outside.
 

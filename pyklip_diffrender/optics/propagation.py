@@ -29,6 +29,7 @@ from pyklip_diffrender.optics.planes import (
     Values,
     Wavefront,
 )
+from pyklip_diffrender.optics.threads import one_thread_after_fork
 from pyklip_diffrender.parameters import parameter
 
 __all__ = ["Propagation", "Value"]
@@ -36,6 +37,8 @@ __all__ = ["Propagation", "Value"]
 Value = Tensor | ArrayLike | float
 
 _ON_AXIS = (0.0, 0.0)
+
+one_thread_after_fork()
 
 
 class Propagation:
@@ -202,7 +205,8 @@ class Propagation:
         passed: list[PupilGrid] = []
         for plane in reversed(self.planes):
             passed.append(needed)
-            needed = plane.window(values) or needed
+            # A mask acts on all the light in front of it, not only on what is needed behind.
+            needed = plane.window(values) or (self.entrance.full if plane.focal else needed)
         return passed[::-1]
 
     def propagate(self, wavefront: Wavefront, values: Values) -> Tensor:

@@ -33,6 +33,9 @@ from pyklip_diffrender.wavefront.wss import EXTENSION, load_wss_opd
 
 __all__ = ["OPDMap", "as_opd_map", "random_drift", "random_opd", "read_opd", "resample"]
 
+_MAP_NAMES = ("OPD", "OPDMAP", "WFE", "WAVEFRONT")
+"""Names of extensions that hold a wavefront, whatever else is in the file."""
+
 _FLAT_SAMPLES = 256
 """Samples across a flat wavefront, which is the same with any number."""
 
@@ -54,7 +57,8 @@ def read_opd(
     path : path
         FITS file, gzipped or not.
     extension : str or int, optional
-        HDU to read unchanged; default the first with a two-dimensional image.
+        HDU to read unchanged; default the one named OPD (or OPDMAP, WFE, WAVEFRONT), otherwise the
+        first with a two-dimensional image.
     unit : str or Unit, optional
         Unit of the values if the header has no BUNIT.
 
@@ -65,7 +69,8 @@ def read_opd(
     Raises
     ------
     CorruptFileError
-        If the file is missing or truncated, has no two-dimensional image, or is zero everywhere.
+        If the file is missing or truncated, has no two-dimensional image, is an exposure and no
+        map, or is constant inside the pupil, such as a mask.
     UnitError
         If no unit is known, or it is not a length.
     ShapeError
@@ -97,9 +102,11 @@ def read_opd(
             return _checked(load_wss_opd(path))
         hdu = _image(hdus, extension, path)
         raw = native_float64(hdu.data)
+        others = [each.name or k for k, each in enumerate(hdus)]
         header = merged_header(hdus[0].header, hdu.header, path.name)
         sensed = hdu.name == EXTENSION
     unit = unit or header_text(header, "BUNIT", path.name) or ("micron" if sensed else None)
+    _require_wavefront(raw, path.name, hdu.name, others)
     if not unit:
         raise UnitError(
             f"{path.name}: the header has no BUNIT. Give the unit: read_opd(path, unit='m') "
@@ -111,12 +118,6 @@ def read_opd(
         data = raw * u.Unit(spelled).to(u.m)
     except (ValueError, u.UnitConversionError) as error:
         raise UnitError(f"{path.name}: BUNIT is {unit!r}, expected a unit of length") from error
-    if not data.any():
-        raise CorruptFileError(
-            f"{path.name}: all values of the map are zero, expected a measured wavefront. Choose "
-            f"the HDU with extension=, out of {[each.name or k for k, each in enumerate(hdus)]}, "
-            f"or give {FLAT!r} in place of the file where a flat wavefront is meant"
-        )
     date = sensing_date(header, path.name)
     return _checked(OPDMap(data, date, path.name, sha256(path)))
 
@@ -147,10 +148,38 @@ def _image(hdus: fits.HDUList, extension: str | int | None, path: Path) -> Any:
             raise CorruptFileError(
                 f"{path}: no extension {extension!r}; it has {[h.name for h in hdus]}"
             ) from error
-    for hdu in hdus:
-        if getattr(hdu, "data", None) is not None and np.ndim(hdu.data) == 2:
-            return hdu
-    raise CorruptFileError(f"{path}: no two-dimensional image in it; expected an OPD map")
+    exposure = str(hdus[0].header.get("EXP_TYPE", "")).strip()
+    if "SCI" in hdus or exposure:
+        raise CorruptFileError(
+            f"{path.name}: this is no wavefront map, but an exposure"
+            f"{f' of type {exposure}' if exposure else ''}. Expected a map of the wavefront "
+            "sensing (R2022081102-NRCA3_FP1-1.fits, for example) or another OPD map; frames are "
+            "given in place of the frames"
+        )
+    images = [each for each in hdus if each.data is not None and np.ndim(each.data) == 2]
+    if not images:
+        raise CorruptFileError(f"{path}: no two-dimensional image in it; expected an OPD map")
+    return next((each for each in images if each.name in _MAP_NAMES), images[0])
+
+
+def _require_wavefront(
+    values: NDArray[np.float64], name: str, hdu: str, others: list[str | int]
+) -> None:
+    """Raise for an image that is constant in the pupil, such as a mask."""
+    if values.ndim != 2 or values.shape[0] != values.shape[1] or not values.size:
+        return  # `_checked` says that.
+    inside = values[_inside(len(values)) & np.isfinite(values)]
+    different = np.unique(inside)
+    # A mask with struts and gaps of its own has two values inside the pupil.
+    if len(different) > 2 or not len(different):
+        return
+    raise CorruptFileError(
+        f"{name}: the image {hdu or 'in the primary HDU'} is no wavefront: inside the pupil it has "
+        f"only the value{'s' if len(different) > 1 else ''} "
+        f"{' and '.join(f'{value:g}' for value in different)}, as a mask has. Choose the HDU with "
+        f"extension=, out of {others}, or give {FLAT!r} in place of the file where a flat "
+        "wavefront is meant"
+    )
 
 
 @lru_cache(maxsize=8)
