@@ -1,4 +1,4 @@
-"""Factor by which errors are multiplied where the residuals are larger than their noise."""
+"""Errors and thresholds of a search, from the residuals of its fits."""
 
 from __future__ import annotations
 
@@ -11,12 +11,61 @@ from torch import Tensor
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.groups import Group
+from pyklip_diffrender.detection.maps import Maps
+from pyklip_diffrender.detection.significance import Significance
+from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.refinement import Refinement
 
-__all__ = ["error_inflation"]
+__all__ = ["error_inflation", "follows_scatter", "resolution_of", "significance_of"]
 
 _DEGENERATE = 1e-6
 """Relative eigenvalue below which sources are degenerate with each other."""
+
+
+def resolution_of(fit: Refinement) -> float:
+    """lambda/D, arcsec."""
+    return fit.model.bandpass.mean_wavelength / fit.model.diameter / ARCSEC
+
+
+def follows_scatter(fits: Sequence[Refinement]) -> bool:
+    """Whether errors are multiplied by the scatter of the S/N, and not by chi-squared alone.
+
+    On real frames, and where a fit does not explain its data, errors of the model that neighbouring
+    pixels share do not show in chi-squared.
+    """
+    explained = all(fit.status.calibrated for fit in fits)
+    return not explained or fits[0].frames[0].observation.is_nircam
+
+
+def significance_of(
+    fits: Sequence[Refinement],
+    maps: Maps,
+    sources: Tensor,
+    inner: float,
+    scatter: float | None = None,
+) -> Significance:
+    """Errors and thresholds of the S/N maps of fits.
+
+    Parameters
+    ----------
+    fits : sequence of Refinement
+    maps : Maps
+    sources : Tensor, (k, 2)
+        x, y of the known sources, arcsec.
+    inner : float
+        Smallest separation of a source, arcsec.
+    scatter : float, optional
+        Replaces the factor.
+    """
+    return Significance(
+        maps.grid,
+        maps.starlight,
+        maps.correlation,
+        inner,
+        resolution_of(fits[0]),
+        error_inflation(fits, maps.groups, sources) if scatter is None else scatter,
+        scatter is None and follows_scatter(fits),
+    )
 
 
 def error_inflation(fits: Sequence[Refinement], groups: Sequence[Group], offsets: Tensor) -> float:

@@ -78,11 +78,12 @@ class Detection:
     residual_snr : ndarray, (ny, nx)
         The same after the candidates are removed from the data.
     error_factor : ErrorFactor
-        Factor by which errors were multiplied, as a function of separation:
-        ``error_factor.at(0.5)`` is that at 0.5 arcsec.
+        Factor by which errors were multiplied, at every pixel; ``error_factor.at(0.5)`` is its
+        median at 0.5 arcsec.
     candidates : Candidates
     threshold : float
-        Smallest S/N of a candidate.
+        Smallest S/N of a candidate in Gaussian noise. Where errors were scaled to the scatter of
+        the S/N, ``error_factor.threshold(threshold, offsets)`` is that at a position.
     contrast_curve : QTable
         See `contrast.contrast_table`.
     grid : ndarray, (ny, nx, 2)
@@ -159,7 +160,7 @@ class Detection:
 
     @property
     def scatter(self) -> float:
-        """The typical factor by which errors were multiplied: the median over separations."""
+        """The typical factor by which errors were multiplied: the median over the field."""
         return self.error_factor.typical
 
     @cached_property
@@ -410,9 +411,6 @@ class Detection:
             detection = cls(
                 fits=fits,
                 groups=groups_of_searched(fits, facts["fits"], path) if fits else (),
-                error_factor=ErrorFactor(
-                    **{key: np.atleast_1d(v) for key, v in facts["error_factor"].items()}
-                ),
                 threshold=facts["threshold"],
                 candidates=candidates_of(facts["candidates"]),
                 contrast_curve=described(table_of(facts["contrast_curve"])),
