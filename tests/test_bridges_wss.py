@@ -16,7 +16,6 @@ from pyklip_diffrender.bridges import (
     load_wss_opd_by_date,
     opd_to_hdus,
 )
-from pyklip_diffrender.bridges.wss import interpolate_wss
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
@@ -26,6 +25,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.wavefront.opd import read_opd
+from pyklip_diffrender.wavefront.wss import interpolate_wss
 
 NPIX = 256
 

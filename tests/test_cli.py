@@ -24,7 +24,6 @@ from astropy.io import fits
 from astropy.time import Time
 
 from pyklip_diffrender import __version__, plotting, reduction, refinement
-from pyklip_diffrender.bridges import wss
 from pyklip_diffrender.cli import application, main
 from pyklip_diffrender.cli.estimate import steps_of
 from pyklip_diffrender.cli.options import read_config
@@ -33,6 +32,7 @@ from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.wavefront import wss
 from pyklip_diffrender.wavefront.map_choice import RULES
 from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, resample
 

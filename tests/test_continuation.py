@@ -203,7 +203,7 @@ def test_a_companion_can_be_added_to_a_planned_fit(
 ) -> None:
     monkeypatch.setattr(Plan, "allows", lambda plan, error: allowed)
     faint = replace(PLANET, contrast=3e-4)
-    kept = settings(min_model_error=1e-6, cycles=4.0)
+    kept = settings(companions_if_stalled=False, grow_basis=False, cycles=4.0)
     fit = dr.refine(model(), shot(0, faint), before(), settings=kept, plan=coarse_plan())
     assert not len(fit.companions)
     again = refine_again(fit, companions=(faint,))
@@ -255,6 +255,7 @@ def test_a_fit_goes_on_from_where_it_ended() -> None:
     frame = replace(frame, data=frame.data * (1 + 0.05 * rng.normal(size=frame.data.shape)))
     settings = GaussNewton(
         basis=default_basis(CYCLES[0]), response_npix=64, min_model_error=0.002, robust=4.0,
+        companions_if_stalled=False,
         prior=WavefrontPrior({"segment": 10.0, "texture": 6.0}, fit_scales=False),
     )  # fmt: skip
     fit = dr.refine(model(), frame, before(), settings=settings, plan="off")
@@ -314,6 +315,8 @@ BAD: Sequence[tuple[dict[str, object], str]] = [
     ({"response_npix": -64}, r"response_npix: got -64"),
     ({"min_model_error": -0.01}, r"min_model_error: got -0\.01, expected 0 or more"),
     ({"min_model_error": math.nan}, r"min_model_error: got nan, expected 0 or more"),
+    ({"accurate_steps": 0.1}, r"accurate_steps: got 0\.1, expected True or False"),
+    ({"grow_basis": None}, r"grow_basis: got None, expected True or False"),
     ({"max_companions": -1}, r"max_companions: got -1, expected 0 or more"),
     ({"companion_threshold": 0.0}, r"companion_threshold: got 0\.0, expected a positive"),
     ({"drift_cycles": -8.0}, r"drift_cycles: got -8\.0, expected a positive"),

@@ -54,7 +54,7 @@ WHERE = Planet(0.0, 0.7, 60.0)
 FAINT = replace(WHERE, contrast=2e-6)
 """Below the S/N at which the star is refined again."""
 
-NOT_LOOKING = {"min_model_error": 1e-6}
+NOT_LOOKING = {"companions_if_stalled": False, "grow_basis": False, "coarse_first": False}
 """With a model error that is allowed for, fits do not look for companions by themselves."""
 
 Image = NDArray[np.float64]

@@ -10,6 +10,7 @@ from astropy.convolution import convolve
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
+from pyklip_diffrender.bridges.rotation import SplineRotation
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.detector_effects import (
@@ -19,7 +20,6 @@ from pyklip_diffrender.optics.detector_effects import (
     LinearResampling,
     PixelCrosstalk,
 )
-from pyklip_diffrender.optics.rotation import SplineRotation
 
 Array = NDArray[np.float64]
 

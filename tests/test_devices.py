@@ -20,11 +20,12 @@ from pretend_device import DEVICE, pretended
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.bridges import from_poppy
+from pyklip_diffrender.bridges.rotation import SplineRotation
 from pyklip_diffrender.detection import wide_field, with_planets
 from pyklip_diffrender.linear.jacobian import jacobian
 from pyklip_diffrender.optics.detector_effects import GaussianBlur, LinearResampling, PixelCrosstalk
-from pyklip_diffrender.optics.rotation import SplineRotation
-from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Systematics
+from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement
+from pyklip_diffrender.scene.systematics import Systematics
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.refinement import GaussNewton, Systematics
+from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.refinement import accurate_step as accurate
 from pyklip_diffrender.refinement.accurate_step import (
     ModelDerivatives,
@@ -23,6 +23,7 @@ from pyklip_diffrender.refinement.gauss_newton import Solver
 from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
@@ -256,7 +257,7 @@ def count_linearisations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_accurate_steps_keep_their_equations(monkeypatch: pytest.MonkeyPatch) -> None:
     """Until conjugate gradients need more iterations than there are, and until a companion."""
     calls = count_linearisations(monkeypatch)
-    solver, state = solver_of(1, relinearise=0.1, robust=4.0)
+    solver, state = solver_of(1, relinearise=0.1, accurate_steps=True, robust=4.0)
     # Of the model itself: one iteration is enough with equations of nearly the same state.
     solver = of_the_model_itself(solver)
     weights = solver.objective.weights(state, 0.01, 4.0)
@@ -282,7 +283,7 @@ def test_accurate_steps_keep_their_equations(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_equations_that_lead_nowhere_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    solver, state = solver_of(1, relinearise=0.1, robust=4.0)
+    solver, state = solver_of(1, relinearise=0.1, accurate_steps=True, robust=4.0)
     solver = of_the_model_itself(solver)
     after, _ = solver._accurate_step(state, 0.01, len(BASIS))
     calls = count_linearisations(monkeypatch)
@@ -304,7 +305,7 @@ def test_other_weights_need_no_new_jacobian(monkeypatch: pytest.MonkeyPatch) -> 
     calls = count_linearisations(monkeypatch)
     models = []
     for _ in range(2):
-        solver, state = solver_of(2, relinearise=0.1)
+        solver, state = solver_of(2, relinearise=0.1, accurate_steps=True)
         if not models:  # The second solver begins where the first one ends.
             solver.linear_model(state, 0.01, len(BASIS), 4.0, final=False)
         mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)

@@ -14,6 +14,7 @@ from pyklip_diffrender.instrument.masks import ROUND_MASKS
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.fast import path as route
 from pyklip_diffrender.optics.fast.point_sources import PointSources
+from pyklip_diffrender.optics.planes import Plane
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.opd import random_opd
 
@@ -124,12 +125,8 @@ def test_all_pixels_at_once_are_the_pixels_one_by_one(opd: torch.Tensor) -> None
 
 
 def test_another_kind_of_plane_takes_the_models_own_route(opd: torch.Tensor) -> None:
-    class Unknown:
+    class Unknown(Plane):
         name = "unknown"
-        parameters = ()
-
-        def window(self, values: Any) -> None:
-            return None
 
         def apply(self, wavefront: Any, values: Any, onto: Any) -> Any:
             return wavefront

@@ -9,10 +9,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pyklip_diffrender.bridges.maps import opd_to_hdus
     from pyklip_diffrender.bridges.poppy import from_poppy, opd_to_poppy
     from pyklip_diffrender.bridges.webbpsf import from_webbpsf, opd_to_webbpsf
-    from pyklip_diffrender.bridges.wss import load_wss_opd, load_wss_opd_by_date
+    from pyklip_diffrender.wavefront.map_files import opd_to_hdus
+    from pyklip_diffrender.wavefront.wss import load_wss_opd, load_wss_opd_by_date
 
 __all__ = [
     "from_poppy",
@@ -25,17 +25,17 @@ __all__ = [
 ]
 
 _MODULE_OF = {
-    "from_poppy": "poppy",
-    "from_webbpsf": "webbpsf",
-    "load_wss_opd": "wss",
-    "load_wss_opd_by_date": "wss",
-    "opd_to_hdus": "maps",
-    "opd_to_poppy": "poppy",
-    "opd_to_webbpsf": "webbpsf",
+    "from_poppy": "bridges.poppy",
+    "from_webbpsf": "bridges.webbpsf",
+    "load_wss_opd": "wavefront.wss",
+    "load_wss_opd_by_date": "wavefront.wss",
+    "opd_to_hdus": "wavefront.map_files",
+    "opd_to_poppy": "bridges.poppy",
+    "opd_to_webbpsf": "bridges.webbpsf",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    return getattr(import_module(f"pyklip_diffrender.{_MODULE_OF[name]}"), name)

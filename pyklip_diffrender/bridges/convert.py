@@ -14,6 +14,21 @@ from numpy.typing import NDArray
 from poppy.poppy_core import PlaneType
 from torch import Tensor
 
+from pyklip_diffrender.bridges.image_masks import (
+    BoxPart,
+    FourierMask,
+    MaskPart,
+    SampledOcculter,
+    SeparablePart,
+)
+from pyklip_diffrender.bridges.orientation import Orientation
+from pyklip_diffrender.bridges.rotation import FreeRotation
+from pyklip_diffrender.bridges.sampled_planes import (
+    Gain,
+    MovableStop,
+    OrientedPupil,
+    PupilOptic,
+)
 from pyklip_diffrender.bridges.sampling import (
     COMPACT_OPTICS,
     ImageSamples,
@@ -25,22 +40,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, native_float64, to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
-from pyklip_diffrender.optics.masks import (
-    BoxPart,
-    FourierMask,
-    MaskPart,
-    SampledOcculter,
-    SeparablePart,
-)
-from pyklip_diffrender.optics.orientation import Orientation
 from pyklip_diffrender.optics.planes import Plane
-from pyklip_diffrender.optics.rotation import FreeRotation
-from pyklip_diffrender.optics.sampled_planes import (
-    Gain,
-    MovableStop,
-    OrientedPupil,
-    PupilOptic,
-)
 
 __all__ = ["Conversion"]
 

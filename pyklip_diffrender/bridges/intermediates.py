@@ -12,10 +12,10 @@ from astropy import units as u
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pyklip_diffrender.bridges.image_masks import FourierMask, SampledOcculter
+from pyklip_diffrender.bridges.orientation import Orientation
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
-from pyklip_diffrender.optics.masks import FourierMask, SampledOcculter
-from pyklip_diffrender.optics.orientation import Orientation
 from pyklip_diffrender.optics.system import OpticalSystem
 
 __all__ = ["intermediate_wavefronts"]

@@ -16,13 +16,13 @@ from torch import Tensor
 
 from pyklip_diffrender.bridges.convert import Conversion
 from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
+from pyklip_diffrender.bridges.sampled_planes import PupilOptic
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.psf_file import poppy_psf
-from pyklip_diffrender.optics.sampled_planes import PupilOptic
 from pyklip_diffrender.optics.system import OpticalSystem
 
 __all__ = ["PoppySystem", "check_supported", "from_poppy", "opd_to_poppy", "refuse_saving"]

@@ -16,7 +16,7 @@ from poppy.poppy_core import PlaneType
 from scipy.special import jn_zeros
 from torch import Tensor
 
-from pyklip_diffrender.optics.masks import Box
+from pyklip_diffrender.bridges.image_masks import Box
 
 __all__ = ["COMPACT_OPTICS", "ImageSamples", "MaskStack", "Part", "complement_box", "pupil_phasor"]
 

@@ -12,7 +12,10 @@ from astropy import units as u
 from astropy.io import fits
 
 from pyklip_diffrender.bridges.convert import Conversion
-from pyklip_diffrender.bridges.instrument import (
+from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
+from pyklip_diffrender.bridges.poppy import PoppySystem, check_supported, refuse_saving
+from pyklip_diffrender.bridges.sampled_planes import AberrationOptic
+from pyklip_diffrender.bridges.stpsf_instrument import (
     band,
     data_errors,
     kernel_files_left_open,
@@ -20,16 +23,13 @@ from pyklip_diffrender.bridges.instrument import (
     private_copy,
     with_effects,
 )
-from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
-from pyklip_diffrender.bridges.maps import check_opd, opd_to_hdus
-from pyklip_diffrender.bridges.poppy import PoppySystem, check_supported, refuse_saving
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres, to_number
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.psf_file import poppy_psf, save
-from pyklip_diffrender.optics.sampled_planes import AberrationOptic
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.wavefront.map_files import check_opd, opd_to_hdus
 
 __all__ = ["WebbSystem", "from_webbpsf", "opd_to_webbpsf"]
 

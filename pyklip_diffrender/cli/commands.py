@@ -325,7 +325,7 @@ def _reduction(
         from pyklip_diffrender.io.progress import stage
         from pyklip_diffrender.plotting import draw_detection, save
         from pyklip_diffrender.reduction import reduce
-        from pyklip_diffrender.refinement import Systematics
+        from pyklip_diffrender.scene.systematics import Systematics
 
         known: Any = systematics
         if known not in ("auto", "references", "off"):
@@ -387,9 +387,9 @@ def _age(opd: OPDMap, sequence: Sequence) -> str:
 
 def _map(sequence: Sequence, opd: Path | None, folder: Path | None, rule: str | None) -> OPDMap:
     """The wavefront map that the options ask for."""
-    from pyklip_diffrender.bridges.wss import load_wss_opd_by_date
     from pyklip_diffrender.wavefront.map_choice import choose_map
     from pyklip_diffrender.wavefront.opd import as_opd_map
+    from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
 
     if opd is not None:
         return as_opd_map(str(opd))

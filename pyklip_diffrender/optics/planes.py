@@ -27,9 +27,10 @@ those that it declares in `parameters`.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -49,7 +50,6 @@ __all__ = [
     "Plane",
     "Values",
     "Wavefront",
-    "is_occulter",
     "phase_factor",
 ]
 
@@ -75,22 +75,42 @@ class Wavefront:
     grid: PupilGrid
 
 
-class Plane(Protocol):
-    """Interface of the planes of an `OpticalSystem` behind the entrance pupil."""
+class Plane(ABC):
+    """A plane of an `OpticalSystem` behind the entrance pupil; linear in the field.
+
+    Attributes
+    ----------
+    name : str
+    parameters : tuple of str
+        Names of the free parameters that it uses.
+    focal : bool
+        True for a mask in a focus, False for an optic in a pupil.
+    pointwise : bool
+        True if it multiplies each sample of the field in the pupil by a factor that does not
+        depend on the field, and that no gradient has to reach except by `parameters`.
+    sampled : bool
+        True if it is known only at the wavelengths that it was made for.
+    """
 
     name: str
-    parameters: tuple[str, ...]
+    parameters: tuple[str, ...] = ()
+    focal: bool = False
+    pointwise: bool = False
+    sampled: bool = False
 
     def window(self, values: Values) -> PupilGrid | None:
-        """The part of the pupil that this plane passes on; None for all of it."""
+        """Return the part of the pupil that this plane passes on; None for all of it."""
+        return None
 
+    def compact(
+        self, wavelength: float, dtype: torch.dtype, device: torch.device
+    ) -> CompactOcculter | None:
+        """Return a focal mask as one compact occulter at a wavelength; None if it is not one."""
+        return None
+
+    @abstractmethod
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Propagate; `onto` is the window that the planes behind need."""
-
-
-def is_occulter(plane: Plane) -> bool:
-    """Whether a plane is a mask in a focus rather than an optic in a pupil."""
-    return hasattr(plane, "focal_field") or hasattr(plane, "focal_sample")
 
 
 def phase_factor(opd: Tensor, wavelength: float, dtype: torch.dtype) -> Tensor:
@@ -113,6 +133,8 @@ class EntrancePupil:
     """
 
     parameters: tuple[str, ...] = ("star_offset",)
+    sampled: bool = False
+    """True if it is known only at the wavelengths that it was made for."""
     opd: Tensor | None = None
     """The OPD for calls without one, (npix, npix) in m; None for a flat wavefront."""
 
@@ -161,7 +183,7 @@ class EntrancePupil:
         return Wavefront(field, wavelength, self.grid)
 
 
-class LyotStop:
+class LyotStop(Plane):
     """A stop made of polygonal openings that can be shifted and turned, exactly.
 
     The openings are rasterised at every position (`polygon_coverage`), so that the image is a
@@ -177,7 +199,8 @@ class LyotStop:
         Side of the full array, m; `lyot_shift` is a fraction of it.
     """
 
-    parameters: tuple[str, ...] = ("lyot_shift", "lyot_rotation")
+    parameters = ("lyot_shift", "lyot_rotation")
+    pointwise = True
     margin = 0.06
     """Room for shifts and rotations around the openings, as a fraction of the diameter."""
 
@@ -222,7 +245,7 @@ class LyotStop:
         return replace(wavefront, field=field, grid=grid)
 
 
-class InternalAberration:
+class InternalAberration(Plane):
     """Wavefront error of the instrument behind the Lyot stop, in Zernikes on the pupil's disc.
 
     Parameters
@@ -233,7 +256,8 @@ class InternalAberration:
         Wavelength (m) to additional coefficients {Noll index: m}.
     """
 
-    parameters: tuple[str, ...] = ("si_zernikes",)
+    parameters = ("si_zernikes",)
+    pointwise = True
 
     def __init__(
         self,
@@ -251,9 +275,6 @@ class InternalAberration:
         self.chromatic = chromatic
         self._bases: Cache[PupilGrid, Tensor] = Cache()
         self._phasors: Cache[tuple[PupilGrid, float], Tensor] = Cache()
-
-    def window(self, values: Values) -> None:
-        return None
 
     def _basis(self, grid: PupilGrid) -> Tensor:
         def make() -> Tensor:
@@ -284,7 +305,7 @@ class InternalAberration:
         return replace(wavefront, field=wavefront.field * phasor)
 
 
-class CompactOcculter:
+class CompactOcculter(Plane):
     """A focal-plane mask whose complement 1 - t is zero outside a disc.
 
     The field behind it, back in the pupil, is E - F^-1[(1 - t) F[E]]. Only the disc is ever
@@ -301,7 +322,7 @@ class CompactOcculter:
         Cells per lambda / `diameter`; default 4.
     """
 
-    parameters: tuple[str, ...] = ()
+    focal = True
 
     def __init__(
         self,
@@ -325,8 +346,8 @@ class CompactOcculter:
         self._cells: Cache[float, tuple[Tensor, Tensor]] = Cache()
         self._transforms: Cache[tuple[float, PupilGrid], MatrixFourier] = Cache()
 
-    def window(self, values: Values) -> None:
-        return None
+    def compact(self, wavelength: float, dtype: torch.dtype, device: torch.device) -> Self:
+        return self
 
     def cells(self, wavelength: float) -> tuple[Tensor, Tensor]:
         """Cell positions along one axis (radians) and 1 - t on the cells."""

@@ -28,7 +28,6 @@ from pyklip_diffrender.optics.planes import (
     Plane,
     Values,
     Wavefront,
-    is_occulter,
 )
 from pyklip_diffrender.parameters import parameter
 
@@ -232,7 +231,7 @@ class Propagation:
     @property
     def _last_occulter(self) -> int:
         """Number of planes up to the last occulter."""
-        return max((k + 1 for k, plane in enumerate(self.planes) if is_occulter(plane)), default=0)
+        return max((k + 1 for k, plane in enumerate(self.planes) if plane.focal), default=0)
 
     @property
     def parameters_behind(self) -> frozenset[str]:
@@ -273,7 +272,7 @@ class Propagation:
             As in a call of the system.
         """
         open_path = copy.copy(self)
-        open_path.planes = tuple(each for each in self.planes if not is_occulter(each))
+        open_path.planes = tuple(each for each in self.planes if not each.focal)
         values = self.values(parameters)
         with torch.no_grad():
             wavefront = self.pupil_field(self.opd(opd), self.bandpass.mean_wavelength, values)

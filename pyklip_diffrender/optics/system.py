@@ -16,7 +16,6 @@ from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.planes import EntrancePupil, Plane
 from pyklip_diffrender.optics.propagation import Propagation, Value
 from pyklip_diffrender.optics.psf_file import instrument_psf, save
-from pyklip_diffrender.optics.sampled_planes import OrientedPupil, PupilOptic
 
 __all__ = ["OpticalSystem", "Value"]
 
@@ -217,8 +216,7 @@ class OpticalSystem(Propagation):
     @property
     def _is_sampled(self) -> bool:
         """Whether planes are known only at the wavelengths of the bandpass."""
-        planes = (self.entrance, *self.planes)
-        return any(isinstance(plane, OrientedPupil | PupilOptic) for plane in planes)
+        return self.entrance.sampled or any(plane.sampled for plane in self.planes)
 
     def _remade(self, changes: Mapping[str, Any]) -> OpticalSystem:
         """Another system from the same recipe with some changes."""

@@ -280,16 +280,17 @@ class Annealing:
         """Number of leading modes to fit while the model error is kappa."""
         joint_fit = len(self.problems) > 1
         amplitude = len(self.solver.priors.amplitude) > 0
-        everything = self.settings.min_model_error > 0 or amplitude or joint_fit
-        return len(self.basis) if everything or kappa <= _COARSE else self._few_modes
+        coarse = self.settings.coarse_first and not joint_fit and not amplitude
+        fine = kappa <= max(_COARSE, self.settings.min_model_error)
+        return self._few_modes if coarse and not fine else len(self.basis)
 
     def _new_companions(self, state: State, kappa: float, stalled: bool) -> list[Planet]:
         """Companions in the residual of the alignment, or of a wavefront fit that stalled."""
         room = self.settings.max_companions - len(state.joint.frames[0].companions)
         threshold = self.settings.companion_threshold
         if stalled:
-            if self.settings.min_model_error > 0:
-                return []  # Peaks may be due to the assumed model error.
+            if not self.settings.companions_if_stalled:
+                return []
             # One at a time, because the side lobes of a bright companion are peaks as well.
             room, threshold = min(1, room + _MOST_BRIGHT), _BRIGHT
         return bright_companions(self.objective, state, kappa, most=room, threshold=threshold)

@@ -99,9 +99,8 @@ def fit_in_stages(
     if settings.basis is not None or not settings.cycles:
         basis = settings.basis or default_basis(pupil=pupil)
         return Annealing(problems, settings, basis, warm, progress).run(seed)
-    # With an assumed model error the residual need not be missing modes. The number of modes that
-    # drift is fixed.
-    grows = settings.wavefront and settings.min_model_error == 0 and settings.drift is None
+    # The number of modes that drift is fixed.
+    grows = settings.wavefront and settings.grow_basis and settings.drift is None
     cycles_to_try = settings.cycles if grows else settings.cycles[:1]
     fit: Refinement | None = None
     for k, cycles in enumerate(cycles_to_try):

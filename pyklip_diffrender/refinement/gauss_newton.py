@@ -40,11 +40,9 @@ _RESPONSES = 4e9
 """Largest number of bytes of stored derivatives."""
 
 _ACCURATE = 0.05
-"""Value of `GaussNewton.relinearise` above which a quick step that fails, gains less than expected
-or is the last is followed by accurate ones, and largest error of the derivatives that precondition
-these. Without them, fits of bright stars stopped at a chi-squared that was up to a fifth too large:
-along directions in which the effects of unknowns cancel, the curvature of the coarse copy was 20
-times too small."""
+"""Largest error of the derivatives that precondition accurate steps. Without these steps, fits
+of bright stars stopped at a chi-squared that was up to a fifth too large: along directions in which
+the effects of unknowns cancel, the curvature of the coarse copy was 20 times too small."""
 
 _FINAL = 0.01
 """Error of derivatives above which the linear model of such a fit gets new ones. With 0.05, limits
@@ -119,7 +117,6 @@ class Solver:
         )
         self.priors = ModePriors.of(settings, basis, len(problems))
         self.damping = 0.0
-        self._has_accurate_steps = settings.relinearise > _ACCURATE
         self._kappa, self._needs_accurate = math.inf, False
         self._equations: NormalEquations | None = None
         self._has_poor_equations = False
@@ -197,7 +194,7 @@ class Solver:
             self._needs_accurate = False
         self._kappa = kappa
         # Without the wavefront, derivatives are cheap and always accurate.
-        may_repeat = self._has_accurate_steps and modes > 0
+        may_repeat = self.settings.accurate_steps and modes > 0
         if not (may_repeat and self._needs_accurate):
             taken = self._quick_step(state, kappa, modes, may_repeat)
             if taken is not None:
@@ -340,7 +337,7 @@ class Solver:
         layout, equations = state.joint, self._equations
         count = layout.unknowns_with(modes)
         allowed = _FINAL if final else _ACCURATE
-        allowed = allowed if self._has_accurate_steps else self.settings.relinearise
+        allowed = allowed if self.settings.accurate_steps else self.settings.relinearise
         if (
             equations is None
             or self._responses.farthest > allowed

@@ -28,6 +28,12 @@ _REACH = 40
 _LONG_WAVE = 2.4e-6
 """m; beyond, NIRCam has its long-wave detectors, whose pixels are twice as wide."""
 
+_SWITCHES = (
+    "wavefront", "grow_basis", "coarse_first", "widen_prior", "companions_if_stalled",
+    "accurate_steps",
+)  # fmt: skip
+"""Fields of `GaussNewton` that are True or False."""
+
 _PROCESS = 1.3e9
 """Memory that the package and PyTorch take, with what a fit needs for a while, bytes."""
 
@@ -48,7 +54,14 @@ class GaussNewton:
         Fit the wavefront; False fits the alignment only.
     cycles : tuple of float
         Highest spatial frequencies of the default basis, in cycles across the pupil. The first
-        one is fitted; the next one is tried while the data are not explained.
+        one is fitted.
+    grow_basis : bool
+        Fit with the next value of `cycles` while the data are not explained. False where the
+        residual need not be missing modes.
+    coarse_first : bool
+        Fit only modes up to 14 cycles while the model error is above a percent of the star, which
+        is faster. Fits of several frames, or with a free pupil amplitude, have all modes from the
+        beginning.
     basis : Basis, optional
         Wavefront modes, in place of the default basis: Fourier modes and, for JWST, the motions of
         its segments.
@@ -76,6 +89,10 @@ class GaussNewton:
         residual of the alignment fit.
     companion_threshold : float
         Smallest S/N of such companions, in units of the scatter of the matched filter.
+    companions_if_stalled : bool
+        Where the fit of the wavefront stalls far above the noise, search the residual for bright
+        companions, one at a time and up to eight more than `max_companions`. False for frames
+        whose residual has peaks that are errors of the model.
     response_npix : int
         Pupil samples of the coarse copy of the model that computes derivatives.
     response_wavelengths : int
@@ -90,9 +107,10 @@ class GaussNewton:
     relinearise : float
         Relative error of derivatives (radians of phase, rms over the pupil) beyond which the
         response to the wavefront is recomputed, see `pyklip_diffrender.linear.responses.Responses`.
-        With more than 0.05, a step that fails, gains less than expected or is the last is followed
-        by steps with derivatives of the model itself, see
-        ``pyklip_diffrender.refinement.accurate_step``.
+    accurate_steps : bool
+        Follow a step that fails, gains less than expected or is the last by steps with derivatives
+        of the model itself, see ``pyklip_diffrender.refinement.accurate_step``. Fits of bright
+        stars need them; `relinearise` may then be twice as large.
     robust : float
         Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain
         least squares.
@@ -122,6 +140,8 @@ class GaussNewton:
     own: tuple[str, ...] = ("star_offset", "flux", "background")
     wavefront: bool = True
     cycles: tuple[float, ...] = (24.0, 32.0)
+    grow_basis: bool = True
+    coarse_first: bool = True
     basis: Basis | None = None
     deviations: Mapping[str, float] = field(default_factory=dict)
     prior: WavefrontPrior = field(default_factory=WavefrontPrior)
@@ -131,12 +151,14 @@ class GaussNewton:
     companions: tuple[Planet, ...] = ()
     max_companions: int = 0
     companion_threshold: float = 4.0
+    companions_if_stalled: bool = True
     response_npix: int = 128
     response_wavelengths: int = 4
     max_iterations: int = 40
     tolerance: float = 1e-3
     min_model_error: float = 0.0
     relinearise: float = 0.05
+    accurate_steps: bool = False
     robust: float = math.inf
     star_flux_error: float | None = None
     memory: float | None = None
@@ -169,6 +191,11 @@ class GaussNewton:
             raise IncompatibleSetupError("cycles: got none, expected at least one, such as 24")
         if not all(each > 0 for each in self.cycles):
             raise IncompatibleSetupError(f"cycles: got {self.cycles}, expected positive numbers")
+        for name in _SWITCHES:
+            if not isinstance(getattr(self, name), bool):
+                raise IncompatibleSetupError(
+                    f"{name}: got {getattr(self, name)!r}, expected True or False"
+                )
         _require_positive(
             self,
             "max_iterations",
@@ -283,13 +310,18 @@ class GaussNewton:
             widen_prior=True,
             # Finer modes cost time and leave chi-squared within 3 %.
             cycles=(_cycles_to_edge("F444W" if filter is None else filter),),
+            grow_basis=False,
+            coarse_first=False,
             deviations={"star_offset": 0.003, "lyot_shift": 0.004, "lyot_rotation": 0.2},
             max_companions=1,
             companion_threshold=3.0,
+            # Peaks may be due to the model error.
+            companions_if_stalled=False,
             robust=3.0,
             min_model_error=0.01,
             max_iterations=40,
             relinearise=0.1,
+            accurate_steps=True,
             tolerance=5e-4,
         )
         # Parameters that are not free need no prior.

@@ -118,9 +118,23 @@ def text_hdu(name: str, content: Mapping[str, Any]) -> fits.ImageHDU:
     return fits.ImageHDU(np.frombuffer(text.encode(), dtype=np.uint8), name=name)
 
 
+def _of_this_version(content: dict[str, Any]) -> dict[str, Any]:
+    """Content of a file in which tolerances of the settings implied modes of the fit."""
+    settings = content.get("settings")
+    if not isinstance(settings, dict) or settings.get("class") != GaussNewton.__name__:
+        return content
+    values = settings["fields"]
+    if "accurate_steps" not in values:
+        searches = not values["min_model_error"] > 0
+        values |= dict.fromkeys(("grow_basis", "coarse_first", "companions_if_stalled"), searches)
+        values["accurate_steps"] = values["relinearise"] > 0.05
+    return content
+
+
 def text_of(hdus: fits.HDUList, name: str) -> dict[str, Any]:
     """Return the content of an extension that `text_hdu` made."""
-    content = json.loads(np.asarray(hdus[name].data, dtype=np.uint8).tobytes().decode())
+    text = np.asarray(hdus[name].data, dtype=np.uint8).tobytes().decode()
+    content = _of_this_version(json.loads(text))
     return {key: decoded(value) for key, value in content.items()}
 
 

@@ -22,9 +22,10 @@ _PIXEL = 0.063
 _MEMORY = re.compile(r"\d+(\.\d+)? ?([kMGT]i?)?B")
 
 _SETTINGS = (
-    "free", "own", "wavefront", "cycles", "deviations", "drift_cycles", "max_companions",
-    "companion_threshold", "response_npix", "response_wavelengths", "max_iterations", "tolerance",
-    "min_model_error", "relinearise", "robust",
+    "free", "own", "wavefront", "cycles", "grow_basis", "coarse_first", "deviations",
+    "drift_cycles", "max_companions", "companion_threshold", "companions_if_stalled",
+    "response_npix", "response_wavelengths", "max_iterations", "tolerance", "min_model_error",
+    "relinearise", "accurate_steps", "robust",
 )  # fmt: skip
 """Fields of GaussNewton whose values TOML can hold."""
 

@@ -15,7 +15,6 @@ from astropy.io import fits
 from astropy.time import Time
 from astropy.utils.exceptions import AstropyUserWarning
 
-from pyklip_diffrender.bridges.wss import EXTENSION, interpolate_wss
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
@@ -26,6 +25,7 @@ from pyklip_diffrender.io.headers import header_text, merged_header, sensing_dat
 from pyklip_diffrender.io.opd_map import FLAT, OPDMap
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.wavefront.opd import as_opd_map, read_opd
+from pyklip_diffrender.wavefront.wss import EXTENSION, interpolate_wss
 
 __all__ = ["RULES", "Rule", "choose_map", "dated_maps", "wavefront_for"]
 

@@ -16,7 +16,6 @@ from astropy import units as u
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from pyklip_diffrender.bridges.wss import EXTENSION, load_wss_opd
 from pyklip_diffrender.errors import (
     CorruptFileError,
     NonFiniteError,
@@ -30,6 +29,7 @@ from pyklip_diffrender.io.opd_map import FLAT, OPDMap
 from pyklip_diffrender.io.units import native_float64, to_metres, to_number, warn_of_rms
 from pyklip_diffrender.optics.grid import PupilGrid, resample
 from pyklip_diffrender.wavefront.bases import FourierModes, SegmentMotions
+from pyklip_diffrender.wavefront.wss import EXTENSION, load_wss_opd
 
 __all__ = ["OPDMap", "as_opd_map", "drift", "random_drift", "random_opd", "read_opd", "resample"]
 
@@ -47,7 +47,7 @@ def read_opd(
     Maps of the mission's wavefront sensing from MAST are recognised by their extension
     RESULT_PHASE. They are in microns without a unit in the header, and contain the aberrations of
     the sensing camera. These are subtracted with stpsf's models if stpsf and its data are
-    installed; otherwise they are kept, with a warning. See `bridges.load_wss_opd`.
+    installed; otherwise they are kept, with a warning. See `wss.load_wss_opd`.
 
     Parameters
     ----------

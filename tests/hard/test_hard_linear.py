@@ -9,10 +9,15 @@ import pytest
 import torch
 from hard_cases import DTYPES, WAVELENGTH, small
 
+from pyklip_diffrender.bridges.image_masks import (
+    BoxPart,
+    FourierMask,
+    SampledOcculter,
+    SeparablePart,
+)
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
-from pyklip_diffrender.optics.masks import BoxPart, FourierMask, SampledOcculter, SeparablePart
 from pyklip_diffrender.optics.planes import Plane, Wavefront
 from pyklip_diffrender.optics.system import OpticalSystem
 

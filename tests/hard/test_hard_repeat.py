@@ -14,10 +14,10 @@ from astropy.io import fits
 from hard_cases import DTYPES, NPIX, small, system, wavefront, worst
 from stability_fits import error_of, fitted, noise, observed, star
 
+from pyklip_diffrender.bridges.image_masks import FourierMask
 from pyklip_diffrender.io.files import open_fits, write_fits
 from pyklip_diffrender.optics.differentiation import Cache, Position
 from pyklip_diffrender.optics.grid import JWST_DIAMETER, PupilGrid
-from pyklip_diffrender.optics.masks import FourierMask
 from pyklip_diffrender.optics.planes import Wavefront
 from pyklip_diffrender.scene.objects import Planet, Scene
 from pyklip_diffrender.scene.simulation import simulate

@@ -31,28 +31,16 @@ from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import (
     CompactOcculter,
     EntrancePupil,
-    InternalAberration,
-    LyotStop,
     Plane,
     Values,
     Wavefront,
 )
-from pyklip_diffrender.optics.sampled_planes import Gain, PupilOptic
 
-__all__ = ["LatticeRoute", "is_pointwise"]
-
-_POINTWISE = (Gain, InternalAberration, LyotStop, PupilOptic)
+__all__ = ["LatticeRoute"]
 
 _LARGE = 512
 """Samples across a pupil above which arrays do not fit into the cache. Only then is it faster to
 compute the field a second time for its derivative."""
-
-
-def is_pointwise(plane: Plane) -> bool:
-    """Whether a plane multiplies the field in the pupil, each sample by its own fixed factor."""
-    return isinstance(plane, _POINTWISE) and not (
-        isinstance(plane, PupilOptic) and plane.opd is not None
-    )
 
 
 class LatticeRoute:
@@ -81,7 +69,7 @@ class LatticeRoute:
     def serves(planes: Sequence[Plane]) -> bool:
         """Whether the planes are one `CompactOcculter` and otherwise factors in pupils."""
         others = [plane for plane in planes if not isinstance(plane, CompactOcculter)]
-        return len(planes) - len(others) == 1 and all(is_pointwise(plane) for plane in others)
+        return len(planes) - len(others) == 1 and all(plane.pointwise for plane in others)
 
     @property
     def occulter(self) -> CompactOcculter:

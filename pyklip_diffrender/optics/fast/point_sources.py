@@ -22,9 +22,8 @@ from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.batches import batch_of
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.fast.occulter import OcculterLattice
-from pyklip_diffrender.optics.fast.path import LatticeRoute, is_pointwise
+from pyklip_diffrender.optics.fast.path import LatticeRoute
 from pyklip_diffrender.optics.fourier import MatrixFourier
-from pyklip_diffrender.optics.masks import SampledOcculter
 from pyklip_diffrender.optics.planes import CompactOcculter, Plane, Wavefront
 from pyklip_diffrender.optics.system import OpticalSystem, Value
 
@@ -90,10 +89,10 @@ class PointSources:
             if self._opd.ndim != 2:
                 raise ShapeError(f"opd: got shape {tuple(self._opd.shape)}, expected one map")
             self._values = {name: value.detach() for name, value in model.values(fixed).items()}
-            self._radius, self.reach = 0.0, math.inf
+            self._radius, self.reach, self._reduced = 0.0, math.inf, False
             self._waves = self._prepared(sampling)
             self.route = "lattice" if self._waves else "model"
-            if any(isinstance(p, SampledOcculter) for p in model.planes) and not self._agrees():
+            if not self._agrees():
                 self._waves, self.route = [], "model"
             self.reach = self._reach()
         _log.debug("images of point sources: method %r", self.route)
@@ -105,6 +104,7 @@ class PointSources:
             planes = _one_mask(self.model, wavelength)
             if planes is None:
                 return []
+            self._reduced |= planes != list(self.model.planes)
             masks = [plane.radius for plane in planes if isinstance(plane, CompactOcculter)]
             self._radius = max(self._radius, *masks, 0.0)
             waves.append(self._wave(planes, wavelength, sampling))
@@ -112,7 +112,7 @@ class PointSources:
 
     def _agrees(self) -> bool:
         """Whether images agree with those of the model, between the middle and a corner."""
-        if self.route == "model":
+        if self.route == "model" or not self._reduced:
             return True
         ny, nx = self.model.detector.shape
         share = torch.tensor([0.55, 0.65, 0.8, 1.0], dtype=torch.float64)
@@ -240,19 +240,19 @@ class PointSources:
 
 
 def _one_mask(model: OpticalSystem, wavelength: float) -> list[Plane] | None:
-    """Reduce sampled masks to their first part.
+    """Replace focal masks by compact occulters.
 
     Returns None unless the planes are at most one mask between factors in the pupil.
     """
     planes: list[Plane] = []
     for plane in model.planes:
-        if isinstance(plane, SampledOcculter):
-            compact = plane.compact(wavelength, model.dtype, model.device)
-            if compact is None:
-                return None
-            plane = compact
-        planes.append(plane)
-    if LatticeRoute.serves(planes) or all(is_pointwise(plane) for plane in planes):
+        each: Plane | None = plane
+        if plane.focal:
+            each = plane.compact(wavelength, model.dtype, model.device)
+        if each is None:
+            return None
+        planes.append(each)
+    if LatticeRoute.serves(planes) or all(plane.pointwise for plane in planes):
         return planes
     return None
 

@@ -9,30 +9,33 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from astropy.time import Time
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import zoom
 
-from pyklip_diffrender.bridges.maps import check_opd, opd_to_hdus
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
     IncompatibleSetupError,
     MissingOPDError,
 )
-from pyklip_diffrender.instrument.jwst import jwst_pupil
 from pyklip_diffrender.io.files import open_fits, sha256
 from pyklip_diffrender.io.headers import header_text, sensing_date
 from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.units import native_float64, require_shape
+from pyklip_diffrender.wavefront.map_files import check_opd
+from pyklip_diffrender.wavefront.sensing import (
+    TO_METRES,
+    finest_pupil,
+    pupil_samples,
+    sensing_terms,
+    stpsf_module,
+)
 
 __all__ = ["EXTENSION", "interpolate_wss", "load_wss_opd", "load_wss_opd_by_date"]
 
@@ -40,12 +43,6 @@ Array = NDArray[np.float64]
 
 EXTENSION = "RESULT_PHASE"
 """Name of the extension that holds the map; only these files have one."""
-
-_TARGET_PHASES = {
-    "NRCA3_FP1": "wss_target_phase_fp1.fits",
-    "NRCA1_FP6": "wss_target_phase_fp6.fits",
-}
-_TO_METRES = {"um": 1e-6, "micron": 1e-6, "microns": 1e-6, "m": 1.0, "meter": 1.0, "nm": 1e-9}
 
 
 def load_wss_opd(
@@ -108,17 +105,17 @@ def load_wss_opd(
         # MAST's files are in microns and do not say so.
         unit = header_text(hdus[EXTENSION].header, "BUNIT", path.name) or "micron"
     require_shape(coarse, (None, None), f"{path}: {EXTENSION}", "It must be an image")
-    if unit.strip().lower() not in _TO_METRES:
+    if unit.strip().lower() not in TO_METRES:
         raise IncompatibleSetupError(f"{path}: {EXTENSION} has BUNIT={unit!r}, expected 'micron'")
     if not coarse.any():
         raise CorruptFileError(
             f"{path}: all values of {EXTENSION} are zero, expected a measured wavefront. Fetch "
             "the file again"
         )
-    npix = npix or _finest_pupil()
+    npix = npix or finest_pupil()
     aperture = header.get("APERNAME", "")
-    pupil = _pupil(npix, required=backout_si_wfe is True)
-    opd = _interpolated(_gaps_filled(coarse), npix) * _TO_METRES[unit.strip().lower()]
+    pupil = pupil_samples(npix, required=backout_si_wfe is True)
+    opd = _interpolated(_gaps_filled(coarse), npix) * TO_METRES[unit.strip().lower()]
     history = [
         f"{path.name} sha256 {sha256(path)}",
         f"gaps filled, interpolated from {len(coarse)} to {npix} samples, {unit} to m, masked",
@@ -127,7 +124,7 @@ def load_wss_opd(
     opd = opd * pupil
     if backout_si_wfe is not False:
         try:
-            terms, source = _sensing_terms(aperture, opd, npix, path.name)
+            terms, source = sensing_terms(aperture, opd, npix, path.name)
         except (CorruptFileError, IncompatibleSetupError) as error:
             if backout_si_wfe:
                 raise
@@ -187,7 +184,7 @@ def load_wss_opd_by_date(
         raise IncompatibleSetupError(
             f"choice: got {choice!r}, expected 'closest', 'before', 'after' or 'interpolate'"
         )
-    mast_wss = _stpsf("to ask MAST").mast_wss
+    mast_wss = stpsf_module("to ask MAST").mast_wss
     when = Time(date)
     cache = None if folder is None else os.fspath(folder)
     choices = ("before", "after") if choice == "interpolate" else (choice,)
@@ -278,83 +275,3 @@ def _has_values(coarse: Array, npix: int) -> NDArray[np.bool_]:
     """Samples of the output at which the map has values."""
     index = (np.arange(npix) * len(coarse)) // npix
     return (coarse != 0)[np.ix_(index, index)]
-
-
-def _stpsf(purpose: str) -> Any:
-    """The module stpsf, with its submodule for MAST."""
-    try:
-        import stpsf
-        import stpsf.mast_wss
-    except ImportError as error:
-        raise IncompatibleSetupError(
-            f"stpsf is needed {purpose} and is not installed ({error}): "
-            'pip install "pyklip-diffrender[webbpsf]"'
-        ) from error
-    return stpsf
-
-
-def _data_folder() -> Path | None:
-    folder = os.environ.get("STPSF_PATH") or os.environ.get("WEBBPSF_PATH")
-    return Path(folder) if folder else None
-
-
-def _finest_pupil() -> int:
-    """Samples across the finest pupil in stpsf's data; 1024 without such data."""
-    folder = _data_folder()
-    names = [] if folder is None else [path.name for path in folder.glob("jwst_pupil_RevW_npix*")]
-    matches = [re.search(r"npix(\d+)\.fits", name) for name in names]
-    return max((int(match[1]) for match in matches if match), default=1024)
-
-
-def _pupil(npix: int, required: bool) -> Array:
-    """1 inside the pupil: that of stpsf's data if available, otherwise of the embedded outlines."""
-    folder = _data_folder()
-    for ending in ("fits.gz", "fits"):
-        path = None if folder is None else folder / f"jwst_pupil_RevW_npix{npix}.{ending}"
-        if path is not None and path.is_file():
-            with open_fits(path) as hdus:
-                return native_float64(hdus[0].data != 0)
-    if required:
-        raise CorruptFileError(
-            f"jwst_pupil_RevW_npix{npix}.fits.gz is not in STPSF_PATH ({folder}). Set it to the "
-            "complete stpsf data files, choose another npix, or pass backout_si_wfe=False"
-        )
-    return native_float64(jwst_pupil(npix) > 0)
-
-
-def _sensing_terms(aperture: str, opd: Array, npix: int, name: str) -> tuple[Array, str]:
-    """Sum of the camera's aberration and the telescope's field dependence (m), and its source."""
-    if not aperture:
-        raise CorruptFileError(
-            f"{name}: no APERNAME in the primary header, so the sensing camera is not known. Pass "
-            "backout_si_wfe=False to keep the sum"
-        )
-    folder = _data_folder()
-    if folder is None:
-        raise CorruptFileError(
-            "STPSF_PATH is not set. Set it to the complete stpsf data files, or pass "
-            "backout_si_wfe=False"
-        )
-    stpsf = _stpsf("to subtract the sensing terms")
-    try:
-        instrument = stpsf.instrument(aperture[:3])
-        instrument.pupil = str(next(folder.glob(f"jwst_pupil_RevW_npix{npix}.fits*")))
-        instrument.pupilopd = opd_to_hdus(opd)
-        instrument.set_position_from_aperture_name(aperture)
-        if aperture in _TARGET_PHASES:
-            source = _TARGET_PHASES[aperture]
-            with open_fits(folder / "NIRCam" / "OPD" / source) as hdus:
-                scale = _TO_METRES[str(hdus[0].header.get("BUNIT", "m")).strip().lower()]
-                si_wfe = native_float64(hdus[0].data) * scale
-        else:
-            source = "Zernikes of the internal aberrations"
-            si_wfe = native_float64(instrument.get_wfe("si"))
-        ote_wfe = native_float64(instrument.get_wfe("ote_field_dep"))
-    except (RuntimeError, FileNotFoundError, StopIteration, ValueError, KeyError) as error:
-        raise CorruptFileError(
-            f"the models of stpsf for {aperture!r} could not be read from {folder} ({error}). "
-            "STPSF_PATH must hold the complete stpsf data files"
-        ) from error
-    if len(si_wfe) != npix:
-        si_wfe = native_float64(zoom(si_wfe, npix / len(si_wfe)))
-    return si_wfe + ote_wfe, source

@@ -11,7 +11,7 @@ from scipy.ndimage import spline_filter1d
 from torch import Tensor
 
 from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.planes import Values, Wavefront
+from pyklip_diffrender.optics.planes import Plane, Values, Wavefront
 
 __all__ = ["FreeRotation", "SplineRotation"]
 
@@ -79,7 +79,7 @@ class SplineRotation:
         return total
 
 
-class FreeRotation:
+class FreeRotation(Plane):
     """A rotation of the field in a pupil by any angle.
 
     Parameters
@@ -87,8 +87,6 @@ class FreeRotation:
     angle : float
         Degrees, counter-clockwise (from +x to +y), frame of the system.
     """
-
-    parameters: tuple[str, ...] = ()
 
     def __init__(self, angle: float, npix: int, diameter: float, name: str) -> None:
         self.name = name

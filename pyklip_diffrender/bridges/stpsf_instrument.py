@@ -14,6 +14,7 @@ from astropy import units as u
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from pyklip_diffrender.bridges.rotation import SplineRotation
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
@@ -25,7 +26,6 @@ from pyklip_diffrender.optics.detector_effects import (
     LinearResampling,
     PixelCrosstalk,
 )
-from pyklip_diffrender.optics.rotation import SplineRotation
 
 __all__ = [
     "band",

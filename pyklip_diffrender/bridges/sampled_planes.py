@@ -14,10 +14,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from pyklip_diffrender.bridges.orientation import Orientation
 from pyklip_diffrender.optics.differentiation import Cache, Position, cached, position_of
 from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.orientation import Orientation
-from pyklip_diffrender.optics.planes import EntrancePupil, Values, Wavefront, phase_factor
+from pyklip_diffrender.optics.planes import EntrancePupil, Plane, Values, Wavefront, phase_factor
 from pyklip_diffrender.optics.zernike import zernike_basis
 from pyklip_diffrender.parameters import parameter
 
@@ -52,6 +52,8 @@ class OrientedPupil(EntrancePupil):
         Sum of the squared amplitude of the true pupil, in units of a sample's area. Default that of
         `amplitude`, which is smaller if samples are means over partly blocked areas.
     """
+
+    sampled = True
 
     def __init__(
         self,
@@ -98,7 +100,7 @@ class OrientedPupil(EntrancePupil):
         return super().field(opd, wavelength, offset)
 
 
-class PupilOptic:
+class PupilOptic(Plane):
     """Amplitude and phase in a pupil plane, one array per wavelength.
 
     Parameters
@@ -115,7 +117,7 @@ class PupilOptic:
         the frame of this plane, to optimise by their gradients.
     """
 
-    parameters: tuple[str, ...] = ()
+    sampled = True
 
     def __init__(
         self,
@@ -148,6 +150,11 @@ class PupilOptic:
         if trainable:
             self.opd = torch.zeros(size, size, dtype=dtype, device=device).requires_grad_()
             self.transmission = torch.ones_like(self.opd).requires_grad_()
+
+    @property
+    def pointwise(self) -> bool:  # type: ignore[override]
+        """See `Plane`: false if the factors are trained."""
+        return self.opd is None
 
     def window(self, values: Values) -> PupilGrid:
         """The window with all samples that transmit light at some wavelength."""
@@ -286,7 +293,7 @@ class AberrationOptic(PupilOptic):
 
 
 @dataclass
-class Gain:
+class Gain(Plane):
     """A uniform factor; 1 for a plane without effect on the field.
 
     Attributes
@@ -298,11 +305,7 @@ class Gain:
 
     name: str
     factor: complex = 1.0
-    parameters: tuple[str, ...] = ()
-
-    def window(self, values: Values) -> None:
-        """See `Plane`: the whole field passes."""
-        return None
+    pointwise = True
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Multiply."""

@@ -21,7 +21,7 @@ from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.differentiation import Cache, Position, cached
 from pyklip_diffrender.optics.fourier import MatrixFourier
 from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.optics.planes import CompactOcculter, Values, Wavefront
+from pyklip_diffrender.optics.planes import CompactOcculter, Plane, Values, Wavefront
 
 __all__ = ["Box", "BoxPart", "FourierMask", "MaskPart", "SampledOcculter", "SeparablePart"]
 
@@ -166,7 +166,7 @@ class SeparablePart:
         return self._convolved(field, "x", wavefront, spacing, onto)
 
 
-class SampledOcculter:
+class SampledOcculter(Plane):
     """A mask that is clear except for its parts, which share a lattice.
 
     Parameters
@@ -177,7 +177,7 @@ class SampledOcculter:
         Lattice points per lambda / `diameter`.
     """
 
-    parameters: tuple[str, ...] = ()
+    focal = True
 
     def __init__(
         self, parts: Sequence[MaskPart], sampling: float, diameter: float, name: str
@@ -189,10 +189,6 @@ class SampledOcculter:
             )
         self.name, self.parts = name, tuple(parts)
         self.sampling, self.diameter = sampling, diameter
-
-    def window(self, values: Values) -> None:
-        """See `Plane`: the whole field passes."""
-        return None
 
     def _spacing(self, wavelength: float) -> float:
         return wavelength / self.diameter / self.sampling
@@ -239,7 +235,7 @@ class SampledOcculter:
         return replace(wavefront, field=field, grid=onto)
 
 
-class FourierMask:
+class FourierMask(Plane):
     """A mask of any kind by FFTs of the padded pupil, as in poppy.
 
     Parameters
@@ -252,7 +248,7 @@ class FourierMask:
         Lattice points per lambda / diameter.
     """
 
-    parameters: tuple[str, ...] = ()
+    focal = True
 
     def __init__(
         self,
