@@ -13,6 +13,7 @@ errors follows Student's t, and the threshold of a search has to be higher.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,8 +38,12 @@ _KNOTS = 8
 _LENGTH = 1.0
 """Correlation length of g in log r: separations that differ by less than a factor of e share it."""
 
-_SPREAD = 1.0
-"""Prior standard deviation of g, of log A and, doubled, of log B."""
+_SPREAD = 0.5
+"""Prior standard deviation of g and of log A: f departs by a quarter from the law of starlight."""
+
+_STARLIGHT = -1.0
+_STARLIGHT_SPREAD = 1.0
+"""Prior mean and standard deviation of log B. Single rolls of four stars gave B of 0 to 5."""
 
 CLIP = 4.0
 """Standard deviations at which S/N is clipped, so that sources that are not yet candidates do not
@@ -46,6 +51,9 @@ raise the threshold of others."""
 
 _THINNING = 2
 """Distance between the rows, and the columns, of pixels to which the factor is fitted."""
+
+_MEDIAN = float(stats.chi2.median(1))
+"""Median of the square of Gaussian noise."""
 
 _STEPS = 30
 """Largest number of steps of the fit."""
@@ -192,16 +200,19 @@ class ScatterModel:
     def evaluate(self, parameters: NDArray[np.float64]) -> tuple[Image, Image]:
         """Return log f^2, (n,), and its derivatives, (n, parameters)."""
         quiet = np.exp(_SPREAD * parameters[0])
-        bright = np.exp(_BM + _BS * parameters[1]) * self.starlight
+        bright = np.exp(_STARLIGHT + _STARLIGHT_SPREAD * parameters[1]) * self.starlight
         share = quiet / (quiet + bright)
-        slopes = np.column_stack([_SPREAD * share, _BS * (1 - share), self.rings])
+        slopes = np.column_stack([_SPREAD * share, _STARLIGHT_SPREAD * (1 - share), self.rings])
         return np.log(quiet + bright) + self.rings @ parameters[2:], slopes
 
     def __getitem__(self, selected: NDArray[np.bool_]) -> ScatterModel:
         return ScatterModel(self.starlight[selected], self.rings[selected])
 
     def fit(
-        self, squares: NDArray[np.float64], independent: float
+        self,
+        squares: NDArray[np.float64],
+        independent: float,
+        start: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Most probable parameters and their covariance.
 
@@ -213,11 +224,14 @@ class ScatterModel:
         squares : ndarray, (n,)
             Squares of the S/N.
         independent : float
+        start : ndarray, (parameters,), optional
         """
-        parameters = np.zeros(2 + self.rings.shape[1])
-        prior = np.eye(len(parameters))
-        # A start from which clipping does not hide a scatter that is large everywhere.
-        parameters[0] = np.log(np.median(squares) / stats.chi2.median(1)) / _SPREAD
+        prior = np.eye(2 + self.rings.shape[1])
+        if start is None:
+            # From here clipping does not hide a scatter that is large everywhere.
+            start = np.zeros(len(prior))
+            start[0] = np.log(np.median(squares) / _MEDIAN) / _SPREAD
+        parameters = start
         for _ in range(_STEPS):
             logs, slopes = self.evaluate(parameters)
             excess = np.minimum(squares * np.exp(-logs), CLIP**2) - 1
@@ -276,16 +290,43 @@ class Scatter:
         sources : Tensor or ndarray, (k, 2)
             x, y of sources, which are left out with their surroundings.
         """
+        fit = self._fit(snr, sources)
+        if fit is None:
+            return ErrorFactor.constant(1.0)
+        factors, freedom = self._evaluate(self._model, *fit)
+        return ErrorFactor(factors.reshape(snr.shape), freedom.reshape(snr.shape), self.grid)
+
+    def judged(
+        self, snr: Image, sources: Tensor | Image, pixels: Sequence[tuple[int, int]]
+    ) -> Iterator[tuple[float, float]]:
+        """Factor and degrees of freedom at pixels, each without the pixel and its surroundings."""
+        start = self._fit(snr, sources)
+        for pixel in pixels:
+            left_out = np.concatenate([np.asarray(sources), self.grid[pixel][None]])
+            fit = self._fit(snr, left_out, None if start is None else start[0])
+            if fit is None:
+                yield 1.0, np.inf
+                continue
+            index = np.zeros(snr.shape, dtype=bool)
+            index[pixel] = True
+            factors, freedom = self._evaluate(self._model[index.ravel()], *fit)
+            yield float(factors[0]), float(freedom[0])
+
+    def _fit(
+        self, snr: Image, sources: Tensor | Image, start: NDArray[np.float64] | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Parameters and their covariance; None if hardly any pixels are left."""
         away = far_from(self.grid, sources, _WINGS * self.resolution)
         clear = self._used & np.isfinite(snr) & away
         if clear.sum() * self._independent < 1:
-            return ErrorFactor.constant(1.0)
-        part = self._model[clear.ravel()]
-        parameters, covariance = part.fit(snr[clear] ** 2, self._independent)
-        logs, slopes = self._model.evaluate(parameters)
-        # A variance that is known to a relative 2 / n is that of n values.
+            return None
+        return self._model[clear.ravel()].fit(snr[clear] ** 2, self._independent, start)
+
+    @staticmethod
+    def _evaluate(
+        model: ScatterModel, parameters: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Factors and degrees of freedom, (n,): a variance known to a relative 2 / n is of n."""
+        logs, slopes = model.evaluate(parameters)
         variance = ((slopes @ covariance) * slopes).sum(axis=1)
-        shape = snr.shape
-        return ErrorFactor(
-            np.exp(logs / 2).reshape(shape), (2 / variance).reshape(shape), self.grid
-        )
+        return np.exp(logs / 2), 2 / variance

@@ -14,6 +14,7 @@ from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.error_inflation import (
+    chi2_by_ring,
     error_inflation,
     follows_scatter,
     resolution_of,
@@ -32,6 +33,7 @@ from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.measurement import contrasts_at
 from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
 from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.tables import measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -119,7 +121,7 @@ def detect(
     _require_positive(threshold=threshold, inner=inner, scatter=scatter)
     maps = Maps(groups_of(fits), progress)
     known = Candidates.of_fit(fits[0])
-    candidates, factor = _search(maps, fits, known, threshold, inner, scatter)
+    candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
     if not all(fit.status.calibrated for fit in fits):
         relinearise = min(relinearise, threshold)
     bright = candidates.snr(factor) > relinearise
@@ -132,7 +134,9 @@ def detect(
     elif bright.any() and lacks_candidates(fits, candidates):
         fits = with_companions(fits, candidates, progress)
         maps = Maps(groups_of(fits), progress)
-        candidates, factor = _search(maps, fits, candidates, threshold, inner, scatter)
+        candidates, factor, significance = _search(
+            maps, fits, candidates, threshold, inner, scatter
+        )
     if not candidates.converged:
         _log.warning(
             "the positions of %d candidates did not settle; two of them may be one source, or the "
@@ -147,6 +151,10 @@ def detect(
         np.array(ring)[:, np.isfinite(error[ring])]
         for ring in ring_pixels(maps.grid, separations, most=error.size)
     ]
+    # The noise of fits that do not explain their data is not known.
+    false_alarm = np.full(len(candidates), np.nan)
+    if all(fit.status.calibrated for fit in fits):
+        false_alarm = significance.false_alarms(factor, candidates.snr(factor), candidates.offsets)
     return Detection(
         fits=tuple(fits),
         groups=maps.groups,
@@ -157,6 +165,8 @@ def detect(
         residual_snr=maps.snr(maps.without(candidates)) / factors,
         error_factor=factor,
         candidates=candidates,
+        false_alarm=false_alarm,
+        rings=chi2_by_ring(maps.groups, candidates.offsets, factor),
         threshold=threshold,
         contrast_curve=contrast_table(
             separations,
@@ -344,7 +354,7 @@ def _search(
     threshold: float,
     inner: float,
     scatter: float | None,
-) -> tuple[Candidates, ErrorFactor]:
+) -> tuple[Candidates, ErrorFactor, Significance]:
     """Candidates in the order in which they were found, and the factor for the errors."""
     groups, grid, pixel = maps.groups, maps.grid, pixel_width(maps.grid)
     # A fit may have taken a residual for a companion while its wavefront was still wrong.
@@ -371,7 +381,7 @@ def _search(
         if not len(candidates) or margin.min() >= 0:
             if not candidates.converged:
                 candidates = refine_candidates(groups, candidates, reach=pixel / 2)
-            return candidates, factor
+            return candidates, factor, significance
         # The factor may have grown since a candidate was accepted.
         weakest = int(margin.argmin())
         dismissed = torch.cat([dismissed, candidates.offsets[weakest, None]])

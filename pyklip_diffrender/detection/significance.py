@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 from torch import Tensor
 
@@ -84,23 +85,54 @@ class Significance:
             rarely.
         allowed : ndarray of bool, (ny, nx)
         """
-        return next(self.significant_peaks(snr, sources, threshold, allowed), None)
+        peaks = self.significant_peaks(snr, sources, threshold, allowed)
+        return next((peak for peak, _ in peaks), None)
 
     def significant_peaks(
         self, snr: Image, sources: Tensor | Image, threshold: float, allowed: NDArray[np.bool_]
-    ) -> Iterator[Peak]:
-        """All such peaks, each judged as if it were the only one; see `next_peak`."""
+    ) -> Iterator[tuple[Peak, float]]:
+        """Peaks that are significant each on its own, and their significance in sigmas.
+
+        The significance is the number of standard deviations that Gaussian noise exceeds as rarely.
+        See `next_peak`.
+        """
         factor = self.factor(snr, sources)
         # A source raises the scatter by which it is measured: it counts for a position or two.
         raised = np.sqrt(1 + _POSITIONS * CLIP**2 / factor.freedom)
         scaled = raised * snr / factor.factors
         allowed = allowed & (separation_of(self.grid) >= self.inner)
         allowed &= far_from(self.grid, sources, pixel_width(self.grid))
-        for peak in local_maxima(scaled, allowed, threshold, size=3)[:_JUDGED]:
-            place = self.grid[peak][None]
-            factor = self.factor(snr, np.concatenate([np.asarray(sources), place]))
-            if snr[peak] >= factor.of(place)[0] * factor.threshold(threshold, place)[0]:
-                yield peak
+        peaks = local_maxima(scaled, allowed, threshold, size=3)[:_JUDGED]
+        alone = (
+            self._scatter.judged(snr, sources, peaks)
+            if self.measured
+            else itertools.repeat((self.least, math.inf))
+        )
+        for peak, (scatter, freedom) in zip(peaks, alone, strict=False):
+            height = float(snr[peak]) / max(scatter, self.least)
+            sigmas = float(self.sigmas(height, freedom))
+            if sigmas >= threshold:
+                yield peak, sigmas
+
+    @staticmethod
+    def sigmas(snr: ArrayLike, freedom: ArrayLike) -> Image:
+        """Standard deviations that Gaussian noise exceeds as rarely as Student's t the S/N."""
+        return np.asarray(stats.norm.isf(stats.t.sf(snr, freedom)))
+
+    def false_alarms(self, factor: ErrorFactor, snr: Image, offsets: Tensor | Image) -> Image:
+        """Probabilities that noise makes peaks of such S/N anywhere in the field, (k,).
+
+        Parameters
+        ----------
+        factor : ErrorFactor
+            By which the errors are multiplied.
+        snr : ndarray, (k,)
+            With multiplied errors.
+        offsets : Tensor or ndarray, (k, 2)
+            x, y, arcsec.
+        """
+        sigmas = stats.norm.isf(factor.false_alarm(snr, offsets))
+        return np.array([self.false_alarm(float(each)) for each in sigmas])
 
     def false_alarm(self, sigmas: float) -> float:
         """Probability that Gaussian noise exceeds a number of standard deviations anywhere.
@@ -110,6 +142,8 @@ class Significance:
         curvature of the autocorrelation: R. J. Adler and J. E. Taylor, "Random Fields and
         Geometry" (2007), chapter 11.
         """
+        if not math.isfinite(sigmas):
+            return 0.0
         valid = np.isfinite(self.starlight) & (separation_of(self.grid) >= self.inner)
         # Second derivatives of the autocorrelation, per pixel^2.
         middle = self.correlation.shape[0] // 2

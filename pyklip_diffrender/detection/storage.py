@@ -74,6 +74,9 @@ def hdus_of(detection: Any) -> fits.HDUList:
         hdu.header.update(wcs)
     facts = {
         "threshold": detection.threshold,
+        "false_alarm": detection.false_alarm,
+        "rings": table_facts(detection.rings),
+        "rolls": detection.rolls,
         "candidates": vars(detection.candidates),
         "calibration_errors": detection._calibration_errors,
         "sky": vars(detection.sky),

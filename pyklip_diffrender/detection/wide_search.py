@@ -256,6 +256,7 @@ def wide_field(
     inner = detection.table.copy()
     chi2 = np.array([each.chi2 for each in measured]) / factor.of(sources.offsets) ** 2
     inner["fit_chi2"], table["fit_chi2"] = np.nan, chi2[order]
+    table["false_alarm_probability"] = np.nan
     tables = [each for each in (inner, table) if len(each)]
     joined = vstack(tables, metadata_conflicts="silent") if tables else table
     joined["fit_chi2"].info.description = (
