@@ -168,7 +168,9 @@ def test_several_candidates_suggest_a_disk() -> None:
     places = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.6]])
     three = Candidates.at(places, np.full(3, 1e-5))
     three = replace(three, covariance=1e-12 * torch.eye(9, dtype=torch.float64))
-    crowded = replace(whole, detection=replace(whole.detection, candidates=three))
+    crowded = replace(
+        whole, detection=replace(whole.detection, candidates=three, false_alarm=np.zeros(3))
+    )
     suggestion = "repeat the reduction with disk=True (--disk on the command line)"
     assert len(crowded.detection.table) == 3
     assert str(crowded).endswith(f"{suggestion}.")
