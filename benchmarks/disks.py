@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.plotting.panels import save
+from pyklip_diffrender.drawing import compass, halo, light_norm, save
 from pyklip_diffrender.pyklip_backend.klip_curve import KlipSubtraction, klip_curve
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 
@@ -52,11 +52,14 @@ def draw(reduction: dr.Reduction, subtracted: Image, path: Path) -> None:
     import matplotlib
     from matplotlib.figure import Figure
 
-    from pyklip_diffrender.plotting.panels import draw_compass, extent_of, halo, light_norm
-
     disk = reduction.disk
     assert disk is not None
-    extent = extent_of(disk.grid[0, :, 0], disk.grid[:, 0, 1])
+    half = (disk.grid[0, 1, 0] - disk.grid[0, 0, 0]) / 2
+    extent = [
+        side + sign * half
+        for k in (0, 1)
+        for side, sign in ((disk.grid[..., k].min(), -1), (disk.grid[..., k].max(), 1))
+    ]
     frame = reduction.sequence.science[0].combined()
     data = np.where(frame.valid[0], frame.data[0], np.nan)
     limit = float(np.nanpercentile(disk.light[0], 99))
@@ -76,7 +79,7 @@ def draw(reduction: dr.Reduction, subtracted: Image, path: Path) -> None:
             ax.set(title=title, facecolor="0.75", xticks=(-2, 0, 2), yticks=(-2, 0, 2))
             ax.plot(0, 0, "+", color="black", ms=9, mew=1.6, path_effects=halo())
         axes[0].set_ylabel("arcsec")
-        draw_compass(axes[0], frame.position_angle)
+        compass(axes[0], frame.position_angle)
         bar = {"orientation": "horizontal", "pad": 0.03, "aspect": 12}
         figure.colorbar(artists[0], ax=axes[0], label="MJy/sr", ticks=(1, 100), extend="min",
                         format="%g", **bar)  # fmt: skip

@@ -17,7 +17,7 @@ from pyklip.instruments.JWST import JWSTData
 from pyklip.parallelized import klip_dataset
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.plotting import save
+from pyklip_diffrender.drawing import save
 from pyklip_diffrender.refinement import Refinement
 
 COMPANION_RADIUS = 0.35  # arcsec; what is left out of the figure of merit

@@ -7,8 +7,9 @@ Every public name is loaded when it is first used, so that ``import pyklip_diffr
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
+
+from pyklip_diffrender._version import __version__
 
 if TYPE_CHECKING:
     from pyklip_diffrender.archive import fetch_calints, list_calints
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
         wide_field,
     )
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+    from pyklip_diffrender.instrument.star_flux import star_flux_density
     from pyklip_diffrender.linear.model import LinearModel
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pattern import known_systematics, learn_systematics
@@ -37,7 +39,6 @@ if TYPE_CHECKING:
     )
     from pyklip_diffrender.reduction import Reduction, reduce
     from pyklip_diffrender.refinement import (
-        Adam,
         GaussNewton,
         Refinement,
         Status,
@@ -55,7 +56,6 @@ if TYPE_CHECKING:
     from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
 
 __all__ = [
-    "Adam",
     "Detection",
     "DiffrenderSettings",
     "Disk",
@@ -99,6 +99,7 @@ __all__ = [
     "refine",
     "register",
     "simulate",
+    "star_flux_density",
     "survey",
     "unregister",
     "wide_field",
@@ -109,13 +110,14 @@ _NAMES = {
     "bridges": "from_poppy from_webbpsf",
     "detection": "Detection Disk WideField contrast_curve detect fit_disk measure wide_field",
     "instrument.nircam": "nircam_coronagraph",
+    "instrument.star_flux": "star_flux_density",
     "linear.model": "LinearModel",
     "optics.system": "OpticalSystem",
     "planning": "Plan plan",
     "pyklip_backend": "DiffrenderSettings backend observation_from_dataset register unregister",
     "reduction": "Reduction reduce",
     "pattern": "known_systematics learn_systematics",
-    "refinement": "Adam GaussNewton Refinement Status refine",
+    "refinement": "GaussNewton Refinement Status refine",
     "scene.objects": "Planet Scene Star",
     "scene.observation": "Observation",
     "scene.real_frames": "model_for",
@@ -131,12 +133,6 @@ _NAMES = {
 
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 
-try:
-    __version__ = version("pyklip-diffrender")
-except PackageNotFoundError:
-    # A source tree that was put on the path without being installed.
-    __version__ = "0+unknown"
-
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
@@ -147,4 +143,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)

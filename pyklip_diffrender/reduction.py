@@ -12,6 +12,7 @@ from typing import Any
 from astropy import units as u
 from astropy.table import QTable
 
+from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import (
     Detection,
     Disk,
@@ -158,6 +159,10 @@ class Reduction:
             written.append(folder / "injections.ecsv")
             with replacing(written[-1]) as temporary:
                 self.injections.write(temporary, format="ascii.ecsv", overwrite=True)
+        figure, axes = drawing.new_figure(1, 2)
+        self.detection.plot(axes)
+        written.append(folder / "detection.png")
+        drawing.save(figure, written[-1])
         return written + report.write_report(self, folder, written)
 
 
@@ -296,12 +301,12 @@ def reduce(
     def searched(science: tuple[Observation, ...]) -> Detection:
         return detect(fitted(science, choice), threshold=threshold, progress=progress)
 
-    def first_fit(choice: PatternChoice, again: bool) -> list[Refinement]:
+    def first_fit(choice: PatternChoice, again: bool) -> Refinement:
         without = ", without the pattern of the library" if again else ""
         with stage(f"2 of 4: wavefront{without}"):
-            return [fitted(choice.science, choice)]
+            return fitted(choice.science, choice)
 
-    choice, (fit,) = fit_with_pattern(
+    choice, fit = fit_with_pattern(
         cut.science,
         cut.references,
         model,

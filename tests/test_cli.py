@@ -23,7 +23,7 @@ import torch
 from astropy.io import fits
 from astropy.time import Time
 
-from pyklip_diffrender import __version__, plotting, reduction, refinement
+from pyklip_diffrender import __version__, reduction, refinement
 from pyklip_diffrender.cli import application, main
 from pyklip_diffrender.cli.estimate import steps_of
 from pyklip_diffrender.cli.options import read_config
@@ -375,7 +375,6 @@ class StubReduction:
     """Writes what a reduction writes, as far as the command line reads it."""
 
     arguments: dict[str, Any]
-    detection: Any = None
 
     def write(self, folder: Path) -> list[Path]:
         folder.mkdir(exist_ok=True)
@@ -398,8 +397,6 @@ def reduced(monkeypatch: pytest.MonkeyPatch) -> list[StubReduction]:
         return made[-1]
 
     monkeypatch.setattr(reduction, "reduce", stub)
-    monkeypatch.setattr(plotting, "draw_detection", lambda detection: None)
-    monkeypatch.setattr(plotting, "save", lambda figure, path: path.write_text(""))
     return made
 
 
@@ -418,7 +415,6 @@ def test_reduce_passes_its_options_on_and_names_the_products(
     shown = capsys.readouterr()
     assert "what was found\n" in shown.out
     assert f"wrote {products / 'summary.json'}\n" in shown.out
-    assert f"wrote {products / 'detection.png'}\n" in shown.out
     (call,) = reduced
     assert call.arguments["opd"].name == "opd_2022-07-20.fits"
     wanted = {"size": 6, "threshold": 4.0, "systematics": "off", "device": "cpu"}
@@ -553,7 +549,8 @@ def test_an_interrupted_run_says_what_it_left(
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(plotting, "draw_detection", interrupt)
+    write = StubReduction.write
+    monkeypatch.setattr(StubReduction, "write", lambda self, folder: interrupt(write(self, folder)))
     assert main(arguments) == 130
     assert f"interrupted; these files in {products} are new and complete: summary.json\n" in (
         capsys.readouterr().err

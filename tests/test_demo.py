@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from pyklip_diffrender.demo import DITHERS, run_demo, simulate_references, write_demo
+from pyklip_diffrender.demo import DITHERS, draw_demo, run_demo, simulate_references, write_demo
+from pyklip_diffrender.drawing import save
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.plotting import draw_demo, save
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene.objects import ALPHA_PICTORIS_W2, Scene, Star
 from pyklip_diffrender.scene.simulation import star_photons

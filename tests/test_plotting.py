@@ -200,7 +200,7 @@ def test_a_system_shows_its_pupils_and_the_star(model: OpticalSystem) -> None:
     labels = [bar_of(ax).get_ylabel() for ax in axes]
     assert labels == [
         "amplitude",
-        "nm",
+        "wavefront error (nm)",
         "light, 1 in the first pupil",
         "fraction of the star's light",
     ]

@@ -63,7 +63,7 @@ def test_a_dismissed_peak_is_not_taken_again(monkeypatch: pytest.MonkeyPatch) ->
     fit = SimpleNamespace(
         status=SimpleNamespace(calibrated=False),
         frames=(SimpleNamespace(observation=observation),),
-        model=SimpleNamespace(bandpass=SimpleNamespace(mean_wavelength=4.4e-6), diameter=6.6),
+        model=SimpleNamespace(resolution=0.14),
     )
     candidates, factor, _ = search._search(
         maps, [fit], Candidates.at(np.zeros((0, 2)), []), 5.0, 0.2, 1.0

@@ -53,8 +53,7 @@ def _drawn() -> None:
 @pytest.fixture(autouse=True)
 def _not_drawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "_drawn" not in request.fixturenames:
-        monkeypatch.setattr("pyklip_diffrender.surveys.page.draw_limits", lambda *_: None)
-        monkeypatch.setattr("pyklip_diffrender.surveys.page.to_png", lambda *_, **__: b"no picture")
+        monkeypatch.setattr("pyklip_diffrender.drawing.to_png", lambda *_, **__: b"no picture")
 
 
 def planned(config: dict[str, Any]) -> list[Job]:

@@ -21,8 +21,8 @@ import torch
 
 from benchmarks.speed import Setting, run_bench, write_page, write_table
 from benchmarks.speed.figure import draw
+from pyklip_diffrender.drawing import save
 from pyklip_diffrender.errors import DiffrenderError
-from pyklip_diffrender.plotting import save
 
 COMMAND = "python -m benchmarks.speed"
 

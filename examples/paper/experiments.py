@@ -42,8 +42,8 @@ from sections import (
     about_progress,
 )
 
+from pyklip_diffrender.drawing import save
 from pyklip_diffrender.io.files import replacing
-from pyklip_diffrender.plotting import save
 
 
 @dataclass(frozen=True)

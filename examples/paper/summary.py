@@ -21,8 +21,8 @@ from calibration import rms
 from inference_figure import draw
 from pages import KINDS, markdown, origin, tables
 
+from pyklip_diffrender.drawing import save
 from pyklip_diffrender.io.files import replacing
-from pyklip_diffrender.plotting import save
 
 
 def about_calibration() -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from pyklip_diffrender import __version__
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.cli import commands
 from pyklip_diffrender.cli.doctor import doctor
 from pyklip_diffrender.cli.options import common

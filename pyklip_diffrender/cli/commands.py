@@ -35,6 +35,8 @@ _REDUCTION = (
     "disk.fits", "injections.ecsv", "report.html", "summary.json", "detection.png",
 )  # fmt: skip
 
+_EPOCHS = ("epochs.html", "epochs.json")
+
 
 @click.command(
     cls=Command,
@@ -66,8 +68,8 @@ def demo(
     Needs no data, half a minute and 2 GB of memory.
     """
     run.claim_folder(output, _DEMO, overwrite)
-    from pyklip_diffrender.demo import run_demo, write_demo
-    from pyklip_diffrender.plotting import draw_demo, save
+    from pyklip_diffrender.demo import draw_demo, run_demo, write_demo
+    from pyklip_diffrender.drawing import save
 
     result = run_demo(
         contrast=contrast,
@@ -147,7 +149,8 @@ def reduce_frames(
 ) -> None:
     """Search all rolls of a target, with what its reference stars teach.
 
-    FRAMES are calints files, or one folder of them. With --program they come from MAST.
+    FRAMES are calints files, or one folder of them. With --program they come from MAST. Epochs more
+    than 5 days apart are reduced one by one, into a folder for each, and compared on one page.
     """
     if not frames and program is None:
         raise click.UsageError("Missing argument 'FRAMES...', or the option --program.")
@@ -156,7 +159,7 @@ def reduce_frames(
     if program is not None and options["dry_run"] and _is_to_fetch(program, target, filter, cache):
         return
 
-    def read() -> Sequence:
+    def read() -> tuple[Sequence, ...]:
         from pyklip_diffrender.archive import fetch_calints
         from pyklip_diffrender.scene.sequence import Sequence
 
@@ -165,7 +168,7 @@ def reduce_frames(
             files = fetch_calints(
                 program, target, filter=filter, folder=cache, progress=run.progress
             )
-        return Sequence.from_files(files, target=target, filter=filter)
+        return Sequence.by_epoch(files, target=target, filter=filter)
 
     _reduction(run, read, **options)
 
@@ -190,16 +193,14 @@ def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
     FRAMES is a calints file.
     """
 
-    def read() -> Sequence:
-        from pyklip_diffrender.scene.observation import Observation
+    def read() -> tuple[Sequence, ...]:
         from pyklip_diffrender.scene.sequence import Sequence
 
         if frames.is_dir():
             raise IncompatibleSetupError(
                 f"{frames} is a folder, expected a file; the command reduce takes folders"
             )
-        observation = Observation.from_fits(frames)
-        return Sequence(observation.target, (observation,))
+        return (Sequence.from_files([frames]),)
 
     _reduction(run, read, **options)
 
@@ -303,58 +304,89 @@ def _reduction(
     opd_folder: Path | None,
     opd_date: str | None,
 ) -> None:
-    """Reduce a sequence, write all products and say what they show."""
+    """Reduce the epochs of a sequence, write all products and say what they show."""
     if (opd is not None) == (opd_folder is not None or opd_date is not None):
         raise click.UsageError("Give either --opd FILE, or --opd-folder FOLDER or --opd-date.")
     if dry_run and json:
         raise click.UsageError("A --dry-run has no summary to print with --json.")
-    run.claim_folder(output, _REDUCTION, overwrite)
+    run.claim_folder(output, (*_REDUCTION, *_EPOCHS), overwrite)
     # Libraries may print, too.
     with redirect_stdout(sys.stderr) if json else nullcontext():
-        sequence = read()
-        _show(sequence)
-        map_ = _map(sequence, opd, opd_folder, opd_date)
-        click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
-        if dry_run:
-            from pyklip_diffrender.cli.estimate import describe_plan
+        sequences = read()
+        folders = [output]
+        if len(sequences) > 1:
+            folders = [output / _day(each) for each in sequences]
+            for folder in folders:
+                run.claim_folder(folder, _REDUCTION, overwrite)
+        maps = []
+        for sequence, folder in zip(sequences, folders, strict=True):
+            if len(sequences) > 1:
+                click.echo(f"\nepoch {folder.name}, {len(sequences)} in all:")
+            _show(sequence)
+            maps.append(_map(sequence, opd, opd_folder, opd_date))
+            click.echo(f"wavefront map: {maps[-1].name}{_age(maps[-1], sequence)}")
+            if dry_run:
+                from pyklip_diffrender.cli.estimate import describe_plan
 
-            parts: dict[str, Any] = {"wide": wide, "disk": disk, "injections": injections}
-            parts["star_flux"] = star_flux is not None
-            click.echo(describe_plan(sequence, size, systematics, **parts))
+                parts: dict[str, Any] = {"wide": wide, "disk": disk, "injections": injections}
+                parts["star_flux"] = star_flux is not None
+                click.echo(describe_plan(sequence, size, systematics, **parts))
+        if dry_run:
             return
         from pyklip_diffrender.io.progress import stage
-        from pyklip_diffrender.plotting import draw_detection, save
         from pyklip_diffrender.reduction import reduce
         from pyklip_diffrender.scene.systematics import Systematics
 
         known: Any = systematics
         if known not in ("auto", "references", "off"):
             known = Systematics.read(known)
-        reduction = reduce(
-            sequence,
-            map_,
-            size=size,
-            systematics=known,
-            threshold=threshold,
-            wide=wide,
-            disk=disk,
-            injections=injections,
-            star_flux=star_flux,
-            star_flux_error=star_flux_error,
-            device=run.device,
-            memory=memory,
-            progress=run.progress,
-        )
-        with stage("4 of 4: products"):
-            written = reduction.write(output)
-            figure = output / "detection.png"
-            save(draw_detection(reduction.detection), figure)
-        click.echo(f"\n{reduction}")
-        for path in (*written, figure):
-            click.echo(f"wrote {path}")
+        for sequence, map_, folder in zip(sequences, maps, folders, strict=True):
+            reduction = reduce(
+                sequence,
+                map_,
+                size=size,
+                systematics=known,
+                threshold=threshold,
+                wide=wide,
+                disk=disk,
+                injections=injections,
+                star_flux=star_flux,
+                star_flux_error=star_flux_error,
+                device=run.device,
+                memory=memory,
+                progress=run.progress,
+            )
+            with stage("4 of 4: products"):
+                written = reduction.write(folder)
+            click.echo(f"\n{reduction}")
+            for path in written:
+                click.echo(f"wrote {path}")
+        if len(folders) > 1:
+            for path in _compare(sequences[0], folders, output):
+                click.echo(f"wrote {path}")
     if json:
-        summary = loads((output / "summary.json").read_text(encoding="utf-8"))
+        name = "epochs.json" if len(folders) > 1 else "summary.json"
+        summary = loads((output / name).read_text(encoding="utf-8"))
         click.echo(dumps(summary, indent=2))
+
+
+def _day(sequence: Sequence) -> str:
+    """First date of a sequence."""
+    dates = [each.date.isot[:10] for each in sequence.science if each.date is not None]
+    return min(dates, default="no-date")
+
+
+def _compare(sequence: Sequence, folders: list[Path], output: Path) -> list[Path]:
+    """Write the page that compares epochs."""
+    from pyklip_diffrender.report import write_epochs
+    from pyklip_diffrender.scene.exposure import proper_motion
+
+    summaries = {
+        folder.name: loads((folder / "summary.json").read_text(encoding="utf-8"))
+        for folder in folders
+    }
+    first = sequence.science[0]
+    return write_epochs(summaries, proper_motion(first.header, first.name), output)
 
 
 def _is_to_fetch(program: int, target: str | None, filter: str | None, cache: Path | None) -> bool:
@@ -371,7 +403,14 @@ def _is_to_fetch(program: int, target: str | None, filter: str | None, cache: Pa
 
 
 def _show(sequence: Sequence) -> None:
-    click.echo("\n".join(sequence.table.pformat(max_lines=-1, max_width=-1)))
+    from pyklip_diffrender.scene.admission_table import SHORT
+
+    table = sequence.table
+    used = table[table["use"] != "excluded"]
+    click.echo("\n".join(used[list(SHORT)].pformat(max_lines=-1, max_width=-1)))
+    for row in used:
+        if row["remark"]:
+            click.echo(f"{row['file']}: {row['remark']}")
     for name, reason in sequence.excluded:
         click.echo(f"left out: {name}: {reason}")
 

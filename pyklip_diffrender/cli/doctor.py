@@ -15,7 +15,7 @@ from typing import Literal
 
 import click
 
-from pyklip_diffrender import __version__
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.cli.machine import free_memory
 from pyklip_diffrender.cli.options import Command, common
 from pyklip_diffrender.cli.run import Run

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.optimize import minimize
 
+from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.field import Image, separation_of
 from pyklip_diffrender.detection.groups import groups_of, has_only_reference_stars
 from pyklip_diffrender.detection.relinearise import without_light
@@ -165,9 +166,17 @@ class Disk:
         -------
         ndarray of Axes
         """
-        from pyklip_diffrender import plotting
-
-        return plotting.plot_disk(self, ax)
+        axes = drawing.axes_for(ax, 2)
+        observation = self.fit.frames[0].observation
+        limit = float(np.nanpercentile(self.light[0], 99)) or float(np.nanmax(self.error))
+        north = None if observation.position_angles is None else observation.position_angle
+        for each, image, title in (
+            (axes[0], self.image, "frames without the star"),
+            (axes[1], self.light[0], "extended light"),
+        ):
+            bar = drawing.unit_label(observation.unit)
+            drawing.signed_image(each, image, self.grid, limit, bar=bar, title=title, north=north)
+        return np.array(axes)
 
     @property
     def table(self) -> QTable:

@@ -18,7 +18,6 @@ from pyklip_diffrender.detection.field import separation_of
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.significance import Significance
-from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.refinement import Refinement
 
 __all__ = [
@@ -26,7 +25,6 @@ __all__ = [
     "default_factor",
     "error_inflation",
     "follows_scatter",
-    "resolution_of",
     "significance_of",
 ]
 
@@ -35,11 +33,6 @@ _RINGS = (0.2, 0.6, 1.2, 2.0)
 
 _DEGENERATE = 1e-6
 """Relative eigenvalue below which sources are degenerate with each other."""
-
-
-def resolution_of(fit: Refinement) -> float:
-    """lambda/D, arcsec."""
-    return fit.model.bandpass.mean_wavelength / fit.model.diameter / ARCSEC
 
 
 def follows_scatter(fits: Sequence[Refinement]) -> bool:
@@ -77,7 +70,7 @@ def significance_of(
         maps.starlight,
         maps.correlation,
         inner,
-        resolution_of(fits[0]),
+        fits[0].model.resolution,
         error_inflation(fits, maps.groups, sources) if scatter is None else scatter,
         scatter is None and follows_scatter(fits),
     )
@@ -90,7 +83,7 @@ def default_factor(
     if not follows_scatter(fits):
         return ErrorFactor.constant(error_inflation(fits, groups, sources.offsets))
     maps = Maps(groups)
-    significance = significance_of(fits, maps, sources.offsets, resolution_of(fits[0]))
+    significance = significance_of(fits, maps, sources.offsets, fits[0].model.resolution)
     return significance.factor(maps.snr(maps.without(sources)), sources.offsets)
 
 

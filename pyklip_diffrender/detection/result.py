@@ -17,6 +17,8 @@ from astropy.io.fits import Header
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
+from pyklip_diffrender import drawing
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection.calibration import calibration_errors
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import described
@@ -325,8 +327,6 @@ class Detection:
 
     @cached_property
     def _provenance(self) -> dict[str, object]:
-        from pyklip_diffrender import __version__
-
         return {
             "software": f"pyklip_diffrender {__version__}",
             "observations": [f.observation.name for fit in self.fits for f in fit.frames],
@@ -356,9 +356,18 @@ class Detection:
         -------
         ndarray of Axes, (2,)
         """
-        from pyklip_diffrender import plotting
-
-        return plotting.plot_detection(self, ax)
+        axes = drawing.axes_for(ax, 2)
+        drawing.search(
+            axes,
+            self.snr,
+            self.grid,
+            self.table,
+            self.contrast_curve,
+            threshold=self.threshold,
+            north=None if self.observation.position_angles is None else self.north,
+            small_sample=self.error_factor.is_measured,
+        )
+        return np.array(axes)
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write maps (FITS), candidates and contrast curve (ECSV); returns the paths.

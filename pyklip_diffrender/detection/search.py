@@ -17,7 +17,6 @@ from pyklip_diffrender.detection.error_inflation import (
     chi2_by_ring,
     error_inflation,
     follows_scatter,
-    resolution_of,
     significance_of,
 )
 from pyklip_diffrender.detection.field import (
@@ -102,7 +101,7 @@ def detect(
     Raises
     ------
     IncompatibleSetupError
-        For fits that failed or have no linear model (the Adam recipe), for fits of a reference
+        For fits that failed or were read without their linear model, for fits of a reference
         star only, or for a threshold or separation that is not positive.
 
     Examples
@@ -172,7 +171,7 @@ def detect(
             separations,
             [error[*ring] for ring in rings],
             [photon[*ring] for ring in rings],
-            resolution_of(fits[0]),
+            fits[0].model.resolution,
             factor,
             Sky.of(fits).star_jansky,
         ),
@@ -323,7 +322,7 @@ def contrast_curve(
         separations,
         errors,
         photon,
-        resolution_of(fits[0]),
+        fits[0].model.resolution,
         ErrorFactor.constant(scatter),
         Sky.of(fits).star_jansky,
     )

@@ -15,6 +15,7 @@ from astropy.io import fits
 from astropy.table import QTable, vstack
 from numpy.typing import NDArray
 
+from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
@@ -56,8 +57,8 @@ _COVERED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class _Source:
-    """A source as measured: contrast, x and y, their variances, reduced chi-squared."""
+class _Measurement:
+    """Contrast, x and y of a source, their variances, and the reduced chi-squared."""
 
     values: Image
     variance: Image
@@ -169,9 +170,18 @@ class WideField:
 
     def plot(self, ax: Any = None) -> NDArray[Any]:
         """Draw the S/N map with the candidates, and the contrast curve; see `Detection.plot`."""
-        from pyklip_diffrender import plotting
-
-        return plotting.plot_detection(self, ax)
+        axes = drawing.axes_for(ax, 2)
+        drawing.search(
+            axes,
+            self.snr,
+            self.grid,
+            self.table,
+            self.contrast_curve,
+            threshold=self.threshold,
+            north=None if self.observation.position_angles is None else self.north,
+            small_sample=self.error_factor.is_measured,
+        )
+        return np.array(axes)
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
         """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables."""
@@ -317,7 +327,7 @@ def _search(
     grid: Image,
     threshold: float,
     detection: Detection,
-) -> tuple[Image, list[_Source], ErrorFactor]:
+) -> tuple[Image, list[_Measurement], ErrorFactor]:
     """Information of contrasts, the sources, and the error factor.
 
     The highest peak is fitted and subtracted, until none is left: sources have side lobes.
@@ -331,7 +341,7 @@ def _search(
         float(separation_of(grid)[outer].min()),
         resolution,
     )
-    sources: list[_Source] = []
+    sources: list[_Measurement] = []
     while True:
         images = [frame.residual - frame.light(*_light_of(sources)) for frame in frames]
         products = [
@@ -362,13 +372,13 @@ def _search(
     return information, _refined(frames, sources), factor
 
 
-def _light_of(sources: Sequence[_Source]) -> tuple[Image, Image]:
+def _light_of(sources: Sequence[_Measurement]) -> tuple[Image, Image]:
     """Positions (k, 2) and contrasts (k,)."""
     values = np.array([each.values for each in sources]).reshape(-1, 3)
     return values[:, 1:], values[:, 0]
 
 
-def _refined(frames: Sequence[WholeFrame], sources: list[_Source]) -> list[_Source]:
+def _refined(frames: Sequence[WholeFrame], sources: list[_Measurement]) -> list[_Measurement]:
     """Fit every source once more, with all others subtracted."""
     for k, source in enumerate(sources):
         others = _light_of([*sources[:k], *sources[k + 1 :]])
@@ -380,7 +390,7 @@ def _refined(frames: Sequence[WholeFrame], sources: list[_Source]) -> list[_Sour
 
 def _measured(
     frames: Sequence[WholeFrame], images: Sequence[Image], offset: Image, contrast: float
-) -> _Source | None:
+) -> _Measurement | None:
     """Fit a source in every frame and average; None if it is in none of them."""
     fits = [f.photometry(i, offset, contrast) for f, i in zip(frames, images, strict=True)]
     usable = [each for each in fits if each is not None]
@@ -388,14 +398,14 @@ def _measured(
         return None
     weights = np.array([errors**-2.0 for _, errors, _ in usable])
     values = np.array([each for each, _, _ in usable])
-    return _Source(
+    return _Measurement(
         (weights * values).sum(axis=0) / weights.sum(axis=0),
         weights.sum(axis=0) ** -1.0,
         float(np.mean([chi2 for _, _, chi2 in usable])),
     )
 
 
-def _candidates(sources: Sequence[_Source]) -> Candidates:
+def _candidates(sources: Sequence[_Measurement]) -> Candidates:
     places, contrasts = _light_of(sources)
     variance = np.array([each.variance for each in sources]).reshape(-1, 3)
     return replace(

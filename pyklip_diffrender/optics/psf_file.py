@@ -15,7 +15,7 @@ from astropy.io.fits.verify import VerifyWarning
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pyklip_diffrender import __version__
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.optics.propagation import Propagation

@@ -7,13 +7,17 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
+import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
-from pyklip_diffrender.optics.planes import EntrancePupil, Plane
+from pyklip_diffrender.optics.planes import EntrancePupil, Plane, Wavefront
 from pyklip_diffrender.optics.propagation import Propagation, Value
 from pyklip_diffrender.optics.psf_file import instrument_psf, save
 
@@ -152,7 +156,7 @@ class OpticalSystem(Propagation):
         return frozenset(names if self._is_sampled else {*names, "bandpass"})
 
     def with_fidelity(self, **changes: Any) -> OpticalSystem:
-        """The same system with other numerical settings, such as ``npix=256``.
+        """Return a copy of the system with other numerical settings, such as ``npix=256``.
 
         Parameters
         ----------
@@ -185,7 +189,7 @@ class OpticalSystem(Propagation):
         return system if bandpass is None else system.at_wavelengths(bandpass)
 
     def at_wavelengths(self, bandpass: Bandpass) -> OpticalSystem:
-        """The same system with another bandpass.
+        """Return a copy of the system with another bandpass.
 
         The planes and their cached results are shared. `with_fidelity` of the result keeps the
         bandpass.
@@ -305,6 +309,41 @@ class OpticalSystem(Propagation):
         -------
         ndarray of Axes, (4,)
         """
-        from pyklip_diffrender import plotting
+        pupil, phase, last, image = axes = drawing.axes_for(ax, 4)
+        mean = self.bandpass.mean_wavelength
+        wavelength = min(self.bandpass.wavelengths, key=lambda each: abs(each - mean))
+        with torch.no_grad():
+            checked, values = self.opd(opd), self.values({})
+            wavefront = self.pupil_field(checked, wavelength, values)
+            first = self._amplitude(wavefront)
+            for plane, onto in zip(self.planes, self.windows(values), strict=True):
+                wavefront = plane.apply(wavefront, values, onto)
+            behind = (self._amplitude(wavefront) / first.max()) ** 2
+            light = self(checked).double().cpu().numpy()
+            map_ = 1e9 * checked.real.double().cpu().numpy()
+            x, y = (
+                axis.reshape(-1, self.detector.oversample).mean(dim=1).cpu().numpy() / ARCSEC
+                for axis in self.detector.axes(values)
+            )
+        width = self.entrance.full.diameter
+        map_ = np.where(self.entrance.lit.cpu().numpy(), map_, np.nan)
+        drawing.pupil_image(
+            pupil, first / first.max(), width, bar="amplitude", title=self.entrance.name
+        )
+        drawing.wavefront_map(phase, map_, width, title="wavefront error")
+        drawing.pupil_image(
+            last, behind, width, bar="light, 1 in the first pupil",
+            title="light in the last pupil", logarithmic=True,
+        )  # fmt: skip
+        drawing.star_image(
+            image, light, np.stack(np.meshgrid(x, y), axis=-1), drawing.light_norm(light),
+            bar="fraction of the star's light", title=f"star on the axis, {1e6 * mean:.2f} um",
+        )  # fmt: skip
+        image.set_xlabel("x from the optical axis (arcsec)")
+        image.set_ylabel("y from the optical axis (arcsec)")
+        return np.array(axes)
 
-        return plotting.plot_system(self, ax, opd=opd)
+    def _amplitude(self, wavefront: Wavefront) -> NDArray[np.float64]:
+        """Amplitude of a wavefront on the whole pupil array."""
+        whole = wavefront.grid.crop(wavefront.field.abs(), self.entrance.full)
+        return np.asarray(whole.double().cpu().numpy())

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 
@@ -73,8 +73,6 @@ def check_forward_model(fm_class: Any, settings: DiffrenderSettings) -> None:
     """
     from pyklip.fmlib.nofm import NoFM
 
-    from pyklip_diffrender.refinement import Adam
-
     if type(fm_class) is NoFM:
         return
     if not is_planet(fm_class):
@@ -89,10 +87,10 @@ def check_forward_model(fm_class: Any, settings: DiffrenderSettings) -> None:
             "injected_into: a planet is measured in a fit to the frames that show it. Call "
             "pyklip.fm.klip_dataset outside the block with injected_into"
         )
-    if settings.subtractor is not None or isinstance(settings.fit, Adam):
+    if settings.subtractor is not None:
         raise IncompatibleSetupError(
             "fm_class: the forward model of a planet needs the linear model of a fit by "
-            "GaussNewton, which a subtractor of your own and the Adam recipe do not have"
+            "GaussNewton, which a subtractor of your own does not have"
         )
 
 
@@ -139,7 +137,7 @@ def planet_in_frames(
     for result in dict.fromkeys(pointing.result for pointing in pointings):
         parts = [pointing for pointing in pointings if pointing.result is result]
         sources = [
-            _Source.of(
+            _PlanetImage.of(
                 fm_class,
                 part,
                 float(angles[part.pointing.frames[0]]),
@@ -175,7 +173,7 @@ def _light(fm_class: Any, frames: NDArray[np.intp], wavelength: float) -> NDArra
 
 
 @dataclass(frozen=True, eq=False)
-class _Source:
+class _PlanetImage:
     """A planet in one pointing.
 
     Attributes
@@ -183,7 +181,7 @@ class _Source:
     offset : ndarray, (2,)
         x, y in pixels from the star.
     image : ndarray, (ny, nx)
-        It in the frames, as bright as the star; NaN where there is no model.
+        Image of the planet in the frames, as bright as the star; NaN where there is no model.
     scale : float
         Light of the user's PSF over that of `image`.
     """
@@ -201,7 +199,7 @@ class _Source:
         wavelength: float,
         flipx: bool,
         filtered: Filter | None,
-    ) -> _Source:
+    ) -> _PlanetImage:
         """Place the planet, and compare its image with the user's PSF at the same place."""
         direction = np.radians(90.0 + (-1 if flipx else 1) * fm_class.pa - angle)
         offset = fm_class.sep * np.array([np.cos(direction), np.sin(direction)])
@@ -244,12 +242,10 @@ class _Source:
 def _change_of_star(
     result: Refinement,
     parts: Sequence[FittedPointing],
-    sources: Sequence[_Source],
+    sources: Sequence[_PlanetImage],
     factors: Sequence[float],
 ) -> list[NDArray[np.float64]]:
     """Light of the planet that the fit takes for star, on the fitted square of every pointing."""
-    if result.linear is None:
-        raise RefinementError("fm_class: the fit has no linear model", result)
     if _is_companion(result, parts[0], sources[0]):
         return [np.zeros(part.window.shape) for part in parts]
     templates = {
@@ -260,7 +256,7 @@ def _change_of_star(
     return [part.change_of_star(change) for part in parts]
 
 
-def _is_companion(result: Refinement, part: FittedPointing, source: _Source) -> bool:
+def _is_companion(result: Refinement, part: FittedPointing, source: _PlanetImage) -> bool:
     """Whether the planet is one of the companions of the fit, within lambda/D."""
     if not len(result.companions):
         return False

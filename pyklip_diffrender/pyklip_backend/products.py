@@ -15,7 +15,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.time import Time
 
-from pyklip_diffrender import __version__
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.pyklip_backend.frames import Frames
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.wavefront.opd import OPDMap

@@ -42,6 +42,7 @@ _PRODUCTS = {
     "astrometry.csv": "epoch and positions of the candidates, for orbitize!",
     "injections.ecsv": "injected planets, and what was measured of them",
     "disk.fits": "the extended light: frames without the star, and its sources",
+    "detection.png": "the S/N map and the contrast curve",
     "fit.fits": "the fit, for Refinement.read",
     "systematics.fits": "the pattern of the model's error, for other reductions",
     "summary.json": "the content of this page, for programs",

@@ -7,7 +7,7 @@ from typing import Any
 
 from astropy.table import QTable
 
-from pyklip_diffrender.plotting import draw_injections, to_png
+from pyklip_diffrender import drawing
 from pyklip_diffrender.report import pieces
 from pyklip_diffrender.report.pictures import Picture
 from pyklip_diffrender.report.words import plus_minus, scientific
@@ -45,8 +45,10 @@ def injections_section(summary: Mapping[str, Any], planets: QTable) -> str:
             f"truth, and the differences scatter by {about['pull_deviation']:.2f} standard "
             "deviations."
         )
+    figure, ax = drawing.panel()
+    drawing.injected_planets(ax, planets)
     picture = Picture(
-        to_png(draw_injections(planets)),
+        drawing.to_png(figure),
         f"Recovered over injected contrast of {about['count']} planets against separation in "
         "arcsec, with error bars.",
         "Recovered over injected contrast. Filled: detected. Open: not detected, and measured at "

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from astropy.table import QTable
 
-from pyklip_diffrender.detection import Disk, WideField
-from pyklip_diffrender.plotting import draw_disk, draw_search, draw_star, draw_wavefronts, to_png
-from pyklip_diffrender.plotting.panels import unit_label
+from pyklip_diffrender import drawing
+from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.reduction import Reduction
 from pyklip_diffrender.report.summary import wavefronts
 from pyklip_diffrender.report.words import number
@@ -27,6 +27,9 @@ __all__ = [
 
 MOST_FRAMES = 4
 """Frames of which pictures are shown."""
+
+_LIMIT = 5.0
+"""Limit of the scale for residuals, standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,7 @@ def search_pictures(
         "the scatter in a ring, its throughput that of injected planets."
     )
     return _pictures(
-        draw_search(detection, klip),
+        _search(detection, klip),
         (
             f"Map of the signal-to-noise ratio of a point source, {candidates}"
             f"{': ' if places else ''}{places}.",
@@ -113,7 +116,7 @@ def wide_pictures(wide: WideField) -> list[Picture]:
     count = len(wide.table)
     some = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {wide.threshold:g}"
     return _pictures(
-        draw_search(wide),
+        _search(wide),
         (
             f"Map of the signal-to-noise ratio of a point source in the whole frames, {some}.",
             "S/N of a point source in the whole frames. About the star it is that of the search "
@@ -129,8 +132,10 @@ def wide_pictures(wide: WideField) -> list[Picture]:
 
 def disk_pictures(disk: Disk) -> list[Picture]:
     """The frames without the star, and the extended light that was fitted."""
+    figures, axes = _panels(2)
+    disk.plot(axes)
     return _pictures(
-        draw_disk(disk),
+        figures,
         (
             "Image of the extended light: the frames without the star.",
             "Frames minus the star, turned to the orientation of the first one and averaged. "
@@ -149,7 +154,7 @@ def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
     """Data, model and residual of a frame."""
     detection = reduction.detection
     observation = detection.fits[0].frames[frame].observation
-    unit, count = unit_label(observation.unit), len(observation)
+    unit, count = drawing.unit_label(observation.unit), len(observation)
     subtracted = (
         " The star was estimated together with the candidates (circles), whose light is kept."
         if len(detection.table)
@@ -158,7 +163,7 @@ def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
     mean = f", the mean of {count} integrations" if count > 1 else ""
     mean += "" if reduction.disk is None else ", without the extended light"
     return _pictures(
-        draw_star(detection, frame),
+        _star(detection, frame),
         (
             f"Image of {observation.target} behind the coronagraph, in {unit}.",
             f"What was observed{mean}. The scale is linear near 0 and logarithmic in bright parts; "
@@ -181,8 +186,14 @@ def wavefront_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list
     fit, about = reduction.detection.fits[0], summary["wavefront_map"]
     before, after = wavefronts(fit)
     rms = [number(about[f"{key}rms_nm"], ".1f", "nm") for key in ("", "refined_", "change_")]
+    figures, axes = _panels(3)
+    width = fit.model.diameter
+    limit = float(np.nanpercentile(np.abs([before, after]), 99.5)) or 1.0
+    drawing.wavefront_map(axes[0], before, width, title="Before the fit", limit=limit)
+    drawing.wavefront_map(axes[1], after, width, title="After the fit", limit=limit)
+    drawing.wavefront_map(axes[2], after - before, width, title="Change")
     return _pictures(
-        draw_wavefronts(before, after, fit.model.diameter),
+        figures,
         (
             f"Map of the wavefront error before the fit, {rms[0]} rms.",
             f"The map that the fit started from ({about['name']}), {rms[0]} rms.",
@@ -199,8 +210,56 @@ def wavefront_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list
     )
 
 
+def _search(result: Detection | WideField, klip: QTable | None = None) -> list[Any]:
+    """Draw the S/N map and the contrast curve."""
+    figures, axes = _panels(2)
+    drawing.search(
+        axes,
+        result.snr,
+        result.grid,
+        result.table,
+        result.contrast_curve,
+        threshold=result.threshold,
+        north=None if result.observation.position_angles is None else result.north,
+        small_sample=result.error_factor.is_measured,
+        klip=klip,
+    )
+    return figures
+
+
+def _star(detection: Detection, frame: int) -> list[Any]:
+    """Draw a frame, the model of its star, and the residual, in which candidates are kept."""
+    fit = detection.fits[0]
+    part, observation = fit.frames[frame], fit.frames[frame].observation.combined()
+    valid, noise = observation.valid[0], observation.error[0]
+    data = np.where(valid, observation.data[0], np.nan)
+    north = None if observation.position_angles is None else observation.position_angle
+    norm, unit = drawing.light_norm(data, noise[valid]), drawing.unit_label(observation.unit)
+    figures, axes = _panels(3)
+    for ax, image, title in ((axes[0], data, "Data"), (axes[1], part.star, "Model of the star")):
+        drawing.star_image(ax, image, part.grid, norm, bar=unit, title=title, north=north)
+    places = np.stack([detection.table["x"].value, detection.table["y"].value], axis=1)
+    drawing.signed_image(
+        axes[2],
+        detection.subtracted[frame] / noise,
+        part.grid,
+        _LIMIT,
+        bar="standard deviations of the noise",
+        title="Residual",
+        places=observation.turned(places, fit.frames[0].observation),
+        north=north,
+    )
+    return figures
+
+
+def _panels(count: int) -> tuple[list[Any], list[Any]]:
+    """Figures with one axes each, and these axes."""
+    panels = [drawing.panel() for _ in range(count)]
+    return [figure for figure, _ in panels], [ax for _, ax in panels]
+
+
 def _pictures(figures: Sequence[Any], *words: tuple[str, str]) -> list[Picture]:
     return [
-        Picture(to_png(figure), alt, caption)
+        Picture(drawing.to_png(figure), alt, caption)
         for figure, (alt, caption) in zip(figures, words, strict=True)
     ]

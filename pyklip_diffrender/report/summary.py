@@ -13,7 +13,7 @@ from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import NDArray
 
-from pyklip_diffrender import __version__
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
@@ -95,6 +95,7 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
             ),
             *(_frame(each, "reference") for each in sequence.references),
         ],
+        "admission": _rows(sequence.table),
         "left_out": [
             *({"name": name, "reason": reason} for name, reason in sequence.excluded),
             *({"name": f"reference star {n}", "reason": why} for n, why in reduction.failed),

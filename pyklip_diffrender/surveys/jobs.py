@@ -13,7 +13,7 @@ from typing import Any
 
 from astropy.time import Time
 
-from pyklip_diffrender import __version__
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import open_fits, sha256
 from pyklip_diffrender.io.headers import header_date, merged_header

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyklip_diffrender import __version__
-from pyklip_diffrender.plotting import draw_limits, to_png
+from pyklip_diffrender import drawing
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.report import pieces
 from pyklip_diffrender.report.pictures import Picture
 from pyklip_diffrender.report.words import number, plus_minus, probability, scientific
@@ -115,7 +115,9 @@ def _limits(rows: Rows) -> str:
         for each in result["candidates"]
         if each["contrast"] > 0
     ]
-    figure = draw_limits(
+    figure, axes = drawing.new_figure(1, 1)
+    drawing.survey_limits(
+        axes[0, 0],
         [
             (job.name, _array(result, "separation_arcsec"), _array(result, "contrast"))
             for job, result in curves
@@ -124,7 +126,7 @@ def _limits(rows: Rows) -> str:
         sigmas,
     )
     picture = Picture(
-        to_png(figure, dpi=200),
+        drawing.to_png(figure, dpi=200),
         f"Curves of the contrast at {sigmas:g} sigma against separation in arcsec for "
         f"{pieces.count(len(curves), 'sequence')}; the table has their values.",
         f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "

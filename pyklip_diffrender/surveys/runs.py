@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pyklip_diffrender import __version__
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.io.files import sha256
 from pyklip_diffrender.surveys.folders import (

@@ -35,7 +35,7 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.simulation import planet_photons, simulate, star_photons
 from pyklip_diffrender.wavefront.opd import OPDMap, random_drift, random_opd
 
-__all__ = ["DITHERS", "DemoResult", "run_demo", "simulate_references"]
+__all__ = ["DITHERS", "DemoResult", "run_demo", "simulate_references", "write_demo"]
 
 _log = logging.getLogger(__name__)
 

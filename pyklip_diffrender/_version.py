@@ -1,0 +1,11 @@
+"""The version of the installed distribution."""
+
+from importlib.metadata import PackageNotFoundError, version
+
+__all__ = ["__version__"]
+
+try:
+    __version__ = version("pyklip-diffrender")
+except PackageNotFoundError:
+    # A source tree that was put on the path without being installed.
+    __version__ = "0+unknown"

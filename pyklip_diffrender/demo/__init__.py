@@ -1,0 +1,12 @@
+"""The demo: a simulated planet near a star, with KLIP and wavefront refinement side by side."""
+
+from pyklip_diffrender.demo.comparison import (
+    DITHERS,
+    DemoResult,
+    run_demo,
+    simulate_references,
+    write_demo,
+)
+from pyklip_diffrender.demo.figure import draw_demo
+
+__all__ = ["DITHERS", "DemoResult", "draw_demo", "run_demo", "simulate_references", "write_demo"]

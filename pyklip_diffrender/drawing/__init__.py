@@ -1,0 +1,39 @@
+"""Figures of arrays, in one style. The only package that imports matplotlib, when it draws.
+
+It knows no class of the package: the `plot` methods, the report and the demo pass arrays. The
+colour maps can be distinguished by readers with colour vision deficiencies.
+"""
+
+from pyklip_diffrender.drawing.curves import contrast_curve, injected_planets, survey_limits
+from pyklip_diffrender.drawing.figures import axes_for, new_figure, panel, save, to_png
+from pyklip_diffrender.drawing.images import (
+    light_norm,
+    pupil_image,
+    signed_image,
+    snr_map,
+    star_image,
+    wavefront_map,
+)
+from pyklip_diffrender.drawing.marks import compass, halo, unit_label
+from pyklip_diffrender.drawing.search import search
+
+__all__ = [
+    "axes_for",
+    "compass",
+    "contrast_curve",
+    "halo",
+    "injected_planets",
+    "light_norm",
+    "new_figure",
+    "panel",
+    "pupil_image",
+    "save",
+    "search",
+    "signed_image",
+    "snr_map",
+    "star_image",
+    "survey_limits",
+    "to_png",
+    "unit_label",
+    "wavefront_map",
+]

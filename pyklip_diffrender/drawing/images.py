@@ -1,0 +1,156 @@
+"""Images on the sky, in arcsec from the star, and on the pupil, in metres.
+
+Every image is drawn with y up and a colour bar as high as it; NaN is grey. On the sky, `grid` has
+the x and y of the pixel centres, (ny, nx, 2), and `north` is the position angle of the image's +y
+axis, degrees east of north, or None where it is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pyklip_diffrender.drawing.marks import INK, circles, compass, label_sky
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["light_norm", "pupil_image", "signed_image", "snr_map", "star_image", "wavefront_map"]
+
+Image = NDArray[np.float64]
+
+_LIGHT = "magma"
+_SIGNED = "RdBu_r"
+
+_LINEAR = 5.0
+"""Linear part of the scale for S/N."""
+
+_SNR_TICKS = (-100, -50, -20, -10, -5, 0, 5, 10, 20, 50, 100)
+
+_DECADES = 6
+"""Decades of a logarithmic scale."""
+
+
+def star_image(
+    ax: Axes, image: Image, grid: Image, norm: Any, *, bar: str, title: str,
+    north: float | None = None,
+) -> None:  # fmt: skip
+    """Draw the light of a star and its surroundings on the scale `norm`, see `light_norm`."""
+    style: dict[str, Any] = {"cmap": _LIGHT, "norm": norm}
+    if hasattr(norm, "linear_width"):
+        # Powers of ten in the logarithmic part; those of the linear part would overlap.
+        decades = np.arange(np.ceil(np.log10(norm.linear_width)), np.log10(norm.vmax))
+        style["ticks"] = [0.0, *10.0**decades]
+    _on_sky(ax, image, grid, north, bar=bar, title=title, **style)
+
+
+def signed_image(
+    ax: Axes, image: Image, grid: Image, limit: float, *, bar: str, title: str,
+    places: ArrayLike = (), north: float | None = None,
+) -> None:  # fmt: skip
+    """Draw an image of either sign on a linear scale to +-`limit`, with circles at `places`."""
+    _on_sky(ax, image, grid, north, bar=bar, title=title, cmap=_SIGNED, vmin=-limit, vmax=limit)
+    if np.size(places):
+        circles(ax, places)
+
+
+def snr_map(
+    ax: Axes, snr: Image, grid: Image, places: ArrayLike = (), north: float | None = None, *,
+    title: str = "", labels: Sequence[str] = (),
+) -> None:  # fmt: skip
+    """Draw a map of S/N with circles at candidates.
+
+    The scale is linear where there is noise and logarithmic beyond, so that bright sources keep
+    their shape.
+
+    Parameters
+    ----------
+    ax : Axes
+    snr : ndarray, (ny, nx)
+    grid : ndarray, (ny, nx, 2)
+    places : array, (k, 2)
+        x and y of candidates, arcsec.
+    north : float, optional
+    title : str
+    labels : sequence of str
+        One for each of the places, or none.
+    """
+    from matplotlib.colors import AsinhNorm
+
+    limit = max(_LINEAR, float(np.nanmax(np.abs(snr))))
+    _on_sky(
+        ax, snr, grid, north, bar="S/N of a point source", title=title, cmap=_SIGNED,
+        norm=AsinhNorm(_LINEAR, -limit, limit), ticks=_SNR_TICKS,
+    )  # fmt: skip
+    circles(ax, places, labels)
+
+
+def wavefront_map(
+    ax: Axes, opd: Image, width: float, *, title: str, limit: float | None = None
+) -> None:
+    """Draw a wavefront error (nm, NaN outside the pupil) on a pupil array of `width` metres.
+
+    The scale goes to +-`limit`; by default few pixels exceed it.
+    """
+    if limit is None:
+        limit = float(np.nanpercentile(np.abs(opd), 99.5)) or 1.0
+    _on_pupil(
+        ax, opd, width, bar="wavefront error (nm)", title=title, cmap=_SIGNED,
+        vmin=-limit, vmax=limit,
+    )  # fmt: skip
+
+
+def pupil_image(
+    ax: Axes, image: Image, width: float, *, bar: str, title: str, logarithmic: bool = False
+) -> None:
+    """Draw an amplitude from 0 to 1, or light on a logarithmic scale, on a pupil array."""
+    style = {"cmap": _LIGHT, "norm": light_norm(image)} if logarithmic else {"cmap": "gray"}
+    _on_pupil(ax, image, width, bar=bar, title=title, **style)
+
+
+def light_norm(image: Image, noise: Image | None = None) -> Any:
+    """Scale for light: logarithmic, and linear within three times the median noise if given."""
+    from matplotlib.colors import AsinhNorm, LogNorm
+
+    low, high = float(np.nanmin(image)), float(np.nanmax(image))
+    if noise is None:
+        return LogNorm(high * 10.0**-_DECADES, high, clip=True)
+    width = 3 * float(np.median(noise))
+    return AsinhNorm(width, vmin=max(low, -width), vmax=max(high, low + width))
+
+
+def _on_sky(ax: Axes, image: Image, grid: Image, north: float | None, **style: Any) -> None:
+    _show(ax, image, grid[0, :, 0], grid[:, 0, 1], **style)
+    label_sky(ax)
+    if north is not None:
+        compass(ax, north)
+
+
+def _on_pupil(ax: Axes, image: Image, width: float, **style: Any) -> None:
+    middles = ((np.arange(len(image)) + 0.5) / len(image) - 0.5) * width
+    _show(ax, image, middles, middles, **style)
+    ax.set_xlabel("x in the pupil (m)")
+    ax.set_ylabel("y in the pupil (m)")
+
+
+def _show(
+    ax: Axes, image: Image, x: Image, y: Image, *, bar: str, title: str,
+    ticks: Sequence[float] | None = None, **style: Any,
+) -> None:  # fmt: skip
+    """Draw an image whose pixels have their centres at `x` and `y`, with a colour bar."""
+    half_x, half_y = (abs(axis[-1] - axis[0]) / (2 * max(len(axis) - 1, 1)) for axis in (x, y))
+    extent = (x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y)
+    artist = ax.imshow(image, origin="lower", extent=extent, interpolation="nearest", **style)
+    ax.set_facecolor("0.75")
+    ax.set_title(title, color=INK, loc="left")
+    # An inset follows the image, whose box differs from that of the axes.
+    strip = ax.inset_axes((1.03, 0.0, 0.05, 1.0))
+    low, high = np.array(artist.get_clim(), dtype=float)
+    extend = ("neither", "max", "min", "both")[
+        2 * bool(np.nanmin(image) < low) + bool(np.nanmax(image) > high)
+    ]
+    form = None if ticks is None else "%g"
+    ax.figure.colorbar(artist, cax=strip, label=bar, extend=extend, ticks=ticks, format=form)
