@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.drawing import compass, halo, light_norm, save
-from pyklip_diffrender.pyklip_backend.klip_curve import KlipSubtraction, klip_curve
+from pyklip_diffrender.pyklip_backend.klip import KlipSubtraction, klip_curve
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 
 Image = NDArray[np.float64]
@@ -112,8 +112,7 @@ def main() -> None:
         for name in ("contrast", "small_sample")
     )
     references = sequence.cutout(SIZE).references
-    fitted = replace(reduction, sequence=replace(reduction.sequence, references=references))
-    theirs = np.asarray(klip_curve(fitted, SEPARATIONS)["contrast"])
+    theirs = np.asarray(klip_curve(reduction.detection, references, SEPARATIONS)["contrast"])
     print("5-sigma limits: ours; with small-sample correction: ours, KLIP, ratio")
     for row in zip(SEPARATIONS, ours, corrected, theirs, theirs / corrected, strict=True):
         print("{:.1f}  {:.2e}  {:.2e}  {:.2e}  {:.2f}".format(*row))

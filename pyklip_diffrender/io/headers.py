@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from numbers import Real
 from typing import Any
 
@@ -14,6 +15,7 @@ from pyklip_diffrender.errors import CorruptFileError
 
 __all__ = [
     "card_error",
+    "fits_text",
     "header_date",
     "header_number",
     "header_text",
@@ -47,6 +49,21 @@ def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fi
             "file again"
         ) from error
     return merged
+
+
+def fits_text(text: object) -> str:
+    """Return a text as FITS headers can hold it, in printable ASCII.
+
+    Accents are left out, and other characters become question marks.
+
+    Examples
+    --------
+    >>> fits_text("Übersicht β Pic.fits")
+    'Ubersicht ? Pic.fits'
+    """
+    plain = unicodedata.normalize("NFKD", str(text))
+    letters = (c for c in plain if not unicodedata.combining(c))
+    return "".join(c if " " <= c <= "~" else "?" for c in letters)
 
 
 def card_error(name: str, card: str, value: Any, expected: str) -> CorruptFileError:
