@@ -1052,12 +1052,11 @@ def test_a_contrast_curve_outside_the_field_is_refused(one: Detection) -> None:
 def test_all_errors_have_the_factor_of_their_position(empty: list[Detection]) -> None:
     """A fit that does not explain its data is searched with the scatter of its S/N."""
     (fit,) = empty[0].fits
-    assert fit.linear is not None
     # Residuals, and unknowns as far from their priors, three times what they should be.
     frames = tuple(replace(each, residual=3 * each.residual) for each in fit.linear.frames)
     mean = fit.linear.vector - 3 * (fit.linear.vector - fit.linear.mean)
     linear = replace(fit.linear, frames=frames, mean=mean)
-    mismatch = replace(fit, linear=linear, status=Status.MODEL_MISMATCH)
+    mismatch = replace(fit, stored_linear=linear, status=Status.MODEL_MISMATCH)
     plain, found = dr.detect(mismatch, scatter=1.0, threshold=math.inf), dr.detect(mismatch)
     factor = found.error_factor
     assert factor.is_measured

@@ -49,7 +49,8 @@ SKY = Sky(north=NORTH, mjd=59855.5, star=(0.4, 0.04))
 
 
 def observation(folder: Path, **changes: object) -> Observation:
-    science = fits.ImageHDU(np.ones((1, 16, 20), "f4"), name="SCI")
+    # Not one value everywhere, which no exposure has.
+    science = fits.ImageHDU(np.arange(320, dtype="f4").reshape(1, 16, 20) + 1, name="SCI")
     for key, value in {**REAL, **changes}.items():
         if value is not None:
             science.header[key] = value

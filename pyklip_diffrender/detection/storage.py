@@ -129,7 +129,10 @@ def maps_of(hdus: fits.HDUList) -> dict[str, Any]:
     shapes = {each.shape[:2] for each in (*maps.values(), factors, freedom)}
     if len(shapes) > 1 or maps["snr"].ndim != 2:
         raise ValueError(f"maps have the shapes {sorted(shapes)}")
-    return {**maps, "error_factor": ErrorFactor(factors, freedom, maps["grid"])}
+    factor = ErrorFactor(factors, freedom, maps["grid"])
+    if not factor.is_measured:
+        factor = ErrorFactor.constant(float(factors[0, 0]))
+    return {**maps, "error_factor": factor}
 
 
 def candidates_of(facts: dict[str, Any]) -> Candidates:
