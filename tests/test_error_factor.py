@@ -1,23 +1,22 @@
-"""The factor by which errors of a search are multiplied, against simulated maps of S/N."""
+"""Errors and thresholds of a search, against simulated maps of S/N."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import cast
-
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import gaussian_filter
 
-from pyklip_diffrender.detection import search
-from pyklip_diffrender.detection.error_factor import ErrorFactor, scatter_profile
-from pyklip_diffrender.detection.maps import Maps
+from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.significance import Significance
 
 PIXEL = 0.06
 RESOLUTION = 0.15
+SMOOTH = 1.1
+"""Standard deviation of the Gaussian that makes noise as smooth as a map of S/N, pixels."""
+
+NOTHING = np.zeros((0, 2))
 Image = NDArray[np.float64]
 
 
@@ -27,69 +26,161 @@ def field(size: int = 80) -> Image:
     return np.stack(np.meshgrid(axis, axis), axis=-1)
 
 
-def snr_map(seed: int, scale: Image) -> Image:
-    """Gaussian noise, smooth over a resolution element, with a standard deviation of `scale`."""
-    white = np.random.default_rng(seed).normal(size=scale.shape)
-    smooth = gaussian_filter(white, RESOLUTION / PIXEL / 2.355)
-    return np.asarray(scale * smooth / smooth.std())
+GRID = field()
+DISTANCE = np.hypot(GRID[..., 0], GRID[..., 1])
+STARLIGHT = (
+    100
+    * (0.3 / np.maximum(DISTANCE, 0.25)) ** 1.6
+    * np.exp(0.5 * np.cos(6 * np.arctan2(GRID[..., 1], GRID[..., 0])))
+)
+"""Star over noise, with spikes."""
 
 
-def test_errors_follow_the_scatter_of_the_snr_at_their_separation() -> None:
-    grid = field()
-    distance = np.hypot(grid[..., 0], grid[..., 1])
-    scale = 1 + 1.5 * np.exp(-((distance / 0.8) ** 2))
-    ratios = []
+def noise(seed: int) -> Image:
+    """Gaussian noise of standard deviation 1, smooth over a resolution element."""
+    white = np.random.default_rng(seed).normal(size=(100, 100))
+    return 2 * np.sqrt(np.pi) * SMOOTH * gaussian_filter(white, SMOOTH)[10:-10, 10:-10]
+
+
+def significance(**changes: object) -> Significance:
+    offsets = np.arange(-5, 6.0)
+    correlation = np.exp(-np.add.outer(offsets**2, offsets**2) / (4 * SMOOTH**2))
+    values = {"grid": GRID, "starlight": STARLIGHT, "correlation": correlation, "inner": 0.2}
+    return Significance(**{**values, "resolution": RESOLUTION, **changes})  # type: ignore[arg-type]
+
+
+RINGS = (0.3, 0.5, 1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    "scale",
+    [
+        pytest.param(np.sqrt(0.5 + 5 * STARLIGHT / 50), id="by starlight"),
+        pytest.param(1 + 1.5 * np.exp(-((DISTANCE / 0.8) ** 2)), id="by separation"),
+        pytest.param(np.ones((80, 80)), id="uniform"),
+    ],
+)
+def test_the_factor_is_the_scatter_of_the_snr(scale: Image) -> None:
+    judge = significance()
+    logs, variances = [], []
     for seed in range(20):
-        snr = snr_map(seed, scale)
-        factor = scatter_profile(snr, grid, torch.zeros(0, 2), 0.2, RESOLUTION)
-        ratios.append([factor.at(s) / (1 + 1.5 * np.exp(-((s / 0.8) ** 2))) for s in (0.6, 1.2, 2)])
-    # Rings are a little broad, and pulled towards the whole field.
-    np.testing.assert_allclose(np.mean(ratios, axis=0), 1, atol=0.12)
-    assert np.std(ratios, axis=0).max() < 0.12
-    # One factor for the whole map would be wrong by 60 % near the star.
-    assert snr_map(0, scale).std() < 0.75 * scale[distance < 0.6].mean()
+        factor = judge.factor(scale * noise(seed), NOTHING)
+        rings = [np.abs(DISTANCE - ring) < 0.06 for ring in RINGS]
+        logs.append([np.log((factor.factors / scale)[ring]).mean() for ring in rings])
+        variances.append([(1 / (2 * factor.freedom[ring])).mean() for ring in rings])
+    # The mean of 20 is known to 2 % at 0.3 arcsec. The prior, which all three laws share, accounts
+    # for 10 %; a pull towards the quiet field cost 15 to 27 %.
+    np.testing.assert_allclose(np.mean(logs, axis=0), 0, atol=0.12)
+    # The logarithm of a standard deviation of n values is known to 1 / sqrt(2 n). The prior keeps
+    # estimates together, so that some scatter less; a scatter of 20 is known to 16 %.
+    stated = np.sqrt(np.mean(variances, axis=0))
+    assert (np.std(logs, axis=0) < 1.5 * stated).all()
+    assert stated[0] < 0.2
+    assert stated[-1] < 0.06
 
 
-def test_where_the_errors_are_right_the_factor_is_nearly_one() -> None:
-    grid = field()
-    factors = [
-        scatter_profile(snr_map(seed, np.ones((80, 80))), grid, torch.zeros(0, 2), 0.2, RESOLUTION)
-        .at_least(1.0)
-        .at([0.4, 1.0, 2.0])
-        for seed in range(20)
-    ]
-    assert np.mean(factors) < 1.06
-    assert np.max(factors) < 1.25
+def test_a_factor_by_separation_alone_would_miss_the_spikes() -> None:
+    scale = np.sqrt(0.5 + 5 * STARLIGHT / 50)
+    factor = significance().factor(scale * noise(1), NOTHING).factors
+    ring = np.abs(DISTANCE - 0.6) < 0.06
+    assert scale[ring].max() > 1.6 * scale[ring].min()
+    assert np.corrcoef(factor[ring], scale[ring])[0, 1] > 0.95
 
 
-def test_sources_do_not_raise_their_own_threshold() -> None:
-    grid, ones = field(), np.ones((80, 80))
-    source = np.hypot(grid[..., 0] - 1.0, grid[..., 1]) < 0.12
-    snr = snr_map(3, ones)
-    known = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
-    alone = scatter_profile(snr, grid, known, 0.2, RESOLUTION)
-    masked = scatter_profile(np.where(source, 300.0, snr), grid, known, 0.2, RESOLUTION)
-    np.testing.assert_allclose(masked.factors, alone.factors)
-    unmasked = scatter_profile(np.where(source, 300.0, snr), grid, known[:0], 0.2, RESOLUTION)
-    assert float(unmasked.at(1.0)) == pytest.approx(float(alone.at(1.0)), abs=0.35)
+def test_sources_do_not_raise_the_factor() -> None:
+    place = np.array([[1.0, 0.0]])
+    image = 30 * np.exp(-(np.hypot(GRID[..., 0] - 1.0, GRID[..., 1]) ** 2) / (4 * 0.07**2))
+    judge, quiet = significance(), noise(3)
+    alone, masked = (judge.factor(each, place) for each in (quiet, quiet + image))
+    # Beyond the disc that is left out a source has a few percent of its light.
+    np.testing.assert_allclose(masked.factors, alone.factors, rtol=0.05)
+    unmasked = judge.factor(quiet + image, NOTHING)  # Clipped.
+    assert float(unmasked.at(1.0)) < 1.25 * float(alone.at(1.0))
+
+
+@pytest.mark.parametrize("separation", [0.4, 0.8])
+def test_a_source_is_judged_without_its_own_light(separation: float) -> None:
+    """At S/N 10 it is significant, though near the star it is much of the scatter of its ring."""
+    pixel = np.unravel_index(
+        np.argmin(np.hypot(GRID[..., 0] - separation, GRID[..., 1])), DISTANCE.shape
+    )
+    shape = np.exp(-(np.sum((GRID - GRID[pixel]) ** 2, axis=-1)) / (4 * (SMOOTH * PIXEL) ** 2))
+    judge, everywhere = significance(), np.ones((80, 80), dtype=bool)
+    for seed in range(5):
+        quiet = noise(seed)
+        assert judge.next_peak(quiet, NOTHING, 5.0, everywhere) is None
+        snr = quiet + (10 - quiet[pixel]) * shape
+        assert judge.next_peak(snr, NOTHING, 5.0, everywhere) == pixel
+        # Not where it is not allowed, and not where it is known.
+        assert judge.next_peak(snr, GRID[pixel][None], 5.0, everywhere) is None
+        assert judge.next_peak(snr, NOTHING, 5.0, ~everywhere) is None
+
+
+def test_noise_passes_as_rarely_as_gaussian_noise_would() -> None:
+    """At a threshold that noise passes often; `benchmarks/false_alarms.py` has that of 5."""
+    scale, judge, everywhere = (
+        1 + 1.5 * np.exp(-((DISTANCE / 0.8) ** 2)),
+        significance(),
+        (np.ones((80, 80), dtype=bool)),
+    )
+    count, nominal, passed, naive = 40, 0, 0, 0
+    for seed in range(count):
+        unit = noise(seed)
+        nominal += bool((unit[DISTANCE > 0.2] > 3.5).any())
+        passed += judge.next_peak(scale * unit, NOTHING, 3.5, everywhere) is not None
+        naive += bool((scale * unit / np.std(scale * unit) > 3.5)[DISTANCE > 0.2].any())
+    # The difference of two counts that agree in most maps is known to 3 or so.
+    assert abs(passed - nominal) <= 10
+    assert naive > nominal + 6
+
+
+def test_probability_of_a_maximum_of_noise() -> None:
+    judge = significance(measured=False)
+    allowed = DISTANCE >= 0.2
+    heights = []
+    for seed in range(300):
+        values = noise(seed)
+        peak = np.unravel_index(np.argmax(np.where(allowed, values, -9)), values.shape)
+        # The curvature at a maximum is known: its height between the pixels follows from the slope.
+        height = values[peak]
+        for axis in (0, 1):
+            if 0 < peak[axis] < 79:
+                step = np.eye(2, dtype=int)[axis]
+                low, high = values[tuple(peak - step)], values[tuple(peak + step)]
+                height += (high - low) ** 2 / 8 / (2 * values[peak] - low - high)
+        heights.append(height)
+    for level in (3.5, 4.0):
+        share = np.mean(np.array(heights) > level)
+        # The share of 300 is known to 8 % and to 18 %.
+        assert judge.false_alarm(level) == pytest.approx(share, rel=0.25)
+    # Far above the noise it is proportional to the number of places.
+    small = significance(measured=False, grid=GRID[20:60, 20:60], starlight=STARLIGHT[20:60, 20:60])
+    assert judge.false_alarm(5.0) == pytest.approx(4 * small.false_alarm(5.0), rel=0.1)
+    assert judge.false_alarm(30.0) < 1e-100
+    assert judge.false_alarm(np.inf) == 0
 
 
 def test_factors_are_interpolated_and_never_below_their_floor() -> None:
-    factor = ErrorFactor(np.array([0.5, 1.0]), np.array([2.0, 0.8]), np.full(2, 50.0))
-    np.testing.assert_allclose(factor.at([0.1, 0.75, 3.0]), [2.0, 1.4, 0.8])
-    offsets = torch.tensor([[0.3, 0.4], [0.0, -1.0]], dtype=torch.float64)
-    np.testing.assert_allclose(factor.of(offsets), [2.0, 0.8])
-    np.testing.assert_allclose(factor.at_least(1.0).factors, [2.0, 1.0])
-    assert factor.typical == pytest.approx(1.4)
+    factor = ErrorFactor(DISTANCE + 0.5, np.full((80, 80), 50.0), GRID)
+    offsets = np.array([[0.3, 0.4], [0.0, -1.0]])
+    np.testing.assert_allclose(factor.of(offsets), [1.0, 1.5], atol=0.01)
+    np.testing.assert_allclose(factor.at([0.5, 1.0]), [1.0, 1.5], atol=0.01)
+    np.testing.assert_allclose(factor.at_least(1.2).of(offsets), [1.2, 1.5], atol=0.01)
+    # Beyond the field the factors of its edge.
+    assert factor.of(np.array([[9.0, 0.0]])) == pytest.approx(factor.factors[40, -1], rel=0.01)
+    assert factor.at(9.0) == pytest.approx(factor.factors[0, 0], rel=0.01)
     assert factor.is_needed
     assert not ErrorFactor.constant(1.0).is_needed
 
 
 def test_noise_exceeds_the_threshold_as_rarely_as_gaussian_noise() -> None:
-    measured = ErrorFactor(np.array([0.4, 2.0]), np.ones(2), np.array([10.0, 50.0]))
-    threshold = measured.threshold(3.0, [0.4, 2.0])
+    freedom = np.where(DISTANCE < 1.0, 10.0, 50.0)
+    measured = ErrorFactor(np.ones((80, 80)), freedom, GRID)
+    offsets = np.array([[0.4, 0.0], [2.0, 0.0]])
+    threshold = measured.threshold(3.0, offsets)
     assert threshold[0] > threshold[1] > 3.0
-    np.testing.assert_allclose(measured.false_alarm(threshold, [0.4, 2.0]), stats.norm.sf(3.0))
+    np.testing.assert_allclose(measured.threshold_at(3.0, [0.4, 2.0]), threshold)
+    np.testing.assert_allclose(measured.false_alarm(threshold, offsets), stats.norm.sf(3.0))
     # The variance of this noise was drawn from few values, like that of a ring.
     rng = np.random.default_rng(5)
     count = 400_000
@@ -97,46 +188,9 @@ def test_noise_exceeds_the_threshold_as_rarely_as_gaussian_noise() -> None:
     exceeded = np.mean(rng.normal(size=count) / scatter > threshold[0])
     assert exceeded == pytest.approx(stats.norm.sf(3.0), rel=0.15)
     known = ErrorFactor.constant(1.5)
-    np.testing.assert_allclose(known.threshold(3.0, [0.4, 2.0]), 3.0)
-
-
-def test_the_scatter_of_a_ring_is_as_well_known_as_its_positions_are_many() -> None:
-    grid, ones = field(), np.ones((80, 80))
-    distance = np.hypot(grid[..., 0], grid[..., 1])
-    ring = np.abs(distance - 0.6) < 0.2
-    maps = [snr_map(seed, ones) for seed in range(300)]
-    variances = [(each[ring] ** 2).mean() for each in maps]
-    positions = 2 * np.mean(variances) ** 2 / np.var(variances)
-    factor = scatter_profile(maps[0], grid, torch.zeros(0, 2), 0.2, RESOLUTION)
-    freedom = float(np.interp(0.6, factor.separations, factor.freedom))
-    # 20 for the scatter of the whole field. Real S/N is smoother than this noise.
-    assert 0.5 * positions < freedom - 20 < positions
+    np.testing.assert_allclose(known.threshold(3.0, offsets), 3.0)
 
 
 def test_a_map_without_valid_pixels_needs_no_factor() -> None:
-    factor = scatter_profile(np.full((80, 80), np.nan), field(), torch.zeros(0, 2), 0.2, RESOLUTION)
+    factor = significance().factor(np.full((80, 80), np.nan), NOTHING)
     assert not factor.is_needed
-
-
-def test_a_source_near_the_star_is_judged_without_its_own_light(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    grid, ones = field(), np.ones((80, 80))
-    distance = np.hypot(grid[..., 0] - 0.4, grid[..., 1])
-    quiet = snr_map(1, ones)
-    snr = quiet + 6.5 * np.exp(-((distance / 0.1) ** 2))
-    peak = np.unravel_index(np.argmax(np.where(distance < 0.2, snr, 0)), snr.shape)
-
-    def factor(_s: Image, _m: object, _f: object, known: torch.Tensor, inner: float) -> ErrorFactor:
-        return scatter_profile(snr, grid, known, inner, RESOLUTION).at_least(1.0)
-
-    monkeypatch.setattr(search, "_error_factor", factor)
-    none = torch.zeros(0, 2, dtype=torch.float64)
-    raised = factor(snr, None, None, none, 0.2)
-    threshold = 0.97 * snr[peak]
-    assert search._next_peak(snr, grid, none, raised, threshold, 0.2) is None
-    maps = cast(Maps, SimpleNamespace(grid=grid))
-    hidden = search._hidden_peak(snr, snr, maps, [], none, raised, threshold, 0.2)
-    assert hidden == peak
-    quiet_factor = factor(quiet, None, None, none, 0.2)
-    assert search._hidden_peak(quiet, quiet, maps, [], none, quiet_factor, 5.0, 0.2) is None

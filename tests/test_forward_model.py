@@ -226,9 +226,10 @@ def test_errors_include_the_scatter_of_the_search(
 ) -> None:
     """Three times the errors where the S/N of the search scatters by three."""
     star, planet = shots(model, OLD.data)
-    factor = ErrorFactor(
-        np.array([0.0, 2 * PIXEL * SEPARATION]), np.array([2.0, 4.0]), np.full(2, 50.0)
-    )
+    axis = PIXEL * np.arange(-40.0, 41.0)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1)
+    distance = np.hypot(grid[..., 0], grid[..., 1])
+    factor = ErrorFactor(2 + distance / (PIXEL * SEPARATION), np.full((81, 81), 50.0), grid)
     headers = []
     for keep, found in ((False, None), (True, factor)):
         monkeypatch.setattr(subtract, "_with_companions", lambda fits, tell, f=found: (fits, f))

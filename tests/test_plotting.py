@@ -267,7 +267,7 @@ def test_a_detection_shows_candidates_and_the_curve(found: Detection) -> None:
 
 
 def test_a_detection_without_candidates_has_no_circles(found: Detection) -> None:
-    left, right = replace(found, candidates=Candidates.at([], [])).plot()
+    left, right = replace(found, candidates=Candidates.at([], []), false_alarm=np.zeros(0)).plot()
     assert left.get_title(loc="left") == "0 candidates above S/N 5"
     assert points(left, "companions").shape == (0, 2)
     assert "candidates" not in [text.get_text() for text in right.get_legend().get_texts()]

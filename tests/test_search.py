@@ -27,6 +27,8 @@ class MadeUpMaps:
         self.grid = 0.06 * np.stack([x, y], axis=-1)
         self.groups = ()
         self.information = np.ones((41, 41))
+        self.starlight = np.ones((41, 41))
+        self.correlation = np.pad([[1.0]], 2)
 
     def without(self, candidates: Candidates) -> np.ndarray:
         snr = np.zeros((41, 41))
@@ -60,9 +62,10 @@ def test_a_dismissed_peak_is_not_taken_again(monkeypatch: pytest.MonkeyPatch) ->
     fit = SimpleNamespace(
         status=SimpleNamespace(calibrated=False),
         frames=(SimpleNamespace(observation=observation),),
+        model=SimpleNamespace(resolution=0.14),
     )
-    candidates, factor = search._search(
-        maps, [fit], 5.0, 0.2, 1.0, Candidates.at(np.zeros((0, 2)), [])
+    candidates, factor, _ = search._search(
+        maps, [fit], Candidates.at(np.zeros((0, 2)), []), 5.0, 0.2, 1.0
     )
     assert factor.typical == 1.0
     assert sorted(candidates.contrasts.tolist()) == [6.0, 8.0]

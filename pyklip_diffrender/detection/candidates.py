@@ -12,14 +12,13 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image, far_from, separation_of
+from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.companions import local_maxima
 from pyklip_diffrender.scene.objects import Planet
 
-__all__ = ["Candidates", "refine_candidates", "strongest_peak"]
+__all__ = ["Candidates", "refine_candidates"]
 
 _log = logging.getLogger(__name__)
 
@@ -157,26 +156,3 @@ def refine_candidates(
     if not converged:
         _log.info("positions did not settle, number of candidates: %d", count)
     return Candidates(offsets, contrasts, covariance, converged)
-
-
-def strongest_peak(
-    snr: Image, grid: Image, sources: Tensor, *, threshold: float, inner: float, distance: float
-) -> tuple[int, int] | None:
-    """Pixel of the highest local maximum above the threshold that belongs to no known source.
-
-    Parameters
-    ----------
-    snr : ndarray, (ny, nx)
-    grid : ndarray, (ny, nx, 2)
-        x, y from the star, arcsec.
-    sources : Tensor, (k, 2)
-        x, y of known sources.
-    threshold : float
-    inner : float
-        Smallest separation from the star, arcsec.
-    distance : float
-        Smallest distance from known sources, arcsec.
-    """
-    allowed = (separation_of(grid) >= inner) & far_from(grid, sources, distance)
-    peaks = local_maxima(snr, allowed, threshold, size=3)
-    return peaks[0] if peaks else None

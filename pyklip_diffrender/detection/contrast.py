@@ -65,7 +65,7 @@ def contrast_table(
         known, the flux density of the median.
     """
     rows = []
-    corrections = factor.threshold(_SIGMAS, separations) / _SIGMAS
+    corrections = factor.threshold_at(_SIGMAS, separations) / _SIGMAS
     for separation, error, photon_error, correction in zip(
         separations, errors, photon, corrections, strict=True
     ):

@@ -1,92 +1,154 @@
-"""Factor by which the errors of a search are multiplied, as a function of separation."""
+"""Factor by which the errors of a search are multiplied.
+
+Where the model does not explain its data to the noise, the S/N of a map scatters by more than 1.
+The scatter grows with the star's light in the pixels of a planet, and what is left depends on the
+separation. Both are fitted to the map itself,
+
+    f^2 = (A + B q / 50) exp(g(log r)),
+
+where q is the star's light over the noise, weighted with the image of the planet, and g a Gaussian
+process. The fit also says how well f is known at each position: noise in units of the multiplied
+errors follows Student's t, and the threshold of a search has to be higher.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from pyklip_diffrender.detection.field import Image, far_from, separation_of
+from pyklip_diffrender.detection.field import Image, far_from, pixels_of, separation_of
 
-__all__ = ["ErrorFactor", "scatter_profile"]
+__all__ = ["CLIP", "ErrorFactor", "Scatter"]
 
-_WINGS = 0.4
-"""arcsec; closer to a candidate, its own light dominates the S/N."""
+_WINGS = 1.5
+"""Resolution elements about a source whose S/N is not used: about the size of its image."""
 
-_WIDTH = 0.2
-"""Half the width of the rings in which the scatter is measured, arcsec."""
+_BRIGHT = 50.0
+"""Star over noise at which the two terms of the starlight are compared."""
 
-_STEP = 0.1
-"""Distance between rings, arcsec."""
+_KNOTS = 8
+"""Number of separations at which the Gaussian process g is represented, evenly in log r."""
 
-_CLIP = 5.0
+_LENGTH = 1.0
+"""Correlation length of g in log r: separations that differ by less than a factor of e share it."""
+
+_SPREAD = 0.5
+"""Prior standard deviation of g and of log A: f departs by a quarter from the law of starlight."""
+
+_STARLIGHT = -1.0
+_STARLIGHT_SPREAD = 1.0
+"""Prior mean and standard deviation of log B. Single rolls of four stars gave B of 0 to 5."""
+
+CLIP = 4.0
 """Standard deviations at which S/N is clipped, so that sources that are not yet candidates do not
-raise their own threshold."""
+raise the threshold of others."""
 
-_PRIOR = 20.0
-"""Independent positions that the scatter of the whole field counts for in every ring. A ring at 0.4
-arcsec has about 35, which leave its own standard deviation uncertain by 12 %."""
+_THINNING = 2
+"""Distance between the rows, and the columns, of pixels to which the factor is fitted."""
 
-_AREA = 1.5
-"""Resolution elements per independent position. The S/N of neighbouring positions correlates; the
-posterior covariance of two rolls of G 7-34 and HIP 17695 gives 1.2 to 1.5 up to 0.7 arcsec from the
-star, and 1.9 to 2.5 at 2 arcsec, where rings have more than a hundred positions in any case."""
+_MEDIAN = float(stats.chi2.median(1))
+"""Median of the square of Gaussian noise."""
+
+_STEPS = 30
+"""Largest number of steps of the fit."""
+
+_SETTLED = 1e-4
+"""The fit ends when no parameter changes by more than this."""
+
+_ANGLES = 72
+"""Positions on a circle of which the median is the factor of a separation."""
 
 
 @dataclass(frozen=True)
 class ErrorFactor:
-    """Factor for errors at any separation from the star, interpolated between rings.
+    """Factor for errors at any position.
 
     Attributes
     ----------
-    separations : ndarray, (k,)
-        Rings, arcsec, from the inside.
-    factors : ndarray, (k,)
-    freedom : ndarray, (k,)
+    factors : ndarray, (ny, nx)
+        At the pixels of the first frame.
+    freedom : ndarray, (ny, nx)
         Degrees of freedom of Student's t, which noise follows in units of errors that were
         multiplied by a measured factor. Infinity where the factor is not measured: the noise is
         then Gaussian.
+    grid : ndarray, (ny, nx, 2)
+        x, y of the pixels from the star, arcsec.
+
+    Examples
+    --------
+    >>> from pyklip_diffrender.detection.error_factor import ErrorFactor
+    >>> factor = ErrorFactor.constant(1.5)
+    >>> float(factor.at(0.5)), factor.is_measured
+    (1.5, False)
     """
 
-    separations: NDArray[np.float64]
-    factors: NDArray[np.float64]
-    freedom: NDArray[np.float64]
+    factors: Image
+    freedom: Image
+    grid: Image
 
     @classmethod
     def constant(cls, factor: float) -> ErrorFactor:
         """The same factor everywhere, which no scatter was measured for."""
-        return cls(np.zeros(1), np.array([float(factor)]), np.array([np.inf]))
+        one = np.ones((1, 1))
+        return cls(factor * one, np.inf * one, np.zeros((1, 1, 2)))
 
-    def at(self, separation: ArrayLike) -> NDArray[np.float64]:
-        """Factors at separations, arcsec; beyond the rings that of the nearest one."""
-        return np.asarray(
-            np.interp(np.asarray(separation, dtype=float), self.separations, self.factors)
-        )
+    def of(self, offsets: Tensor | Image) -> Image:
+        """Factors at positions x, y from the star, (..., 2), arcsec."""
+        return self._interpolated(self.factors, np.asarray(offsets))
 
-    def of(self, offsets: Tensor) -> NDArray[np.float64]:
-        """Factors at positions x, y from the star, (k, 2), arcsec."""
-        return self.at(separation_of(offsets.numpy().reshape(-1, 2)))
+    def at(self, separation: ArrayLike) -> Image:
+        """Median of the factors at separations, arcsec."""
+        return self._on_circles(self.factors, separation)
 
-    def false_alarm(self, snr: ArrayLike, separation: ArrayLike) -> NDArray[np.float64]:
+    def false_alarm(self, snr: ArrayLike, offsets: Tensor | Image) -> Image:
         """Probability that noise at one position exceeds an S/N of the multiplied errors."""
-        return np.asarray(stats.t.sf(snr, self._freedom_at(separation)))
+        return np.asarray(stats.t.sf(snr, self._freedom_of(offsets)))
 
-    def threshold(self, sigmas: float, separation: ArrayLike) -> NDArray[np.float64]:
-        """S/N that noise exceeds as rarely as Gaussian noise exceeds `sigmas`."""
-        return np.asarray(stats.t.isf(stats.norm.sf(sigmas), self._freedom_at(separation)))
+    def threshold(self, sigmas: float, offsets: Tensor | Image) -> Image:
+        """S/N that noise at a position exceeds as rarely as Gaussian noise exceeds `sigmas`."""
+        return np.asarray(stats.t.isf(stats.norm.sf(sigmas), self._freedom_of(offsets)))
 
-    def _freedom_at(self, separation: ArrayLike) -> NDArray[np.float64]:
+    def threshold_at(self, sigmas: float, separation: ArrayLike) -> Image:
+        """The same at separations, arcsec, from the median of the degrees of freedom."""
+        freedom = _inverse(self._on_circles(1 / self.freedom, separation))
+        return np.asarray(stats.t.isf(stats.norm.sf(sigmas), freedom))
+
+    def _freedom_of(self, offsets: Tensor | Image) -> Image:
         # Interpolated as its inverse, which is finite.
-        inverse = np.interp(np.asarray(separation, dtype=float), self.separations, 1 / self.freedom)
-        return np.divide(1.0, inverse, out=np.full_like(inverse, np.inf), where=inverse > 0)
+        return _inverse(self._interpolated(1 / self.freedom, np.asarray(offsets)))
+
+    def _interpolated(self, image: Image, offsets: Image) -> Image:
+        """Values of an image at positions; beyond the grid those of the nearest pixel."""
+        if image.size == 1:
+            return np.full(offsets.shape[:-1], image[0, 0])
+        columns, rows = np.moveaxis(pixels_of(self.grid, offsets), -1, 0)
+        return np.asarray(map_coordinates(image, [rows, columns], order=1, mode="nearest"))
+
+    def _on_circles(self, image: Image, separation: ArrayLike) -> Image:
+        """Medians of an image on circles, as far as they are on the grid."""
+        radius = np.asarray(separation, dtype=float)
+        if image.size == 1:
+            return np.full(radius.shape, image[0, 0])
+        angle = np.linspace(0, 2 * np.pi, _ANGLES, endpoint=False)
+        circles = radius[..., None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        values = self._interpolated(image, circles)
+        columns, rows = np.moveaxis(pixels_of(self.grid, circles), -1, 0)
+        ny, nx = image.shape
+        inside = (rows >= 0) & (rows <= ny - 1) & (columns >= 0) & (columns <= nx - 1)
+        # A circle around the whole field has the values of its corners.
+        inside |= ~inside.any(axis=-1, keepdims=True)
+        return np.asarray(np.nanmedian(np.where(inside, values, np.nan), axis=-1))
 
     @property
     def is_measured(self) -> bool:
         """Whether it follows the scatter of the S/N, and not chi-squared alone."""
-        return len(self.factors) > 1
+        return bool(np.isfinite(self.freedom).any())
 
     @property
     def is_needed(self) -> bool:
@@ -95,7 +157,7 @@ class ErrorFactor:
 
     @property
     def typical(self) -> float:
-        """Median over the rings."""
+        """Median over the field."""
         return float(np.median(self.factors))
 
     def at_least(self, factor: float) -> ErrorFactor:
@@ -103,46 +165,168 @@ class ErrorFactor:
         return replace(self, factors=np.maximum(self.factors, factor))
 
 
-def scatter_profile(
-    snr: Image, grid: Image, offsets: Tensor, inner: float, resolution: float
-) -> ErrorFactor:
-    """Standard deviation of the S/N away from sources, by separation.
+def _inverse(values: Image) -> Image:
+    return np.divide(1.0, values, out=np.full_like(values, np.inf), where=values > 0)
 
-    Every ring has few independent positions, so that its variance is averaged with that of the
-    whole field, which counts for `_PRIOR` of them. This is the posterior mean of a variance with a
-    scaled inverse chi-squared prior. In units of its root, noise at another position follows
-    Student's t, whose degrees of freedom are the sum of both counts.
+
+@dataclass(frozen=True)
+class ScatterModel:
+    """Logarithm of f^2 at the pixels of a map as a function of a few parameters.
+
+    Parameters have independent Gaussian priors with mean 0 and standard deviation 1.
+
+    Attributes
+    ----------
+    starlight : ndarray, (n,)
+        Star over noise, in units of `_BRIGHT`.
+    rings : ndarray, (n, knots)
+        Derivative of log f^2 by the parameters of g.
+    """
+
+    starlight: NDArray[np.float64]
+    rings: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, starlight: Image, distance: Image, inner: float) -> ScatterModel:
+        """For pixels with a star over noise, at distances from the star, both (n,)."""
+        logs = np.log(np.maximum(distance, inner) / inner)
+        knots = np.linspace(0, max(logs.max(), _LENGTH), _KNOTS)
+        covariance = _SPREAD**2 * _kernel(knots, knots) + 1e-6 * np.eye(_KNOTS)
+        # Parameters are the values at the knots, made independent; g follows from them as the
+        # mean of a Gaussian process does.
+        rings = np.linalg.solve(np.linalg.cholesky(covariance), _SPREAD**2 * _kernel(knots, logs))
+        return cls(np.maximum(starlight, 0) / _BRIGHT, rings.T)
+
+    def evaluate(self, parameters: NDArray[np.float64]) -> tuple[Image, Image]:
+        """Return log f^2, (n,), and its derivatives, (n, parameters)."""
+        quiet = np.exp(_SPREAD * parameters[0])
+        bright = np.exp(_STARLIGHT + _STARLIGHT_SPREAD * parameters[1]) * self.starlight
+        share = quiet / (quiet + bright)
+        slopes = np.column_stack([_SPREAD * share, _STARLIGHT_SPREAD * (1 - share), self.rings])
+        return np.log(quiet + bright) + self.rings @ parameters[2:], slopes
+
+    def __getitem__(self, selected: NDArray[np.bool_]) -> ScatterModel:
+        return ScatterModel(self.starlight[selected], self.rings[selected])
+
+    def fit(
+        self,
+        squares: NDArray[np.float64],
+        independent: float,
+        start: NDArray[np.float64] | None = None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Most probable parameters and their covariance.
+
+        Fisher scoring for a Gaussian S/N of variance f^2, of which each pixel counts for
+        `independent` positions.
+
+        Parameters
+        ----------
+        squares : ndarray, (n,)
+            Squares of the S/N.
+        independent : float
+        start : ndarray, (parameters,), optional
+        """
+        prior = np.eye(2 + self.rings.shape[1])
+        if start is None:
+            # From here clipping does not hide a scatter that is large everywhere.
+            start = np.zeros(len(prior))
+            start[0] = np.log(np.median(squares) / _MEDIAN) / _SPREAD
+        parameters = start
+        for _ in range(_STEPS):
+            logs, slopes = self.evaluate(parameters)
+            excess = np.minimum(squares * np.exp(-logs), CLIP**2) - 1
+            curvature = independent / 2 * slopes.T @ slopes + prior
+            gradient = independent / 2 * slopes.T @ excess - parameters
+            step = np.linalg.solve(curvature, gradient)
+            step *= min(1.0, 1.0 / float(np.abs(step).max()))
+            parameters = parameters + step
+            if np.abs(step).max() < _SETTLED:
+                break
+        return parameters, np.asarray(np.linalg.inv(curvature), dtype=float)
+
+
+def _kernel(first: Image, second: Image) -> Image:
+    return np.exp(-0.5 * ((first[:, None] - second) / _LENGTH) ** 2)
+
+
+class Scatter:
+    """Scatter of the S/N of a map away from sources.
 
     Parameters
     ----------
-    snr : ndarray, (ny, nx)
+    starlight : ndarray, (ny, nx)
+        Star over noise, weighted with the image of a planet at the pixel.
     grid : ndarray, (ny, nx, 2)
         x, y of the pixels from the star, arcsec.
-    offsets : Tensor, (k, 2)
-        x, y of the sources.
     inner : float
         Pixels closer to the star than this are ignored, arcsec.
     resolution : float
         Size of a resolution element, arcsec.
+    independent : float
+        Number of independent positions per pixel: one over the sum of the squared autocorrelation
+        of the S/N.
     """
-    distance = separation_of(grid)
-    clear = (distance >= inner) & np.isfinite(snr) & far_from(grid, offsets, _WINGS)
-    if not clear.any():
-        return ErrorFactor.constant(1.0)
-    pixel_area = abs(np.linalg.det([grid[1, 1] - grid[0, 1], grid[1, 1] - grid[1, 0]]))
-    whole = _variance(snr[clear])
-    separations = np.arange(inner, distance[clear].max() + _STEP, _STEP)
-    variances, freedom = [], []
-    for separation in separations:
-        ring = clear & (np.abs(distance - separation) < _WIDTH)
-        independent = ring.sum() * pixel_area / (_AREA * resolution**2)
-        own = _variance(snr[ring]) if ring.any() else whole
-        variances.append((independent * own + _PRIOR * whole) / (independent + _PRIOR))
-        freedom.append(independent + _PRIOR)
-    return ErrorFactor(separations, np.sqrt(variances), np.array(freedom))
 
+    def __init__(
+        self, starlight: Image, grid: Image, inner: float, resolution: float, independent: float
+    ) -> None:
+        self.grid, self.resolution = grid, resolution
+        self._independent = independent * _THINNING**2
+        distance = separation_of(grid)
+        # Neighbouring pixels say nearly the same.
+        thinned = np.zeros(distance.shape, dtype=bool)
+        thinned[::_THINNING, ::_THINNING] = True
+        self._used = thinned & (distance >= inner) & np.isfinite(starlight)
+        typical = np.median(starlight[self._used]) if self._used.any() else 0.0
+        everywhere = np.nan_to_num(starlight, nan=float(typical))
+        self._model = ScatterModel.of(everywhere.ravel(), distance.ravel(), inner)
 
-def _variance(values: NDArray[np.float64]) -> float:
-    """Clipped variance about 0."""
-    deviation = 1.4826 * float(np.median(np.abs(values)))
-    return float((np.clip(values, -_CLIP * deviation, _CLIP * deviation) ** 2).mean())
+    def factor(self, snr: Image, sources: Tensor | Image) -> ErrorFactor:
+        """Factor for the errors of a map.
+
+        Parameters
+        ----------
+        snr : ndarray, (ny, nx)
+        sources : Tensor or ndarray, (k, 2)
+            x, y of sources, which are left out with their surroundings.
+        """
+        fit = self._fit(snr, sources)
+        if fit is None:
+            return ErrorFactor.constant(1.0)
+        factors, freedom = self._evaluate(self._model, *fit)
+        return ErrorFactor(factors.reshape(snr.shape), freedom.reshape(snr.shape), self.grid)
+
+    def judged(
+        self, snr: Image, sources: Tensor | Image, pixels: Sequence[tuple[int, int]]
+    ) -> Iterator[tuple[float, float]]:
+        """Factor and degrees of freedom at pixels, each without the pixel and its surroundings."""
+        start = self._fit(snr, sources)
+        for pixel in pixels:
+            left_out = np.concatenate([np.asarray(sources), self.grid[pixel][None]])
+            fit = self._fit(snr, left_out, None if start is None else start[0])
+            if fit is None:
+                yield 1.0, np.inf
+                continue
+            index = np.zeros(snr.shape, dtype=bool)
+            index[pixel] = True
+            factors, freedom = self._evaluate(self._model[index.ravel()], *fit)
+            yield float(factors[0]), float(freedom[0])
+
+    def _fit(
+        self, snr: Image, sources: Tensor | Image, start: NDArray[np.float64] | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Parameters and their covariance; None if hardly any pixels are left."""
+        away = far_from(self.grid, sources, _WINGS * self.resolution)
+        clear = self._used & np.isfinite(snr) & away
+        if clear.sum() * self._independent < 1:
+            return None
+        return self._model[clear.ravel()].fit(snr[clear] ** 2, self._independent, start)
+
+    @staticmethod
+    def _evaluate(
+        model: ScatterModel, parameters: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Factors and degrees of freedom, (n,): a variance known to a relative 2 / n is of n."""
+        logs, slopes = model.evaluate(parameters)
+        variance = ((slopes @ covariance) * slopes).sum(axis=1)
+        return np.exp(logs / 2), 2 / variance

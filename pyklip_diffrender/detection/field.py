@@ -13,6 +13,7 @@ __all__ = [
     "curve_separations",
     "far_from",
     "pixel_width",
+    "pixels_of",
     "require_inside",
     "ring_pixels",
     "separation_of",
@@ -26,10 +27,10 @@ def separation_of(grid: Image) -> Image:
     return np.asarray(np.hypot(grid[..., 0], grid[..., 1]))
 
 
-def far_from(grid: Image, offsets: Tensor, distance: float) -> NDArray[np.bool_]:
+def far_from(grid: Image, offsets: Tensor | Image, distance: float) -> NDArray[np.bool_]:
     """Pixels that are at least `distance` from all positions (k, 2), (ny, nx)."""
     far = np.ones(grid.shape[:2], dtype=bool)
-    for offset in offsets.numpy():
+    for offset in np.asarray(offsets):
         far &= separation_of(grid - offset) >= distance
     return far
 
@@ -37,6 +38,13 @@ def far_from(grid: Image, offsets: Tensor, distance: float) -> NDArray[np.bool_]
 def pixel_width(grid: Image) -> float:
     """Mean width of a pixel along x, arcsec."""
     return float(np.abs(np.diff(grid[:, :, 0], axis=1)).mean())
+
+
+def pixels_of(grid: Image, offsets: Image) -> Image:
+    """Columns and rows, (..., 2), of positions x, y from the star on a regular grid."""
+    origin = grid[0, 0]
+    steps = np.stack([grid[0, 1] - origin, grid[1, 0] - origin], axis=1)
+    return np.asarray((offsets - origin) @ np.linalg.inv(steps).T)
 
 
 def require_inside(offsets: Image, grid: Image) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -22,6 +24,12 @@ _BATCH = 320
 _STORE = 1e9
 """Largest number of bytes of templates that are stored; otherwise they are rendered again."""
 
+_REACH = 5
+"""Largest distance at which the autocorrelation of the S/N is computed, pixels."""
+
+_PLACES = 4
+"""Number of rows, and of columns, of places at which it is computed."""
+
 
 class Maps:
     """Inner products with a planet p at every pixel of the first frame.
@@ -36,6 +44,8 @@ class Maps:
     ----------
     numerator, information, photon : ndarray, (ny, nx)
         p . Sigma^-1 r, p . Sigma^-1 p and p . p, see `linear.model.TemplateProducts`.
+    starlight : ndarray, (ny, nx)
+        Star over noise, averaged over the pixels with the squared S/N that a planet has in each.
     """
 
     def __init__(self, groups: Sequence[Group], progress: bool = False) -> None:
@@ -45,10 +55,50 @@ class Maps:
         frames = sum(len(templates.frames) for _, templates in self.groups)
         self._stores = 4.0 * frames * (ny * nx) ** 2 <= min(_STORE, self._spare())
         self._stored: dict[tuple[int, int], dict[int, Tensor]] = {}
-        total = np.zeros((3, ny * nx))
+        total, light = np.zeros((3, ny * nx)), np.zeros((2, ny * nx))
         for g, pixels, images in self._batches("S/N map"):
             total[:, pixels] += torch.stack(self.groups[g][0].weigh(images)).numpy()
+            light[:, pixels] += self._starlight(g, images)
         self.numerator, self.information, self.photon = total.reshape(3, ny, nx)
+        with np.errstate(invalid="ignore"):
+            self.starlight = (light[0] / light[1]).reshape(ny, nx)
+
+    def _starlight(self, g: int, images: Mapping[int, Tensor]) -> Image:
+        """Squared S/N of planets, with and without the star over noise of each pixel, (2, k)."""
+        linear, templates = self.groups[g]
+        total = np.zeros((2, len(next(iter(images.values())))))
+        for k, planets in images.items():
+            fitted, weight = templates.frames[k], linear.frames[k].weight
+            star = torch.from_numpy(fitted.star - fitted.values["background"][0])
+            squares = weight.square()
+            columns = torch.stack([squares * weight * star, squares]).flatten(1).to(planets.dtype)
+            total += (columns @ planets.flatten(1).square().T).double().numpy()
+        return total
+
+    @cached_property
+    def correlation(self) -> Image:
+        """Autocorrelation of the S/N of noise, by distance in pixels, mean over the field."""
+        ny, nx = self.shape
+        reach = np.arange(-_REACH, _REACH + 1)
+        total, count = np.zeros((2, len(reach), len(reach)))
+        steps = np.linspace(0, 1, _PLACES + 2)[1:-1]
+        for row, column in itertools.product((ny * steps).astype(int), (nx * steps).astype(int)):
+            rows, columns = (axis.ravel() for axis in np.meshgrid(row + reach, column + reach,
+                                                                  indexing="ij"))  # fmt: skip
+            inside = (rows >= 0) & (rows < ny) & (columns >= 0) & (columns < nx)
+            if not self.information[row, column] > 0:
+                continue
+            middle = int(np.flatnonzero((rows[inside] == row) & (columns[inside] == column))[0])
+            products = np.zeros((2, inside.sum()))
+            for linear, templates in self.groups:
+                matrix, _ = linear.normal_equations(
+                    templates.at_pixels(rows[inside], columns[inside])
+                )
+                products += torch.stack([matrix[middle], matrix.diagonal()]).numpy()
+            deviation = np.sqrt(products[1] * products[0, middle])
+            total.ravel()[inside] += products[0] / deviation
+            count.ravel()[inside] += 1
+        return total / count
 
     def _spare(self) -> float:
         """Bytes that the settings of the fits leave beside the linear models."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -80,11 +82,17 @@ class Detection:
     residual_snr : ndarray, (ny, nx)
         The same after the candidates are removed from the data.
     error_factor : ErrorFactor
-        Factor by which errors were multiplied, as a function of separation:
-        ``error_factor.at(0.5)`` is that at 0.5 arcsec.
+        Factor by which errors were multiplied, at every pixel; ``error_factor.at(0.5)`` is its
+        median at 0.5 arcsec.
     candidates : Candidates
+    false_alarm : ndarray, (candidates,)
+        Probability that noise alone makes a peak as significant as the candidate anywhere in the
+        field; NaN where a fit does not explain its data.
+    rings : QTable
+        Chi-squared per pixel, without the candidates, and error factor between separations.
     threshold : float
-        Smallest S/N of a candidate.
+        Smallest S/N of a candidate in Gaussian noise. Where errors were scaled to the scatter of
+        the S/N, ``error_factor.threshold(threshold, offsets)`` is that at a position.
     contrast_curve : QTable
         See `contrast.contrast_table`.
     grid : ndarray, (ny, nx, 2)
@@ -114,6 +122,8 @@ class Detection:
     residual_snr: Image
     error_factor: ErrorFactor
     candidates: Candidates
+    false_alarm: Image
+    rings: QTable
     threshold: float
     contrast_curve: QTable
     grid: Image
@@ -127,7 +137,30 @@ class Detection:
 
     def __str__(self) -> str:
         """The candidates in words, at most 80 columns wide."""
-        return in_words(self.table, self.threshold)
+        return f"{in_words(self.table, self.threshold)}\n{textwrap.fill(self.remark, 80)}".rstrip()
+
+    @property
+    def remark(self) -> str:
+        """Caveat about real frames of a single roll; else empty."""
+        if self.rolls > 1 or not self.observation.is_nircam:
+            return ""
+        step = np.rad2deg(self.contrast_curve.meta["resolution_arcsec"])
+        return (
+            "One roll: structure that is fixed on the detector cannot be told from a planet. A "
+            f"second roll by 10 degrees would tell them apart beyond {step / 10:.1f} arcsec, where "
+            "it moves a planet by more than lambda/D."
+        )
+
+    @cached_property
+    def rolls(self) -> int:
+        """Number of orientations of the target's frames that differ by more than a degree."""
+        angles = sorted(
+            each.observation.position_angle
+            for fit in self.fits
+            for each in fit.frames
+            if not each.observation.reference
+        )
+        return 1 + sum(high - low > 1 for low, high in itertools.pairwise(angles))
 
     @property
     def _count(self) -> str:
@@ -161,7 +194,7 @@ class Detection:
 
     @property
     def scatter(self) -> float:
-        """The typical factor by which errors were multiplied: the median over separations."""
+        """The typical factor by which errors were multiplied: the median over the field."""
         return self.error_factor.typical
 
     @cached_property
@@ -174,10 +207,10 @@ class Detection:
         """The candidates, highest S/N first; every column has a description.
 
         Columns are separation; position angle east of north (counter-clockwise from +y of the
-        first frame if its orientation is not known); contrast; magnitude difference; S/N; angle
-        and x, y from the star on the first frame. With a known orientation there are the offsets
-        in right ascension and declination and their correlation, with a date the epoch, and for
-        calibrated frames the flux density and the AB magnitude.
+        first frame if its orientation is not known); contrast; magnitude difference; S/N; the
+        probability of a false alarm; angle and x, y from the star on the first frame. With a known
+        orientation there are the offsets in right ascension and declination and their correlation,
+        with a date the epoch, and for calibrated frames the flux density and the AB magnitude.
 
         Errors are standard deviations, with all parameters of the star marginalised. Those of
         positions do not include errors of the pixel scale and of the roll angle. The error of the
@@ -189,6 +222,10 @@ class Detection:
         table = candidate_table(
             self.candidates, self.error_factor, self._calibration_errors, self.sky
         )
+        order = np.argsort(-self.candidates.snr(self.error_factor))
+        table["false_alarm_probability"] = self.false_alarm[order]
+        table["false_alarm_probability"].info.format = ".1e"
+        table["false_alarm_probability"].info.description = "of a peak anywhere; NaN if not known"
         table.meta = dict(self._provenance)
         return table
 
@@ -415,15 +452,15 @@ class Detection:
                     for key, value in facts["provenance"].items()
                 },
                 "_digests": facts["fits"],
+                "rolls": facts["rolls"],
             }
             detection = cls(
                 fits=fits,
                 groups=groups_of_searched(fits, facts["fits"], path) if fits else (),
-                error_factor=ErrorFactor(
-                    **{key: np.atleast_1d(v) for key, v in facts["error_factor"].items()}
-                ),
                 threshold=facts["threshold"],
                 candidates=candidates_of(facts["candidates"]),
+                false_alarm=np.array(facts["false_alarm"], dtype=float),
+                rings=table_of(facts["rings"]),
                 contrast_curve=described(table_of(facts["contrast_curve"])),
                 path=path,
                 **maps_of(hdus),

@@ -10,10 +10,15 @@ import torch
 from astropy.table import QTable
 from numpy.typing import ArrayLike
 
-from pyklip_diffrender.detection.candidates import Candidates, refine_candidates, strongest_peak
+from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
 from pyklip_diffrender.detection.contrast import contrast_table
-from pyklip_diffrender.detection.error_factor import ErrorFactor, scatter_profile
-from pyklip_diffrender.detection.error_inflation import error_inflation
+from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.error_inflation import (
+    chi2_by_ring,
+    error_inflation,
+    follows_scatter,
+    significance_of,
+)
 from pyklip_diffrender.detection.field import (
     Image,
     curve_separations,
@@ -22,7 +27,7 @@ from pyklip_diffrender.detection.field import (
     ring_pixels,
     separation_of,
 )
-from pyklip_diffrender.detection.groups import Group, groups_of, weigh
+from pyklip_diffrender.detection.groups import groups_of, weigh
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.measurement import contrasts_at
 from pyklip_diffrender.detection.relinearise import (
@@ -32,6 +37,7 @@ from pyklip_diffrender.detection.relinearise import (
 )
 from pyklip_diffrender.detection.rescue import with_raised_peaks
 from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.tables import measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -51,9 +57,6 @@ all positions are fitted again with every one that is added."""
 _STEPS = 6
 """Largest number of steps of the positions while candidates are added or dropped. Point sources
 settle in these; parts of something extended do not, and would take most of the time."""
-
-_WORTH_A_LOOK = 0.6
-"""Part of the threshold from which a peak is judged by the scatter without it."""
 
 _SOURCE = 5.0
 """S/N above which `measure` removes a source before it computes the default `scatter`."""
@@ -76,15 +79,17 @@ def detect(
     fits : Refinement or sequence of Refinement
         Several refinements are independent measurements of the same sky.
     threshold : float
-        S/N above which a source is a candidate.
+        S/N above which a source is a candidate in Gaussian noise. Where errors are scaled to the
+        scatter of the S/N, the S/N must be higher, so that noise exceeds it as rarely.
     inner : float or Quantity
         Smallest separation of candidates, arcsec.
     scatter : float, optional
         Factor by which all errors are multiplied. By default it is the square root of the reduced
         chi-squared with the candidates removed if every fit explains its data, and at least 1. On
-        real frames, and where a fit does not explain its data, the errors are increased at every
-        separation to the standard deviation of the S/N there, away from candidates, if that is
-        larger: errors of the model that neighbouring pixels share do not show in chi-squared.
+        real frames, and where a fit does not explain its data, it is the standard deviation of the
+        S/N away from candidates if that is larger, which depends on the star's light in the pixels
+        and on the separation (see `ErrorFactor`): errors of the model that neighbouring pixels
+        share do not show in chi-squared.
     separations : array or Quantity, optional
         Separations of the contrast curve, arcsec. Default every 0.1 from 0.2 to the nearest edge.
     relinearise : float
@@ -119,14 +124,15 @@ def detect(
     inner = float(to_arcsec(inner, "inner"))
     _require_positive(threshold=threshold, inner=inner, scatter=scatter)
     maps = Maps(groups_of(fits), progress)
-    candidates, factor = _search(maps, fits, threshold, inner, scatter, Candidates.of_fit(fits[0]))
+    known = Candidates.of_fit(fits[0])
+    candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
     if not len(candidates):
         better = with_raised_peaks(fits, maps, inner, progress)
         if better is not None:
             fits = better
             maps = Maps(groups_of(fits), progress)
-            first = Candidates.of_fit(fits[0])
-            candidates, factor = _search(maps, fits, threshold, inner, scatter, first)
+            known = Candidates.of_fit(fits[0])
+            candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
     if not all(fit.status.calibrated for fit in fits):
         relinearise = min(relinearise, threshold)
     bright = candidates.snr(factor) > relinearise
@@ -141,7 +147,9 @@ def detect(
     ):
         fits = with_companions(fits, candidates, progress)
         maps = Maps(groups_of(fits), progress)
-        candidates, factor = _search(maps, fits, threshold, inner, scatter, candidates)
+        candidates, factor, significance = _search(
+            maps, fits, candidates, threshold, inner, scatter
+        )
     if not candidates.converged:
         _log.warning(
             "the positions of %d candidates did not settle; two of them may be one source, or the "
@@ -149,13 +157,17 @@ def detect(
         )  # fmt: skip
     information = np.where(maps.information > 0, maps.information, np.nan)
     photon = np.where(maps.photon > 0, maps.photon, np.nan) ** -0.5
-    factors = factor.at(separation_of(maps.grid))
+    factors = factor.of(maps.grid)
     error = factors / np.sqrt(information)
     separations = curve_separations(maps.grid, separations)
     rings = [
         np.array(ring)[:, np.isfinite(error[ring])]
         for ring in ring_pixels(maps.grid, separations, most=error.size)
     ]
+    # The noise of fits that do not explain their data is not known.
+    false_alarm = np.full(len(candidates), np.nan)
+    if all(fit.status.calibrated for fit in fits):
+        false_alarm = significance.false_alarms(factor, candidates.snr(factor), candidates.offsets)
     return Detection(
         fits=tuple(fits),
         groups=maps.groups,
@@ -166,6 +178,8 @@ def detect(
         residual_snr=maps.snr(maps.without(candidates)) / factors,
         error_factor=factor,
         candidates=candidates,
+        false_alarm=false_alarm,
+        rings=chi2_by_ring(maps.groups, candidates.offsets, factor),
         threshold=threshold,
         contrast_curve=contrast_table(
             separations,
@@ -195,8 +209,7 @@ def measure(
     offsets : array or Quantity, (k, 2)
         x, y from the star, arcsec, image orientation of the first frame.
     scatter : float, optional
-        Factor by which the errors are multiplied. Default as for `detect`, with sources of S/N
-        above 5 removed; 1 for fits that do not explain their data.
+        Factor by which the errors are multiplied. Default as for `detect`.
     relinearise : float
         See `detect`.
     sigmas : float
@@ -227,6 +240,8 @@ def measure(
     """
     fits = _checked(fits)
     _require_positive(scatter=scatter, sigmas=sigmas)
+    if scatter is None and follows_scatter(fits):
+        return detect(fits, relinearise=relinearise).measure(offsets, sigmas=sigmas)
     table, calibration, factor = _measured(fits, offsets, scatter)
     bright = table[table["snr"] > relinearise]
     if len(bright):
@@ -271,10 +286,10 @@ def contrast_curve(
     separations : array or Quantity, optional
         arcsec; as for `detect`.
     angles : int
-        Largest number of positions per separation.
+        Largest number of positions per separation. All are used where errors are scaled to the
+        scatter of the S/N, which needs the whole map.
     scatter : float, optional
-        Factor by which the errors are multiplied; see `measure`. Sources that are not companions
-        of the fits increase the default; `detect` removes them first.
+        Factor by which the errors are multiplied. Default as for `detect`.
 
     Returns
     -------
@@ -309,6 +324,8 @@ def contrast_curve(
             f"the corners of the field are {separation_of(grid).max():.3g} arcsec from the star"
         )
     rows, columns = np.concatenate(rings, axis=1)
+    if scatter is None and follows_scatter(fits):
+        return detect(fits, separations=separations).contrast_curve
     products = weigh(groups, lambda templates: templates.at_pixels(rows, columns))
     if scatter is None:
         scatter = error_inflation(fits, groups, Candidates.of_fit(fits[0]).offsets)
@@ -346,107 +363,39 @@ def _require_positive(**values: float | None) -> None:
 def _search(
     maps: Maps,
     fits: Sequence[Refinement],
+    start: Candidates,
     threshold: float,
     inner: float,
     scatter: float | None,
-    start: Candidates,
-) -> tuple[Candidates, ErrorFactor]:
+) -> tuple[Candidates, ErrorFactor, Significance]:
     """Candidates in the order in which they were found, and the factor for the errors."""
     groups, grid, pixel = maps.groups, maps.grid, pixel_width(maps.grid)
     # A fit may have taken a residual for a companion while its wavefront was still wrong.
     candidates = refine_candidates(groups, start, pixel / 2, _STEPS)
     unscaled = ErrorFactor.constant(1.0)
     while len(candidates) and candidates.snr(unscaled).min() < threshold:
-        candidates = _without_weakest(groups, candidates, unscaled, pixel)
+        weakest = int(candidates.snr(unscaled).argmin())
+        candidates = refine_candidates(groups, candidates.without(weakest), pixel / 2, _STEPS)
     # A peak that is no candidate once its position is fitted would be the highest one for ever.
     dismissed = torch.zeros(0, 2, dtype=torch.float64)
     while True:
         snr = maps.snr(maps.without(candidates))
-        if scatter is not None:
-            factor = ErrorFactor.constant(scatter)
-        else:
-            factor = _error_factor(snr, maps, fits, candidates.offsets, inner)
-        allowed = np.where(far_from(grid, dismissed, 2 * pixel), snr, 0.0)
-        peak = _next_peak(allowed, grid, candidates.offsets, factor, threshold, inner)
-        if peak is None and factor.is_measured:
-            peak = _hidden_peak(snr, allowed, maps, fits, candidates.offsets, factor, threshold,
-                                inner)  # fmt: skip
-        if peak is None or max(len(candidates), len(dismissed)) >= _MAX_CANDIDATES:
-            # The factor may have grown since a candidate was accepted.
-            if not len(candidates) or candidates.snr(factor).min() >= threshold:
-                if not candidates.converged:
-                    candidates = refine_candidates(groups, candidates, reach=pixel / 2)
-                return candidates, factor
-            weakest = int(candidates.snr(factor).argmin())
-            dismissed = torch.cat([dismissed, candidates.offsets[weakest, None]])
-            candidates = _without_weakest(groups, candidates, factor, pixel)
+        significance = significance_of(fits, maps, candidates.offsets, inner, scatter)
+        allowed = far_from(grid, dismissed, 2 * pixel)
+        peak = significance.next_peak(snr, candidates.offsets, threshold, allowed)
+        if peak is not None and max(len(candidates), len(dismissed)) < _MAX_CANDIDATES:
+            contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
+            candidates = candidates.with_one_more(grid[peak], contrast)
+            candidates = refine_candidates(groups, candidates, pixel / 2, _STEPS)
+            _log.info("candidates at %s arcsec", candidates.offsets.tolist())
             continue
-        contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
-        candidates = candidates.with_one_more(grid[peak], contrast)
-        candidates = refine_candidates(groups, candidates, pixel / 2, _STEPS)
-        _log.info("candidates at %s arcsec", candidates.offsets.tolist())
-
-
-def _next_peak(
-    snr: Image,
-    grid: Image,
-    sources: torch.Tensor,
-    factor: ErrorFactor,
-    threshold: float,
-    inner: float,
-) -> tuple[int, int] | None:
-    """The highest peak above the threshold that belongs to no source."""
-    return strongest_peak(
-        snr / factor.at(separation_of(grid)),
-        grid,
-        sources,
-        threshold=threshold,
-        inner=inner,
-        distance=pixel_width(grid),
-    )
-
-
-def _hidden_peak(
-    snr: Image,
-    allowed: Image,
-    maps: Maps,
-    fits: Sequence[Refinement],
-    sources: torch.Tensor,
-    factor: ErrorFactor,
-    threshold: float,
-    inner: float,
-) -> tuple[int, int] | None:
-    """A peak that is above the threshold where it does not itself raise the scatter.
-
-    Near the star a ring has few positions, so that a source is a large part of their scatter.
-    """
-    for _ in range(_MAX_CANDIDATES):
-        peak = _next_peak(allowed, maps.grid, sources, factor, _WORTH_A_LOOK * threshold, inner)
-        if peak is None:
-            return None
-        place = torch.from_numpy(maps.grid[peak][None])
-        without = _error_factor(snr, maps, fits, torch.cat([sources, place]), inner)
-        if snr[peak] >= threshold * without.of(place)[0]:
-            return peak
-        allowed = np.where(far_from(maps.grid, place, 2 * pixel_width(maps.grid)), allowed, 0.0)
-    return None
-
-
-def _error_factor(
-    snr: Image, maps: Maps, fits: Sequence[Refinement], offsets: torch.Tensor, inner: float
-) -> ErrorFactor:
-    """The default factor, from chi-squared and from the S/N with the sources removed."""
-    explained = all(fit.status.calibrated for fit in fits)
-    least = error_inflation(fits, maps.groups, offsets)
-    if explained and not fits[0].frames[0].observation.is_nircam:
-        return ErrorFactor.constant(least)
-    measured = scatter_profile(snr, maps.grid, offsets, inner, fits[0].model.resolution)
-    return measured.at_least(least)
-
-
-def _without_weakest(
-    groups: Sequence[Group], candidates: Candidates, factor: ErrorFactor, pixel: float
-) -> Candidates:
-    """The other candidates, fitted again."""
-    weakest = int(candidates.snr(factor).argmin())
-    return refine_candidates(groups, candidates.without(weakest), pixel / 2, _STEPS)
+        factor = significance.factor(snr, candidates.offsets)
+        margin = candidates.snr(factor) - factor.threshold(threshold, candidates.offsets)
+        if not len(candidates) or margin.min() >= 0:
+            if not candidates.converged:
+                candidates = refine_candidates(groups, candidates, reach=pixel / 2)
+            return candidates, factor, significance
+        # The factor may have grown since a candidate was accepted.
+        weakest = int(margin.argmin())
+        dismissed = torch.cat([dismissed, candidates.offsets[weakest, None]])
+        candidates = refine_candidates(groups, candidates.without(weakest), pixel / 2, _STEPS)

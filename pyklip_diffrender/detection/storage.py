@@ -14,6 +14,7 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group, groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -72,8 +73,10 @@ def hdus_of(detection: Any) -> fits.HDUList:
     for hdu in data:
         hdu.header.update(wcs)
     facts = {
-        "error_factor": vars(detection.error_factor),
         "threshold": detection.threshold,
+        "false_alarm": detection.false_alarm,
+        "rings": table_facts(detection.rings),
+        "rolls": detection.rolls,
         "candidates": vars(detection.candidates),
         "calibration_errors": detection._calibration_errors,
         "sky": vars(detection.sky),
@@ -88,6 +91,13 @@ def hdus_of(detection: Any) -> fits.HDUList:
             *(
                 image_hdu(getattr(detection, attribute), name, "", wcs)
                 for name, attribute in MAPS.items()
+            ),
+            *(
+                image_hdu(np.broadcast_to(values, detection.snr.shape), name, "", wcs)
+                for name, values in (
+                    ("ERROR_FACTOR", detection.error_factor.factors),
+                    ("FREEDOM", detection.error_factor.freedom),
+                )
             ),
             image_hdu(detection.left_out[0], "LEFT_OUT", unit, wcs),
             image_hdu(detection.left_out[1], "LEFT_OUT_ERROR", unit, wcs),
@@ -105,8 +115,8 @@ def hdus_of(detection: Any) -> fits.HDUList:
     )
 
 
-def maps_of(hdus: fits.HDUList) -> dict[str, Image]:
-    """Return the maps and the grid of a detection, by attribute.
+def maps_of(hdus: fits.HDUList) -> dict[str, Any]:
+    """Return the maps, the error factor and the grid of a detection, by attribute.
 
     Raises
     ------
@@ -115,10 +125,14 @@ def maps_of(hdus: fits.HDUList) -> dict[str, Image]:
     """
     maps = {attribute: image(hdus, name, 0) for name, attribute in MAPS.items()}
     maps["grid"] = np.stack([image(hdus, "OFFSET_X", 0), image(hdus, "OFFSET_Y", 0)], axis=-1)
-    shapes = {each.shape[:2] for each in maps.values()}
+    factors, freedom = image(hdus, "ERROR_FACTOR", 0), image(hdus, "FREEDOM", 0)
+    shapes = {each.shape[:2] for each in (*maps.values(), factors, freedom)}
     if len(shapes) > 1 or maps["snr"].ndim != 2:
         raise ValueError(f"maps have the shapes {sorted(shapes)}")
-    return maps
+    factor = ErrorFactor(factors, freedom, maps["grid"])
+    if not factor.is_measured:
+        factor = ErrorFactor.constant(float(factors[0, 0]))
+    return {**maps, "error_factor": factor}
 
 
 def candidates_of(facts: dict[str, Any]) -> Candidates:

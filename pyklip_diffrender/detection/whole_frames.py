@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve, map_coordinates
 from scipy.signal import fftconvolve
 
-from pyklip_diffrender.detection.field import Image, separation_of
+from pyklip_diffrender.detection.field import Image, pixels_of, separation_of
 from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.refinement.frame_fit import pixel_grid
@@ -163,6 +164,24 @@ class WholeFrame:
                 fine[row::_FINE, column::_FINE] = moved
         return ImagePSF(fine, oversampling=_FINE)
 
+    @cached_property
+    def correlation(self) -> Image:
+        """Autocorrelation of the S/N of noise, by distance in pixels."""
+        image = fftconvolve(self.kernel, self.kernel[::-1, ::-1])
+        middle, reach = _KERNEL - 1, _KERNEL // 2
+        near = slice(middle - reach, middle + reach + 1)
+        return np.asarray(image[near, near] / image[middle, middle])
+
+    @cached_property
+    def starlight(self) -> Image:
+        """Star over noise, averaged with the squared S/N that a source has in each pixel."""
+        weight, squares = self.sigma**-2.0, self.kernel[::-1, ::-1] ** 2
+        ratio = np.where(weight > 0, self.stars / self.sigma, 0.0)
+        light, total = (
+            fftconvolve(each, squares, mode="same") for each in (weight * ratio, weight)
+        )
+        return np.asarray(np.maximum(light, 0) / np.maximum(total, 1e-300))
+
     def products(self, image: Image) -> tuple[Image, Image]:
         """Template times image and template times template, over the variance, at every pixel.
 
@@ -184,9 +203,7 @@ class WholeFrame:
 
     def pixels_of(self, offsets: Image) -> Image:
         """Columns and rows, (..., 2), of positions x, y from the star in the first frame."""
-        origin = self.grid[0, 0]
-        steps = np.stack([self.grid[0, 1] - origin, self.grid[1, 0] - origin], axis=1)
-        return np.asarray((offsets @ self._turn.T - origin) @ np.linalg.inv(steps).T)
+        return pixels_of(self.grid, offsets @ self._turn.T)
 
     def offsets_of(self, pixels: Image) -> Image:
         """x, y from the star in the first frame of columns and rows, (k, 2)."""
@@ -198,16 +215,16 @@ class WholeFrame:
     def _turn(self) -> NDArray[np.float64]:
         return rotation_matrix(self.roll)
 
-    def on_first(self, grid: Image, image: Image) -> tuple[Image, Image]:
-        """`products` at the positions of the first frame's pixels; 0 outside this frame."""
-        products = self.products(image)
+    def on_first(self, grid: Image, images: Sequence[Image]) -> list[Image]:
+        """Images of this frame at the positions of the first frame's pixels; 0 outside it.
+
+        So are they where the last of the images is not positive after the interpolation.
+        """
         if np.array_equal(grid, self.grid):
-            return products
+            return list(images)
         x, y = np.moveaxis(self.pixels_of(grid), -1, 0)
-        numerator, information = (
-            map_coordinates(each, [y, x], order=3, mode="constant") for each in products
-        )
-        return np.where(information > 0, numerator, 0.0), np.maximum(information, 0.0)
+        moved = [map_coordinates(each, [y, x], order=3, mode="constant") for each in images]
+        return [np.where(moved[-1] > 0, each, 0.0) for each in moved]
 
     def light(self, offsets: Image, contrasts: Image) -> Image:
         """Image of point sources at x, y from the star in the first frame, (ny, nx)."""

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
-from pyklip_diffrender.detection.error_factor import ErrorFactor, scatter_profile
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image, far_from, ring_pixels, separation_of
 from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.detection.storage import image_hdu
 from pyklip_diffrender.detection.tables import candidate_table, in_words
 from pyklip_diffrender.detection.whole_frames import WholeFrame
@@ -28,7 +29,6 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement import star_flux_error
-from pyklip_diffrender.refinement.companions import local_maxima
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
@@ -249,8 +249,10 @@ def wide_field(
     outer[rows, columns] = False
     information, measured, factor = _search(frames, outer, grid, threshold, detection)
     sources = _candidates(measured)
-    numerator = np.sum([each.on_first(grid, each.residual)[0] for each in frames], axis=0)
-    error = factor.at(separation_of(grid)) / np.sqrt(information)
+    numerator = np.sum(
+        [each.on_first(grid, each.products(each.residual))[0] for each in frames], axis=0
+    )
+    error = factor.of(grid) / np.sqrt(information)
     contrast = numerator / information
     for ours, theirs in ((contrast, detection.contrast), (error, detection.error)):
         ours[rows, columns] = theirs
@@ -264,6 +266,7 @@ def wide_field(
     inner = detection.table.copy()
     chi2 = np.array([each.chi2 for each in measured]) / factor.of(sources.offsets) ** 2
     inner["fit_chi2"], table["fit_chi2"] = np.nan, chi2[order]
+    table["false_alarm_probability"] = np.nan
     tables = [each for each in (inner, table) if len(each)]
     joined = vstack(tables, metadata_conflicts="silent") if tables else table
     joined["fit_chi2"].info.description = (
@@ -330,28 +333,33 @@ def _search(
     The highest peak is fitted and subtracted, until none is left: sources have side lobes.
     """
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
-    distance = separation_of(grid)
-    inner = float(distance[outer].min())
-    known = detection.candidates.offsets
+    known = detection.candidates.offsets.numpy()
+    significance = Significance(
+        grid,
+        np.mean([frame.on_first(grid, (frame.starlight,))[0] for frame in frames], axis=0),
+        frames[0].correlation,
+        float(separation_of(grid)[outer].min()),
+        resolution,
+    )
     sources: list[_Measurement] = []
     while True:
         images = [frame.residual - frame.light(*_light_of(sources)) for frame in frames]
-        products = [f.on_first(grid, image) for f, image in zip(frames, images, strict=True)]
+        products = [
+            f.on_first(grid, f.products(image)) for f, image in zip(frames, images, strict=True)
+        ]
         numerator, information = (np.sum(each, axis=0) for each in zip(*products, strict=True))
         information = np.where(outer & (information > 0), information, np.nan)
         snr = numerator / np.sqrt(information)
-        factor = scatter_profile(snr, grid, known, inner, resolution).at_least(1.0)
-        places = torch.from_numpy(_light_of(sources)[0])
-        scaled = snr / factor.at(distance)
-        allowed = np.isfinite(scaled) & far_from(grid, places, resolution)
+        places = np.concatenate([known, _light_of(sources)[0]])
+        factor = significance.factor(snr, places)
+        allowed = np.isfinite(snr) & far_from(grid, places, resolution)
         for source in sources:
-            # What the subtraction of a bright source leaves is not another one.
+            # The subtraction of a bright source leaves residuals.
             near = separation_of(grid - source.values[1:]) < _LOBES
             allowed &= ~near | (snr > _LEFT * source.snr)
-        peaks = local_maxima(np.nan_to_num(scaled), allowed, threshold, size=5)
-        if not peaks or len(sources) >= _MOST:
+        peak = significance.next_peak(snr, places, threshold, allowed)
+        if peak is None or len(sources) >= _MOST:
             break
-        peak = peaks[0]
         contrast = float(numerator[peak] / information[peak])
         fitted = _measured(frames, images, grid[peak], contrast)
         if fitted is None or separation_of(fitted.values[1:] - grid[peak]) > resolution:
@@ -434,16 +442,13 @@ def _curve(
         errors,
         photons,
         detection.contrast_curve.meta["resolution_arcsec"],
-        _joined(detection.error_factor, factor, inner[-1]),
+        _joined(detection.error_factor, factor, window),
         detection.sky.star_jansky,
     )
 
 
-def _joined(inner: ErrorFactor, outer: ErrorFactor, edge: float) -> ErrorFactor:
-    """The inner factor up to the edge, the outer one beyond."""
-    near, far = inner.separations <= edge, outer.separations > edge
-    return ErrorFactor(
-        np.concatenate([inner.separations[near], outer.separations[far]]),
-        np.concatenate([inner.factors[near], outer.factors[far]]),
-        np.concatenate([inner.freedom[near], outer.freedom[far]]),
-    )
+def _joined(inner: ErrorFactor, outer: ErrorFactor, window: tuple[slice, slice]) -> ErrorFactor:
+    """The inner factor in the fitted pixels, the outer one elsewhere."""
+    factors, freedom = outer.factors.copy(), outer.freedom.copy()
+    factors[window], freedom[window] = inner.factors, inner.freedom
+    return ErrorFactor(factors, freedom, outer.grid)

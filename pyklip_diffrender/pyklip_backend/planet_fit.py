@@ -45,7 +45,8 @@ def planet_cards(
     flipx : bool
         See `pyklip.klip.rotate`.
     error_factor : ErrorFactor, optional
-        By how much the errors are too small, by separation; 1 by default.
+        By how much the errors are too small. By default it is measured with the planet, and the
+        companions of the fit, removed.
 
     Returns
     -------
@@ -54,7 +55,7 @@ def planet_cards(
     """
     from pyklip_diffrender.detection.calibration import calibration_errors
     from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
-    from pyklip_diffrender.detection.error_inflation import error_inflation
+    from pyklip_diffrender.detection.error_inflation import default_factor
     from pyklip_diffrender.detection.groups import groups_of
 
     cards = fits.Header()
@@ -73,9 +74,9 @@ def planet_cards(
         logger.info("no source within lambda/D of the planet of the forward model")
         return cards
     covariance = sources.covariance.numpy().reshape(3, len(sources), 3, len(sources))[:, -1, :, -1]
-    factor = error_inflation([part.result], groups, sources.offsets)
-    if error_factor is not None:
-        factor = max(factor, float(error_factor.of(sources.offsets[-1:])[0]))
+    if error_factor is None:
+        error_factor = default_factor([part.result], groups, sources)
+    factor = float(error_factor.of(sources.offsets[-1:])[0])
     error = factor * np.sqrt(covariance[0, 0])
     snr = sources.contrasts[-1:] / error
     factors = snr.new_full(snr.shape, factor)

@@ -158,11 +158,20 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
             "Error of the star model",
             "none needed" if error == 0 else number(error and 100 * error, ".2g", "% of the star"),
         ),
+        ("Chi-squared per pixel, by separation", _by_ring(fit["rings"])),
         ("Errors multiplied by", number(fit["error_factor"])),
         ("Wavefront map", f"{map_['name']}, {_age(map_['days_before_first_frame'])}"),
         ("Pattern of the model's error learned from", pattern),
         *flux,
     ]
+
+
+def _by_ring(rings: Sequence[Mapping[str, Any]]) -> str:
+    return "; ".join(
+        f"{number(each['chi2'], '.2f')} ({each['inner_arcsec']:.1f} to "
+        f"{each['outer_arcsec']:.1f} arcsec)"
+        for each in rings
+    )
 
 
 def _age(days: float | None) -> str:
@@ -194,8 +203,8 @@ def _candidates(summary: Mapping[str, Any]) -> str:
     note = (
         "Contrast is relative to the star without coronagraph; errors are standard deviations, "
         "those of contrasts with that of the star's flux. The false-alarm probability is that of "
-        "noise alone making such a peak anywhere in the field; errors of the star model are not "
-        "Gaussian and can be more frequent. One epoch does not show whether a candidate is bound "
+        "noise alone making such a peak anywhere in the field; it is not stated where the model "
+        "does not explain the data. One epoch does not show whether a candidate is bound "
         "or in the background."
     )
     return (

@@ -67,13 +67,14 @@ def search_pictures(
         scaled = "Errors are those of the fit, not scaled."
     elif not detection.error_factor.is_measured:
         scaled = (
-            f"Errors were multiplied by {factors[0]:.2f}, the square root of the reduced "
+            f"Errors were multiplied by {factors[0, 0]:.2f}, the square root of the reduced "
             "chi-squared without the candidates."
         )
     else:
         scaled = (
             f"Errors were multiplied by {factors.min():.2f} to {factors.max():.2f}, depending on "
-            "the separation, so that the S/N away from candidates has a standard deviation of 1."
+            "the star's light and the separation, so that the S/N away from candidates has a "
+            "standard deviation of 1."
         )
     limits = "; ".join(
         f"{row['contrast']:.1e} at {row['separation_arcsec']:.3g} arcsec"

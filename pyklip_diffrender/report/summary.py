@@ -67,7 +67,7 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
             "advice": advice(
                 fit.status,
                 patterned=reduction.systematics is not None,
-                remark=reduction.remark,
+                remark=f"{detection.remark} {reduction.remark}".strip(),
             ),
             "usable": fit.status.usable,
             "calibrated": fit.status.calibrated,
@@ -77,10 +77,11 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
             "chi2_per_pixel": fit.chi2_per_pixel,
             "model_error": fit.model_error,
             "error_factor": detection.scatter,
+            "rings": _rows(detection.rings),
         },
         "wavefront_map": _wavefront_map(fit, first),
         "systematics": _systematics(reduction),
-        "candidates": _candidates(detection),
+        "candidates": _rows(detection.table),
         "wide_field": None if reduction.wide is None else _wide_field(reduction.wide),
         "disk": None if reduction.disk is None else _disk(reduction.disk),
         "limits": _limits(detection),
@@ -170,20 +171,6 @@ def _label(table: QTable, name: str) -> str:
     return name if unit in (None, u.mag) else f"{name}_{unit}"
 
 
-def _candidates(detection: Detection) -> list[dict[str, Any]]:
-    """The table of candidates, with the unit in the names and the probability of a false alarm."""
-    table = detection.table
-    return [
-        {
-            **values,
-            "false_alarm_probability": _false_alarm(
-                detection, float(row["snr"]), row["separation"].to_value("arcsec")
-            ),
-        }
-        for row, values in zip(table, _rows(table), strict=True)
-    ]
-
-
 def _rows(table: QTable) -> list[dict[str, Any]]:
     """The rows of a table, with the unit in the names."""
     return [
@@ -224,21 +211,6 @@ def _injected(planets: QTable) -> dict[str, Any]:
         "within_one_error": np.mean(np.abs(pull) < 1),
         "planets": _rows(planets),
     }
-
-
-def _false_alarm(detection: Detection, snr: float, separation: float) -> float:
-    """Probability that noise alone makes a peak of this S/N anywhere in the field.
-
-    Gaussian noise where the errors are those of the fit; Student's t, as in the small-sample column
-    of the contrast curve, where they were scaled to the scatter of the S/N.
-    """
-    resolution = detection.contrast_curve.meta["resolution_arcsec"]
-    single = float(detection.error_factor.false_alarm(snr, separation))
-    pixel = abs(detection.grid[0, 1, 0] - detection.grid[0, 0, 0]) * abs(
-        detection.grid[1, 0, 1] - detection.grid[0, 0, 1]
-    )
-    trials = max(1.0, np.isfinite(detection.snr).sum() * pixel / resolution**2)
-    return float(-math.expm1(trials * math.log1p(-single)))
 
 
 def _curve(curve: QTable) -> dict[str, Any]:

@@ -110,8 +110,10 @@ def measured_offset(
     if stamp is None:
         return None
     image, distance, noise = stamp
-    outer = image[distance > _OUTER]
-    if not outer.size or image[distance < _INNER].mean() < _CONCENTRATED * np.abs(outer.mean()):
+    inside, outside = image[distance < _INNER], image[distance > _OUTER]
+    if not (inside.size and outside.size):
+        return None
+    if inside.mean() < _CONCENTRATED * np.abs(outside.mean()):
         return None
     bright = np.where(image > _SEEN * noise, image, 0.0)
     return center_of_symmetry(bright) if np.count_nonzero(bright) >= 10 else None
