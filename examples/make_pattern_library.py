@@ -14,13 +14,13 @@ import logging
 from pathlib import Path
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.refinement.learning import (
+from pyklip_diffrender.pattern import (
     MeasuredPattern,
     combine_patterns,
     measure_patterns,
+    pattern_pedestal,
+    write_patterns,
 )
-from pyklip_diffrender.refinement.library import write_patterns
-from pyklip_diffrender.refinement.pedestal import pattern_pedestal
 
 log = logging.getLogger(__name__)
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
     from pyklip_diffrender.linear.model import LinearModel
     from pyklip_diffrender.optics.system import OpticalSystem
+    from pyklip_diffrender.pattern import known_systematics, learn_systematics
     from pyklip_diffrender.planning import Plan, plan
     from pyklip_diffrender.pyklip_backend import (
         DiffrenderSettings,
@@ -41,9 +42,6 @@ if TYPE_CHECKING:
         GaussNewton,
         Refinement,
         Status,
-        Systematics,
-        known_systematics,
-        learn_systematics,
         refine,
     )
     from pyklip_diffrender.scene.objects import Planet, Scene, Star
@@ -51,6 +49,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.scene.real_frames import model_for
     from pyklip_diffrender.scene.sequence import Sequence
     from pyklip_diffrender.scene.simulation import simulate
+    from pyklip_diffrender.scene.systematics import Systematics
     from pyklip_diffrender.surveys import survey
     from pyklip_diffrender.wavefront.map_choice import choose_map
     from pyklip_diffrender.wavefront.opd import drift, random_opd, read_opd
@@ -116,14 +115,14 @@ _NAMES = {
     "planning": "Plan plan",
     "pyklip_backend": "DiffrenderSettings backend observation_from_dataset register unregister",
     "reduction": "Reduction reduce",
-    "refinement": (
-        "Adam GaussNewton Refinement Status Systematics known_systematics learn_systematics refine"
-    ),
+    "pattern": "known_systematics learn_systematics",
+    "refinement": "Adam GaussNewton Refinement Status refine",
     "scene.objects": "Planet Scene Star",
     "scene.observation": "Observation",
     "scene.real_frames": "model_for",
     "scene.sequence": "Sequence",
     "scene.simulation": "simulate",
+    "scene.systematics": "Systematics",
     "wavefront.map_choice": "choose_map",
     "surveys": "survey",
     "wavefront.opd": "drift random_opd read_opd",

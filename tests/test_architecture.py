@@ -30,6 +30,7 @@ PACKAGES = (
     "linear",
     "planning",
     "refinement",
+    "pattern",
     "detection",
     "reduction",
     "pyklip_backend",

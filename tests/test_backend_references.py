@@ -23,6 +23,7 @@ from pyklip_diffrender.errors import (
     MissingOPDError,
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+from pyklip_diffrender.pattern import PatternChoice, choose_systematics
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     observation_from_dataset,
@@ -31,10 +32,10 @@ from pyklip_diffrender.pyklip_backend import (
     unregister,
 )
 from pyklip_diffrender.pyklip_backend.frames import frames_of
-from pyklip_diffrender.pyklip_backend.references import ChosenPattern, References, pattern_for
-from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Systematics
-from pyklip_diffrender.refinement.pattern_choice import PatternChoice
+from pyklip_diffrender.pyklip_backend.references import References
+from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 
 CARDS = {"SUBSTRT1": 492, "SUBSTRT2": 1502, "DETECTOR": "NRCALONG"}
 TARGET = {"TARGPROP": "TARGET", "IS_PSF": False, **CARDS}
@@ -223,7 +224,6 @@ def frame(target: str, **details: Any) -> Observation:
 @pytest.mark.parametrize(
     ("requested", "library", "fitted", "label", "used"),
     [
-        (None, True, [], "library (OTHER)", 0),
         ("auto", True, [], "library (OTHER)", 0),
         ("auto", False, ["REF"], "references (REF)", 4),
         ("references", True, ["REF"], "references (REF), library (OTHER)", 4),
@@ -248,29 +248,32 @@ def test_which_pattern_is_used(
         made = Systematics(flat, flat + 0.1, (15.5, 15.5), 0.1, provenance={"stars": names})
         return made if names else None
 
-    choosing = "pyklip_diffrender.refinement.pattern_choice"
+    choosing = "pyklip_diffrender.pattern.choice"
     monkeypatch.setattr(f"{choosing}.refine", refine)
     monkeypatch.setattr(f"{choosing}.known_systematics", known)
     zeros = np.zeros((32, 32))
     mine = Systematics(zeros, zeros, (15.5, 15.5), 0.1, name="mine")
-    settings = DiffrenderSettings(systematics=mine if requested == "mine" else requested)
-    references = References(frames=(frame("REF"), frame("REF")))
     model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
-    told: list[str] = []
-    # Two rolls, which would share a pattern of their own if nothing else were known.
-    science = [frame("TARGET"), frame("TARGET")]
-    chosen = pattern_for(science, references, model, OPD, settings, told.append)
+    read: list[str] = []
+
+    def references() -> list[Observation]:
+        read.append("references")
+        return [frame("REF"), frame("REF")]
+
+    def choose(**options: Any) -> PatternChoice:
+        # Two rolls, which would share a pattern of their own if nothing else were known.
+        science, request = [frame("TARGET")] * 2, mine if requested == "mine" else requested
+        return choose_systematics(science, references, model, OPD, systematics=request, **options)
+
+    chosen = choose()
     assert stars == fitted
+    assert bool(read) == bool(fitted)
     assert (chosen.label, chosen.reference_frames) == (label, used)
-    assert (chosen.choice.systematics is None) == (label == "none")
-    assert told == [
-        "fitting the reference stars" if fitted else "the reference frames are not needed"
-    ]
-    without = pattern_for(science, references, model, OPD, settings, print, library=False)
-    assert "library" not in without.label
+    assert (chosen.systematics is None) == (label == "none")
     if label != "none":
         # The pattern's own error takes the place of most of the model's.
-        assert chosen.choice.settings == GaussNewton.nircam(min_model_error=0.002)
+        assert chosen.settings == GaussNewton.nircam(min_model_error=0.002)
+    assert "library" not in choose(library=False).label
 
 
 def test_a_library_of_another_flat_field_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -278,11 +281,11 @@ def test_a_library_of_another_flat_field_is_replaced(monkeypatch: pytest.MonkeyP
     patterns: list[str] = []
     zeros = np.zeros((32, 32))
 
-    def chosen(*_: Any, library: bool = True) -> ChosenPattern:
-        name = "library" if library else "references"
+    def chosen(*_: Any, library: bool = True, **options: Any) -> PatternChoice:
+        name = "library" if library else "the rolls themselves"
         pattern = Systematics(zeros, zeros + 0.1, (15.5, 15.5), 0.1, name=name)
-        choice = PatternChoice((simulated,), pattern, settings.fit, from_library=library)
-        return ChosenPattern(choice, name)
+        origin: Any = "library" if library else "rolls"
+        return PatternChoice((simulated,), pattern, settings.fit, origin=origin)
 
     def lacks(fit: Refinement) -> bool:
         assert fit.systematics is not None
@@ -293,13 +296,12 @@ def test_a_library_of_another_flat_field_is_replaced(monkeypatch: pytest.MonkeyP
     model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
     fit = GaussNewton(free=("flux", "background"), wavefront=False)
     settings = DiffrenderSettings(model=model, fit=fit, max_chi2=np.inf)
-    subtract = "pyklip_diffrender.pyklip_backend.subtract"
-    monkeypatch.setattr(f"{subtract}.pattern_for", chosen)
-    monkeypatch.setattr("pyklip_diffrender.refinement.pattern_choice.lacks_pattern", lacks)
+    monkeypatch.setattr("pyklip_diffrender.pattern.fit.choose_systematics", chosen)
+    monkeypatch.setattr("pyklip_diffrender.pattern.choice.lacks_pattern", lacks)
     told: list[str] = []
     with pytest.warns(DiffrenderWarning):  # The star is not one of this model.
         result = subtract_by_refinement(simulated, OPD, settings, tell=told.append)
-    assert result.systematics == "references"
+    assert result.systematics == "the rolls themselves"
     assert patterns == ["library"]
     assert "the frames do not show the pattern of the library" in told
 
@@ -308,17 +310,32 @@ def test_references_that_are_asked_for_must_be_there() -> None:
     model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
     settings = DiffrenderSettings(systematics="references")
     with pytest.raises(IncompatibleSetupError, match=r"psflib_filepaths after register\(\)"):
-        pattern_for([frame("TARGET")], References(), model, OPD, settings, print)
+        subtract_by_refinement(frame("TARGET"), OPD, replace(settings, model=model))
 
 
-def test_simulations_and_the_adam_recipe_use_no_pattern_by_default() -> None:
+@pytest.mark.parametrize(
+    ("cards", "fit", "expected"),
+    [({}, None, "off"), ({"INSTRUME": "NIRCAM"}, Adam(), "off"),
+     ({"INSTRUME": "NIRCAM"}, None, "auto")],
+)  # fmt: skip
+def test_simulations_and_the_adam_recipe_use_no_pattern_by_default(
+    cards: dict[str, str], fit: Any, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    requests: list[str] = []
+
+    class Stop(Exception):
+        pass
+
+    def chosen(*_: Any, systematics: str, **options: Any) -> PatternChoice:
+        requests.append(systematics)
+        raise Stop
+
+    monkeypatch.setattr("pyklip_diffrender.pattern.fit.choose_systematics", chosen)
     model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
-    simulated = replace(frame("TARGET"), header=fits.Header())
-    for science, fit in ((simulated, None), (frame("TARGET"), Adam())):
-        settings = DiffrenderSettings(fit=fit)
-        chosen = pattern_for([science], References(), model, OPD, settings, print)
-        choice = chosen.choice
-        assert (choice.systematics, choice.settings, chosen.label) == (None, fit, "none")
+    star = replace(frame("TARGET"), header=fits.Header(cards))
+    with pytest.raises(Stop):
+        subtract_by_refinement(star, OPD, DiffrenderSettings(model=model, fit=fit))
+    assert requests == [expected]
 
 
 # Which wavefront map is used

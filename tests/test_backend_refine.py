@@ -28,6 +28,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.pattern import PatternChoice
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     backend,
@@ -35,14 +36,13 @@ from pyklip_diffrender.pyklip_backend import (
     subtract_by_refinement,
     throughput,
 )
-from pyklip_diffrender.pyklip_backend.references import ChosenPattern
 from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
 from pyklip_diffrender.pyklip_backend.windows import Window, extent
-from pyklip_diffrender.refinement import Adam, GaussNewton, Status, Systematics, refine
-from pyklip_diffrender.refinement.pattern_choice import PatternChoice
+from pyklip_diffrender.refinement import Adam, GaussNewton, Status, refine
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 
@@ -488,13 +488,13 @@ def test_frames_that_were_moved_for_the_fit_are_subtracted_where_they_are(
     )
     away = np.array([0.3, -0.2])
 
-    def moved(science: Any, references: Any, model: Any, opd: Any, settings: Any, tell: Any) -> Any:
+    def moved(science: Any, *_: Any, **options: Any) -> PatternChoice:
         (frame,) = science
         shifted = shift_frames(frame.data, away[np.newaxis])
         registered = replace(frame, data=shifted, center=frame.center + away)
-        return ChosenPattern(PatternChoice((registered,), None, settings.fit))
+        return PatternChoice((registered,), None, settings.fit)
 
-    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract.pattern_for", moved)
+    monkeypatch.setattr("pyklip_diffrender.pattern.fit.choose_systematics", moved)
     settings = DiffrenderSettings(model=small, fit=ALIGNED, start={"star_offset": (0.02, 0.0)})
     rendered = subtract_by_refinement(observation, OLD, settings)
     inner = np.s_[6:-6, 6:-6]

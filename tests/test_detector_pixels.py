@@ -22,12 +22,13 @@ from pyklip_diffrender.errors import (
     ShapeError,
 )
 from pyklip_diffrender.optics.fast.point_sources import PointSources
-from pyklip_diffrender.refinement.learning import (
+from pyklip_diffrender.pattern import (
     MeasuredPattern,
     combine_patterns,
+    place_on_detector,
+    read_patterns,
+    write_patterns,
 )
-from pyklip_diffrender.refinement.library import read_patterns, write_patterns
-from pyklip_diffrender.refinement.registration import register
 
 SIDE = 320
 SHIFTS = np.array([[10.6, -13.3], [10.4, -13.4]])
@@ -307,7 +308,7 @@ def test_lost_pixels_are_found_by_the_pattern(moved: tuple[float, float] | None)
     known = dr.Systematics(
         flat, np.full(flat.shape, 0.01), (18.5, 18.5), unknown=0.06, first_pixel=(100, 200)
     )
-    frame = register(fit, known)
+    frame = place_on_detector(fit, known)
     if moved is None:
         assert frame is None
         return

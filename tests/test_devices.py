@@ -24,7 +24,8 @@ from pyklip_diffrender.bridges.rotation import SplineRotation
 from pyklip_diffrender.detection import wide_field, with_planets
 from pyklip_diffrender.linear.jacobian import jacobian
 from pyklip_diffrender.optics.detector_effects import GaussianBlur, LinearResampling, PixelCrosstalk
-from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Systematics
+from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement
+from pyklip_diffrender.scene.systematics import Systematics
 
 Array = NDArray[np.float64]
 

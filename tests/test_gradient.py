@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.refinement import GaussNewton, Systematics
+from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.refinement import accurate_step as accurate
 from pyklip_diffrender.refinement.accurate_step import (
     ModelDerivatives,
@@ -23,6 +23,7 @@ from pyklip_diffrender.refinement.gauss_newton import Solver
 from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 

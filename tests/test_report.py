@@ -25,8 +25,9 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.planning.choice import ModelError
-from pyklip_diffrender.refinement import Status, pattern_size
+from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.report import summarise, write_report
 from pyklip_diffrender.report.html import page
 from pyklip_diffrender.report.words import (

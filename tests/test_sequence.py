@@ -22,20 +22,15 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.names import same_name
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.pattern import PatternChoice, learn_systematics
+from pyklip_diffrender.pattern import choice as pattern_choice
 from pyklip_diffrender.reduction import reduce
-from pyklip_diffrender.refinement import (
-    GaussNewton,
-    Refinement,
-    Systematics,
-    learn_systematics,
-    pattern_choice,
-    refine,
-)
-from pyklip_diffrender.refinement.pattern_choice import PatternChoice
+from pyklip_diffrender.refinement import GaussNewton, Refinement, refine
 from pyklip_diffrender.scene.objects import Planet, Scene, Star
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.simulation import simulate
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import OPDMap, random_opd
 
 SIZE = 32
@@ -378,7 +373,7 @@ def test_references_are_fitted_only_where_they_are_needed(
         asked.append(options.get("library", True))
         return known if library or references else None
 
-    choosing = "pyklip_diffrender.refinement.pattern_choice"
+    choosing = "pyklip_diffrender.pattern.choice"
     for module in ("pyklip_diffrender.reduction", choosing):
         monkeypatch.setattr(f"{module}.refine", fit)
     monkeypatch.setattr(f"{choosing}.known_systematics", from_library)
@@ -447,7 +442,7 @@ def test_a_rough_fit_tells_which_pixels_a_frame_shows(monkeypatch: pytest.Monkey
         return replace(lost, first_pixel=(3, 4)) if len(places) < 3 else None
 
     monkeypatch.setattr(pattern_choice, "refine", rough_fit)
-    monkeypatch.setattr(pattern_choice, "register", place)
+    monkeypatch.setattr(pattern_choice, "place_on_detector", place)
     monkeypatch.setattr(pattern_choice, "known_systematics", lambda *_: known)
     lost = frame("TARGET", 20)
     assert lost.first_pixel is None

@@ -16,16 +16,17 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, Systematics
-from pyklip_diffrender.refinement.learning import (
+from pyklip_diffrender.pattern.measure import (
     learn_systematics,
 )
-from pyklip_diffrender.refinement.pattern_match import lacks_pattern, pattern_size
-from pyklip_diffrender.refinement.pedestal import light_and_residual, pattern_pedestal
+from pyklip_diffrender.pattern.pedestal import light_and_residual, pattern_pedestal
+from pyklip_diffrender.pattern.presence import lacks_pattern, pattern_size
+from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
 from pyklip_diffrender.wavefront.opd import as_opd_map, random_opd
 

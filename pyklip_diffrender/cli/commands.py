@@ -324,7 +324,7 @@ def _reduction(
             return
         from pyklip_diffrender.io.progress import stage
         from pyklip_diffrender.reduction import reduce
-        from pyklip_diffrender.refinement import Systematics
+        from pyklip_diffrender.scene.systematics import Systematics
 
         known: Any = systematics
         if known not in ("auto", "references", "off"):

@@ -71,9 +71,9 @@ def check_libraries() -> Iterator[Check]:
 def check_data() -> Iterator[Check]:
     """Read the files that come with the package."""
     from pyklip_diffrender.io.files import embedded_table
-    from pyklip_diffrender.refinement.library import read_patterns
+    from pyklip_diffrender.pattern.library import read_patterns
 
-    library = resources.files("pyklip_diffrender.refinement") / "data" / "patterns.fits.gz"
+    library = resources.files("pyklip_diffrender.pattern") / "data" / "patterns.fits.gz"
     try:
         rows = sum(len(embedded_table(name)) for name in _TABLES)
         with resources.as_file(library) as path:

@@ -7,7 +7,7 @@ from typing import Any
 
 from pyklip_diffrender.cli.machine import free_memory
 from pyklip_diffrender.detection.recovery import TOGETHER
-from pyklip_diffrender.refinement import known_systematics
+from pyklip_diffrender.pattern import known_systematics
 from pyklip_diffrender.scene.sequence import Sequence
 
 __all__ = ["describe_plan", "steps_of"]

@@ -78,8 +78,8 @@ def check_settings(settings: DiffrenderSettings) -> None:
     if settings.subtractor is not None:
         return
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+    from pyklip_diffrender.pattern.choice import require_request
     from pyklip_diffrender.refinement import Adam
-    from pyklip_diffrender.refinement.pattern_choice import require_request
 
     known = set(inspect.signature(nircam_coronagraph).parameters) - {"filter"}
     wrong = sorted(set(settings.model_options) - known)

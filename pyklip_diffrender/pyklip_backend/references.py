@@ -1,12 +1,12 @@
-"""Frames of reference stars, and the pattern of the model's error that a reduction uses."""
+"""Frames of reference stars that a reduction may learn the flat-field pattern from."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -14,22 +14,14 @@ from astropy.io import fits
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.pyklip_backend.pointings import may_be_one_star
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.source import REFERENCES
 from pyklip_diffrender.pyklip_backend.windows import Window
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.wavefront.opd import OPDMap
-
-if TYPE_CHECKING:
-    from pyklip_diffrender.optics.system import OpticalSystem
-    from pyklip_diffrender.refinement.pattern_choice import PatternChoice
 
 __all__ = [
-    "ChosenPattern",
     "References",
     "files_of_setup",
     "library_files",
-    "pattern_for",
     "require_same_setup",
 ]
 
@@ -75,24 +67,6 @@ class References:
                 continue
             observations.append(replace(frames, reference=True))
         return [Window.about(each.center[0], shape).of(each) for each in observations]
-
-
-@dataclass(frozen=True, eq=False)
-class ChosenPattern:
-    """The pattern of the model's error for a fit, and where it comes from.
-
-    Attributes
-    ----------
-    choice : PatternChoice
-    label : str
-        What the pattern is, in a few words.
-    reference_frames : int
-        Number of frames of reference stars that it was learned from.
-    """
-
-    choice: PatternChoice
-    label: str = "none"
-    reference_frames: int = 0
 
 
 def library_files(dataset: Any, psf_library: Any) -> tuple[Path, ...]:
@@ -148,80 +122,3 @@ def _difference(header: fits.Header, path: Path) -> str | None:
             if None not in (ours, other) and str(ours).strip() != str(other).strip():
                 return f"{key} {other}, the target with {ours}"
     return None
-
-
-def pattern_for(
-    science: Sequence[Observation],
-    references: References,
-    model: OpticalSystem,
-    opd: OPDMap,
-    settings: DiffrenderSettings,
-    tell: Callable[[str], None],
-    *,
-    library: bool = True,
-) -> ChosenPattern:
-    """Choose the pattern of the model's error as `reduce` does.
-
-    Parameters
-    ----------
-    science : sequence of Observation
-        Frames of the target, as they will be fitted.
-    references : References
-    model : OpticalSystem
-    opd : OPDMap
-    settings : DiffrenderSettings
-        Without `systematics`, real NIRCam frames get "auto", others "off".
-    tell : callable
-        Called with a line of text before reference stars are fitted.
-    library : bool
-        False leaves the package's library out.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If "references" is asked for without any.
-    """
-    from pyklip_diffrender.refinement import Adam, Systematics
-    from pyklip_diffrender.refinement.pattern_choice import choose_systematics
-
-    requested = settings.systematics
-    if requested is None:
-        real = science[0].is_nircam and not isinstance(settings.fit, Adam)
-        requested = "auto" if real else "off"
-    if requested == "references" and not references:
-        raise IncompatibleSetupError(
-            "systematics='references' needs frames of reference stars: give them to JWSTData as "
-            "psflib_filepaths after register(), and RDI in the mode and psf_library= to "
-            "klip_dataset"
-        )
-
-    def choose(request: Any, others: Sequence[Observation]) -> Any:
-        return choose_systematics(
-            science,
-            others,
-            model,
-            opd,
-            systematics=request,
-            library=library,
-            settings=settings.fit,
-        )
-
-    first = "off" if requested == "references" else requested
-    choice = choose(first, [])
-    needed = requested == "references" or (requested == "auto" and not choice.from_library)
-    if needed and references:
-        tell("fitting the reference stars")
-        choice = choose("references", references.cut(model.detector.shape, science[0]))
-    elif references:
-        tell("the reference frames are not needed")
-    learned = [frame.observation for fit in choice.references for frame in fit.frames]
-    stars = list(dict.fromkeys(each.target for each in learned))
-    label = "none"
-    if isinstance(requested, Systematics):
-        label = f"given ({requested.name})"
-    elif choice.systematics is not None:
-        others = [n for n in choice.systematics.provenance.get("stars", []) if n not in stars]
-        parts = [("references", stars), ("library", others)]
-        label = ", ".join(f"{origin} ({', '.join(names)})" for origin, names in parts if names)
-    used = sum(map(len, learned)) if choice.systematics is not None else 0
-    return ChosenPattern(choice, label, used)

@@ -31,7 +31,8 @@ from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
 
 if TYPE_CHECKING:
     from pyklip_diffrender.planning import Plan
-    from pyklip_diffrender.refinement import Adam, GaussNewton, Systematics
+    from pyklip_diffrender.refinement import Adam, GaussNewton
+    from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = [
     "ATTRIBUTE",

@@ -14,11 +14,7 @@ from numpy.typing import NDArray
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 from pyklip_diffrender.pyklip_backend.pointings import Pointing, pointings_of
-from pyklip_diffrender.pyklip_backend.references import (
-    ChosenPattern,
-    References,
-    pattern_for,
-)
+from pyklip_diffrender.pyklip_backend.references import References
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.verdict import (
     require_plausible,
@@ -32,6 +28,7 @@ from pyklip_diffrender.wavefront.opd import OPDMap
 if TYPE_CHECKING:
     from pyklip_diffrender.detection.error_factor import ErrorFactor
     from pyklip_diffrender.optics.system import OpticalSystem
+    from pyklip_diffrender.pattern import PatternChoice, PatternRequest
     from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["FIT_PIXELS", "Fit", "Subtraction", "Subtractor", "subtract_by_refinement"]
@@ -82,7 +79,7 @@ class Subtraction:
     fits : tuple of Fit
         At least one; together they cover all frames.
     systematics : str
-        The pattern of the model's error that was used, in words.
+        Origin of the flat-field pattern that was used, see `PatternChoice.label`.
     references : int
         Number of frames of reference stars that were used.
     pointings : tuple of FittedPointing
@@ -160,8 +157,8 @@ def subtract_by_refinement(
     Raises
     ------
     IncompatibleSetupError
-        If there is neither a model nor a filter to make one for, or for `keep_detected` with a
-        method that `detect` cannot use.
+        If there is neither a model nor a filter to make one for, for `keep_detected` with a
+        method that `detect` cannot use, or if "references" is asked for without any.
     RefinementError
         If a refinement has no usable or no plausible result.
 
@@ -172,25 +169,41 @@ def subtract_by_refinement(
     """
     model = model_of(observation, settings)
     # Takes a second to import, so only after the input has been checked.
+    from pyklip_diffrender.pattern import fit_with_pattern
     from pyklip_diffrender.refinement import Adam
 
+    adam, seed = isinstance(settings.fit, Adam), _seed_of(settings)
     groups = list(pointings_of(observation) if pointings is None else pointings)
     windows = [Window.about(g.observation.center[0], model.detector.shape) for g in groups]
     cut = [window.of(group.observation) for window, group in zip(windows, groups, strict=True)]
     references = References() if references is None else references
-    pattern = pattern_for(cut, references, model, opd, settings, tell)
-    together, results = _refined(pattern, model, opd, settings, tell)
-    if any(pattern.choice.is_refuted_by(result) for result in results):
-        tell("the frames do not show the pattern of the library")
-        pattern = pattern_for(cut, references, model, opd, settings, tell, library=False)
-        together, results = _refined(pattern, model, opd, settings, tell)
-    adam, seed = isinstance(settings.fit, Adam), _seed_of(settings)
+
+    def frames_of_references() -> list[Observation]:
+        tell("fitting the reference stars")
+        return references.cut(model.detector.shape, cut[0])
+
+    def fit(choice: PatternChoice, again: bool) -> list[Refinement]:
+        if again:
+            tell("the frames do not show the pattern of the library")
+        elif references and not choice.references:
+            tell("the reference frames are not needed")
+        return _refined(choice, model, opd, settings, tell)
+
+    choice, results = fit_with_pattern(
+        cut,
+        frames_of_references if references else (),
+        model,
+        opd,
+        fit,
+        systematics=_requested_pattern(settings, observation, references),
+        settings=settings.fit,
+    )
     keep, error_factor = settings.keep_detected, None
     if (observation.is_nircam and not adam) if keep is None else keep:
         results, error_factor = _with_companions(results, tell)
     star = np.full(observation.data.shape, np.nan)
     fits, fitted = [], []
-    for chosen, result in zip(together, results, strict=True):
+    for chosen, result in zip(_together(len(cut), adam), results, strict=True):
         # It may have been refined again with companions.
         require_plausible(cut[chosen[0]].name, result, settings.max_chi2)
         warn_of_status(cut[chosen[0]].name, result)
@@ -206,50 +219,77 @@ def subtract_by_refinement(
         results[0].method,
         seed,
         tuple(fits),
-        pattern.label,
-        pattern.reference_frames,
+        choice.label,
+        choice.reference_frames,
         tuple(fitted),
         error_factor,
     )
 
 
+def _requested_pattern(
+    settings: DiffrenderSettings, observation: Observation, references: References
+) -> PatternRequest:
+    """Return the pattern that is asked for: real NIRCam frames get "auto", others "off".
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If "references" is asked for without any.
+    """
+    from pyklip_diffrender.refinement import Adam
+
+    requested = settings.systematics
+    if requested is None:
+        real = observation.is_nircam and not isinstance(settings.fit, Adam)
+        return "auto" if real else "off"
+    if requested == "references" and not references:
+        raise IncompatibleSetupError(
+            "systematics='references' needs frames of reference stars: give them to JWSTData as "
+            "psflib_filepaths after register(), and RDI in the mode and psf_library= to "
+            "klip_dataset"
+        )
+    return requested
+
+
+def _together(pointings: int, adam: bool) -> list[tuple[int, ...]]:
+    """Return which pointings are fitted together; the Adam recipe takes one at a time."""
+    everything = tuple(range(pointings))
+    return [(k,) for k in everything] if adam else [everything]
+
+
 def _refined(
-    pattern: ChosenPattern,
+    choice: PatternChoice,
     model: OpticalSystem,
     opd: OPDMap,
     settings: DiffrenderSettings,
     tell: Callable[[str], None],
-) -> tuple[list[tuple[int, ...]], list[Refinement]]:
-    """Fit all pointings; the numbers of those that were fitted together, and the fits."""
+) -> list[Refinement]:
+    """Fit all pointings with a pattern."""
     from pyklip_diffrender.refinement import Adam, refine
 
-    science = pattern.choice.science
-    adam = isinstance(settings.fit, Adam)
-    # The Adam recipe takes one observation at a time.
-    everything = tuple(range(len(science)))
-    together: list[tuple[int, ...]] = [(k,) for k in everything] if adam else [everything]
+    science, adam = choice.science, isinstance(settings.fit, Adam)
     tell(
         f"fitting {_counted(sum(map(len, science)), 'frame')} of "
         f"{_counted(len(science), 'pointing')}"
         f"{'' if adam or len(science) == 1 else ' together'}, {model.detector.shape[1]} x "
-        f"{model.detector.shape[0]} pixels, pattern of the model's error: {pattern.label}"
+        f"{model.detector.shape[0]} pixels, flat-field pattern: {choice.label}"
     )
     results: list[Refinement] = []
-    for chosen in together:
+    for chosen in _together(len(science), adam):
         result = refine(
             model,
             [science[k] for k in chosen],
             opd,
-            settings=pattern.choice.settings,
+            settings=choice.settings,
             start=settings.start,
-            systematics=pattern.choice.systematics,
+            systematics=choice.systematics,
             plan="auto" if settings.plan is None else settings.plan,
             seed=_seed_of(settings),
         )
         require_plausible(science[chosen[0]].name, result, settings.max_chi2)
         tell(f"{_described(result)}, {result.seconds:.0f} s")
         results.append(result)
-    return together, results
+    return results
 
 
 def _seed_of(settings: DiffrenderSettings) -> int:

@@ -27,23 +27,19 @@ from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.io.units import require_bound, to_bytes
+from pyklip_diffrender.pattern import PatternChoice, PatternRequest, fit_with_pattern
 from pyklip_diffrender.refinement import (
     GaussNewton,
     Refinement,
-    Systematics,
     refine,
     require_calibrated,
     to_jansky,
     with_star_flux,
 )
-from pyklip_diffrender.refinement.pattern_choice import (
-    PatternChoice,
-    PatternRequest,
-    choose_systematics,
-)
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.map_choice import wavefront_for
 
 __all__ = ["Reduction", "reduce"]
@@ -289,20 +285,7 @@ def reduce(
     model = model_for(sequence.science[0], size, device=device)
     whole, cut = sequence.science, sequence.cutout(size)
 
-    def chosen(**options: Any) -> PatternChoice:
-        return choose_systematics(
-            cut.science,
-            cut.references,
-            model,
-            wavefront,
-            systematics=systematics,
-            settings=settings,
-            memory=limit,
-            progress=progress,
-            **options,
-        )
-
-    def fitted(science: tuple[Observation, ...]) -> Refinement:
+    def fitted(science: tuple[Observation, ...], choice: PatternChoice) -> Refinement:
         fit = refine(
             model,
             science,
@@ -316,15 +299,24 @@ def reduce(
         return with_star_flux(fit, jansky, star_flux_error, progress=progress)
 
     def searched(science: tuple[Observation, ...]) -> Detection:
-        return detect(fitted(science), threshold=threshold, progress=progress)
+        return detect(fitted(science, choice), threshold=threshold, progress=progress)
 
-    choice = chosen()
-    with stage("2 of 4: wavefront"):
-        fit = fitted(choice.science)
-    if choice.is_refuted_by(fit):
-        choice = chosen(library=False)
-        with stage("2 of 4: wavefront, without the pattern of the library"):
-            fit = fitted(choice.science)
+    def first_fit(choice: PatternChoice, again: bool) -> list[Refinement]:
+        without = ", without the pattern of the library" if again else ""
+        with stage(f"2 of 4: wavefront{without}"):
+            return [fitted(choice.science, choice)]
+
+    choice, (fit,) = fit_with_pattern(
+        cut.science,
+        cut.references,
+        model,
+        wavefront,
+        first_fit,
+        systematics=systematics,
+        settings=settings,
+        memory=limit,
+        progress=progress,
+    )
     sequence = replace(cut, science=choice.science)
     extended = None
     if disk:
@@ -337,7 +329,7 @@ def reduce(
     cleaned = None if outside is None else outside.subtracted(whole, sequence.science)
     if cleaned is not None:
         with stage("3 of 4: star and search without the light of sources beyond the fitted pixels"):
-            fit = fitted(cleaned)
+            fit = fitted(cleaned, choice)
             detection = detect(fit, threshold=threshold, progress=progress)
             outside = wide_field(detection, whole)
     recovered = None

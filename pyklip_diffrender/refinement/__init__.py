@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.learning import learn_systematics
-from pyklip_diffrender.refinement.library import known_systematics
-from pyklip_diffrender.refinement.pattern_match import pattern_size
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
@@ -18,7 +15,6 @@ from pyklip_diffrender.refinement.star_flux import (
     with_star_flux,
 )
 from pyklip_diffrender.refinement.status import Status
-from pyklip_diffrender.refinement.systematics import Systematics
 
 __all__ = [
     "Adam",
@@ -26,11 +22,7 @@ __all__ = [
     "GaussNewton",
     "Refinement",
     "Status",
-    "Systematics",
     "jansky_per_unit",
-    "known_systematics",
-    "learn_systematics",
-    "pattern_size",
     "refine",
     "refine_again",
     "require_calibrated",

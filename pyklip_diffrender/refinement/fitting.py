@@ -22,8 +22,8 @@ from pyklip_diffrender.refinement.planned import choose_plan, fit_problems
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
-from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import as_opd_map
 
 __all__ = ["refine"]

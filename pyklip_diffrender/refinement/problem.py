@@ -15,8 +15,8 @@ from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError,
 from pyklip_diffrender.io.units import to_number
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import OPDMap, resample
 
 __all__ = ["Problem"]

@@ -37,9 +37,9 @@ from pyklip_diffrender.refinement.storage import (
     reading,
     text_hdu,
 )
-from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.product_headers import primary_hdu
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.opd import OPDMap
 

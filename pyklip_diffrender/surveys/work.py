@@ -10,10 +10,11 @@ from typing import Any
 
 from pyklip_diffrender.detection import measured_planet, with_planets
 from pyklip_diffrender.reduction import Reduction, reduce
-from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement, Systematics
+from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement
 from pyklip_diffrender.report import summarise, write_report
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.surveys.jobs import Injection, Job
 
 __all__ = ["reduce_job"]

@@ -16,14 +16,14 @@ from astropy.io import fits
 
 from pyklip_diffrender.io.files import open_fits, write_fits
 from pyklip_diffrender.io.units import native_float64
-from pyklip_diffrender.refinement.learning import (
+from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
     combine_patterns,
     measure_patterns,
 )
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = ["known_systematics", "read_patterns", "write_patterns"]
 
@@ -109,7 +109,7 @@ def _covered(pattern: MeasuredPattern, observation: Observation) -> float:
 
 @lru_cache(maxsize=1)
 def _library() -> tuple[MeasuredPattern, ...]:
-    name = resources.files("pyklip_diffrender.refinement") / "data" / "patterns.fits.gz"
+    name = resources.files("pyklip_diffrender.pattern") / "data" / "patterns.fits.gz"
     with resources.as_file(name) as path:
         return tuple(read_patterns(path))
 

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.pedestal import (
+from pyklip_diffrender.pattern.pedestal import (
     light_and_residual,
     median_variance,
     pattern_pedestal,
     rings_about,
 )
+from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.refinement.systematics import Systematics
+from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = [
     "MeasuredPattern",
@@ -77,7 +77,7 @@ def learn_systematics(
     """Learn the pattern that the star model misses from fits of other stars.
 
     In every frame the residual is divided by the sum of the star and a pedestal, the same in all of
-    them, see ``refinement.pedestal.pattern_pedestal``. The ratios are averaged with inverse
+    them, see ``pattern.pedestal.pattern_pedestal``. The ratios are averaged with inverse
     variances, which are those of the data's noise and of the scatter between frames beyond that
     noise; a zero-mean Gaussian prior, as wide as the ratios scatter over the pixels of a ring,
     shrinks pixels that were not measured well. The error of the pattern for another frame is that

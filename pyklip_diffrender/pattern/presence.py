@@ -10,7 +10,7 @@ import logging
 
 import torch
 
-from pyklip_diffrender.refinement.pedestal import light_and_residual
+from pyklip_diffrender.pattern.pedestal import light_and_residual
 from pyklip_diffrender.refinement.result import Refinement
 
 __all__ = ["lacks_pattern", "pattern_size"]
@@ -46,7 +46,7 @@ def pattern_size(fit: Refinement) -> tuple[float, float] | None:
     >>> from dataclasses import replace
     >>> import numpy as np
     >>> import pyklip_diffrender as dr
-    >>> from pyklip_diffrender.refinement import pattern_size
+    >>> from pyklip_diffrender.pattern import pattern_size
     >>> model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=32)
     >>> opd = dr.random_opd(1, npix=128)
     >>> frames = dr.simulate(model, dr.Scene(), opd, seed=3)

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import fourier_shift
 
-from pyklip_diffrender.refinement.learning import measure_patterns
+from pyklip_diffrender.pattern.measure import measure_patterns
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 
-__all__ = ["register"]
+__all__ = ["place_on_detector"]
 
 _log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ _INNER = 0.3
 """Smallest separation used, arcsec. Closer in, the ratio is dominated by errors of the model."""
 
 
-def register(fit: Refinement, pattern: Systematics) -> Observation | None:
+def place_on_detector(fit: Refinement, pattern: Systematics) -> Observation | None:
     """Move the frames of a fit onto the pixels of the detector that a pattern was measured on.
 
     Parameters

@@ -1,9 +1,9 @@
-"""The choice of the pattern of the model's error: of the library, of reference stars, or none."""
+"""The choice of the flat-field pattern: of the library, of reference stars, or none."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
@@ -13,25 +13,36 @@ from astropy import units as u
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.pattern.library import known_systematics
+from pyklip_diffrender.pattern.placement import place_on_detector
+from pyklip_diffrender.pattern.presence import lacks_pattern
 from pyklip_diffrender.refinement.fitting import refine
-from pyklip_diffrender.refinement.library import known_systematics
-from pyklip_diffrender.refinement.pattern_match import lacks_pattern
-from pyklip_diffrender.refinement.registration import register
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
-from pyklip_diffrender.refinement.systematics import Systematics
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import OPDMap
 
-__all__ = ["PatternChoice", "PatternRequest", "choose_systematics", "require_request"]
+__all__ = [
+    "PatternChoice",
+    "PatternRequest",
+    "ReferenceFrames",
+    "choose_systematics",
+    "require_request",
+]
 
 PatternRequest: TypeAlias = Systematics | Literal["auto", "references", "off"]
+
+ReferenceFrames: TypeAlias = Sequence[Observation] | Callable[[], Sequence[Observation]]
+"""Frames of reference stars, or a function that reads them where they are needed."""
+
+Origin: TypeAlias = Literal["none", "given", "library", "references", "rolls"]
 
 _log = logging.getLogger(__name__)
 
 _KNOWN_MODEL_ERROR = 0.002
-"""Smallest model error, as a fraction of the star, where the pattern of the model's error is known
-from other stars: the pattern's own error is counted apart."""
+"""Smallest model error, as a fraction of the star, where the pattern is known from other stars: the
+pattern's own error is counted apart."""
 
 _ROUGH: dict[str, Any] = {
     "min_model_error": 0.05,
@@ -68,8 +79,10 @@ class PatternChoice:
         One for each reference star that was fitted.
     failed : tuple of (str, str)
         Reference stars that could not be fitted, and why.
-    from_library : bool
-        Whether the pattern is that of the package's library alone.
+    origin : {"none", "given", "library", "references", "rolls"}
+        Where the pattern comes from: nowhere, from the caller, from the package's library alone,
+        from reference stars (and the library), or from the rolls, which share a pattern of which
+        only the size is known.
     """
 
     science: tuple[Observation, ...]
@@ -77,14 +90,35 @@ class PatternChoice:
     settings: GaussNewton | Adam | None
     references: tuple[Refinement, ...] = ()
     failed: tuple[tuple[str, str], ...] = ()
-    from_library: bool = False
+    origin: Origin = "none"
+
+    @property
+    def label(self) -> str:
+        """The origin of the pattern in a few words, with the names of its stars."""
+        if self.systematics is None:
+            return "none"
+        if self.origin in ("given", "rolls"):
+            name = self.systematics.name
+            return f"given ({name})" if self.origin == "given" else name
+        fitted = [frame.observation.target for fit in self.references for frame in fit.frames]
+        own = list(dict.fromkeys(fitted))
+        others = [n for n in self.systematics.provenance.get("stars", []) if n not in own]
+        parts = (("references", own), ("library", others))
+        return ", ".join(f"{origin} ({', '.join(names)})" for origin, names in parts if names)
+
+    @property
+    def reference_frames(self) -> int:
+        """Number of frames of reference stars that the pattern was learned from."""
+        if self.systematics is None:
+            return 0
+        return sum(len(frame.observation) for fit in self.references for frame in fit.frames)
 
     def is_refuted_by(self, fit: Refinement) -> bool:
-        """Whether a fit with the library's pattern shows that the frames do not have it.
+        """Return True if a fit shows less than half of the library's pattern.
 
-        If they do not have the pattern, a warning is logged, whatever pattern it is.
+        A warning is logged if it shows less than half of its pattern, whatever its origin.
         """
-        return lacks_pattern(fit) and self.from_library
+        return lacks_pattern(fit) and self.origin == "library"
 
 
 def require_request(systematics: object) -> None:
@@ -100,7 +134,7 @@ def require_request(systematics: object) -> None:
 
 def choose_systematics(
     science: Sequence[Observation],
-    references: Sequence[Observation],
+    references: ReferenceFrames,
     model: OpticalSystem,
     opd: OPDMap,
     *,
@@ -110,14 +144,14 @@ def choose_systematics(
     memory: float | None = None,
     progress: bool = False,
 ) -> PatternChoice:
-    """Choose the pattern of the model's error for a target.
+    """Choose the flat-field pattern for a target.
 
     Parameters
     ----------
     science : sequence of Observation
         Frames of the target, as they will be fitted.
-    references : sequence of Observation
-        Frames of other stars.
+    references : sequence of Observation, or callable
+        Frames of other stars; a function that returns them is called only if they are needed.
     model : OpticalSystem
     opd : OPDMap
         The wavefront to start from.
@@ -150,26 +184,29 @@ def choose_systematics(
     fits: list[Refinement] = []
     failed: list[tuple[str, str]] = []
     pattern = systematics if isinstance(systematics, Systematics) else None
-    from_library = False
+    origin: Origin = "none" if pattern is None else "given"
     if systematics in ("auto", "references"):
         first = science[0]
         if systematics == "auto" and library:
             pattern = known_systematics(first)
             if pattern is not None:
                 science, pattern = _registered(science, pattern, model, opd, common)
-                from_library = pattern is not None
+                origin = "library"
         if pattern is None and references:
-            fits, failed = _fit_references(references, model, opd, common)
+            frames = references() if callable(references) else references
+            fits, failed = _fit_references(frames, model, opd, common)
             pattern = known_systematics(first, fits, library=library)
+            origin = "references"
         if pattern is None:
             pattern = _unknown_pattern(science)
-        _log.info("pattern of the model's error: %s", pattern)
+            origin = "rolls"
+        if pattern is None:
+            origin = "none"
+        _log.info("flat-field pattern: %s", pattern)
     if pattern is not None and settings is None and science[0].is_nircam:
         settings = replace(settings_for(science[0]), min_model_error=_KNOWN_MODEL_ERROR)
     settings = _limited(settings, science[0], memory)
-    return PatternChoice(
-        tuple(science), pattern, settings, tuple(fits), tuple(failed), from_library
-    )
+    return PatternChoice(tuple(science), pattern, settings, tuple(fits), tuple(failed), origin)
 
 
 def _limited(
@@ -182,7 +219,7 @@ def _limited(
 
 
 def _unknown_pattern(science: Sequence[Observation]) -> Systematics | None:
-    """A pattern of which only the size is known, where rolls tell it from a planet; else None."""
+    """Return a pattern of which only the size is known, if rolls tell it from a planet."""
     first = science[0]
     same = all(
         each.first_pixel == first.first_pixel and each.shape == first.shape for each in science
@@ -209,7 +246,7 @@ def _fit_references(
     opd: OPDMap,
     common: dict[str, Any],
 ) -> tuple[list[Refinement], list[tuple[str, str]]]:
-    """One fit for every reference star; names of those that fail, and why."""
+    """Fit every reference star; also the names of those that fail, and why."""
     fits, failed = [], []
     for star, frames in _by_star(references).items():
         try:
@@ -228,13 +265,13 @@ def _registered(
     opd: OPDMap,
     common: dict[str, Any],
 ) -> tuple[Sequence[Observation], Systematics | None]:
-    """The frames on the pixels of the library's pattern; no pattern if one frame is not."""
+    """Move frames onto the pixels of the library's pattern; no pattern if one cannot be."""
     moved = []
     for each in science:
         frame: Observation | None = each
         if each.first_pixel is None:
             with stage(f"1 of 4: place of {each.name} on the detector"):
-                frame = register(_rough_fit(model, each, opd, **common), pattern)
+                frame = place_on_detector(_rough_fit(model, each, opd, **common), pattern)
         if frame is None:
             _log.warning(
                 "%s: the file does not say which pixels of the detector its frames show, and the "
@@ -253,7 +290,7 @@ def _rough_fit(
     settings: GaussNewton | Adam | None,
     progress: bool,
 ) -> Refinement:
-    """A fit until the pattern dominates the residual."""
+    """Fit until the pattern dominates the residual."""
     settings = settings or settings_for(observation)
     if isinstance(settings, GaussNewton):
         settings = replace(settings, **_ROUGH)
