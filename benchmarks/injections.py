@@ -20,7 +20,7 @@ import numpy as np
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.pyklip_backend.klip_curve import klip_curve
-from pyklip_diffrender.report import summarise
+from pyklip_diffrender.reduction import summarise
 
 SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])
 SIZE = 80
@@ -54,10 +54,7 @@ def main() -> None:
         np.interp(SEPARATIONS, curve["separation"].value, curve[name])
         for name in ("contrast", "known_star", "small_sample")
     )
-    with_references = replace(
-        base, sequence=replace(base.sequence, references=sequence.cutout(SIZE).references)
-    )
-    klip = klip_curve(with_references, SEPARATIONS)
+    klip = klip_curve(base.detection, sequence.cutout(SIZE).references, SEPARATIONS)
     theirs, modes = np.asarray(klip["contrast"]), klip["modes"]
     print(
         "small-sample correction: ours, KLIP, ratio (modes of KLIP); without it: ours, star known"

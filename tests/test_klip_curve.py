@@ -74,17 +74,15 @@ def frame(
     )  # fmt: skip
 
 
-def reduction(
+def searched(
     science: list[FrameFit], references: list[FrameFit] | tuple[FrameFit, ...] = ()
-) -> Any:
-    """What `klip_curve` uses of a reduction."""
+) -> tuple[Any, Any]:
+    """Arguments of `klip_curve`: as much of a detection as it uses, and references."""
     curve = SimpleNamespace(meta={"resolution_arcsec": RESOLUTION})
-    return SimpleNamespace(
-        sequence=SimpleNamespace(references=tuple(each.observation for each in references)),
-        detection=SimpleNamespace(
-            fits=(SimpleNamespace(frames=tuple(science)),), contrast_curve=curve
-        ),
+    detection = SimpleNamespace(
+        fits=(SimpleNamespace(frames=tuple(science)),), contrast_curve=curve
     )
+    return detection, tuple(each.observation for each in references)
 
 
 def rolls(speckles: float = 0.0) -> list[FrameFit]:
@@ -98,7 +96,7 @@ def frames() -> tuple[list[FrameFit], list[FrameFit]]:
 
 @cache
 def quiet() -> NDArray[np.float64]:
-    return np.asarray(klip_curve(reduction(*frames()), SEPARATIONS)["contrast"])
+    return np.asarray(klip_curve(*searched(*frames()), SEPARATIONS)["contrast"])
 
 
 def photon_limits(science: list[FrameFit]) -> NDArray[np.float64]:
@@ -119,7 +117,7 @@ def test_limits_are_near_the_photon_limit_and_not_below() -> None:
 
 
 def test_light_that_no_reference_has_makes_the_limits_worse() -> None:
-    worse = klip_curve(reduction(rolls(0.5), frames()[1]), SEPARATIONS)["contrast"]
+    worse = klip_curve(*searched(rolls(0.5), frames()[1]), SEPARATIONS)["contrast"]
     assert (worse > 2 * quiet()).all()
 
 
@@ -130,7 +128,7 @@ def test_stars_are_aligned() -> None:
         replace(each, observation=replace(each.observation, center=each.observation.center + off))
         for each, off in zip(references, (0.5, -0.5), strict=True)
     ]
-    assert (klip_curve(reduction(science, wrong), SEPARATIONS)["contrast"] > 1.2 * quiet()).any()
+    assert (klip_curve(*searched(science, wrong), SEPARATIONS)["contrast"] > 1.2 * quiet()).any()
 
 
 def test_companions_of_the_fit_are_not_noise() -> None:
@@ -142,7 +140,7 @@ def test_companions_of_the_fit_are_not_noise() -> None:
         planet = 1e-2 * light[k][0].numpy()
         observation = replace(each.observation, data=each.observation.data + planet)
         known.append(replace(each, observation=observation, companion_image=planet))
-    curve = klip_curve(reduction(known, references), SEPARATIONS)
+    curve = klip_curve(*searched(known, references), SEPARATIONS)
     assert curve["contrast"] == pytest.approx(quiet(), rel=1e-6)
 
 
@@ -158,7 +156,7 @@ def test_two_rolls_alone_and_masked_pixels() -> None:
             data=np.where(valid, science[0].observation.data, 0.0),
         ),
     )
-    curve = klip_curve(reduction([hole, science[1]]), [500, 800, 5000] * u.mas)
+    curve = klip_curve(*searched([hole, science[1]]), [500, 800, 5000] * u.mas)
     assert curve["separation"].to_value(u.arcsec) == pytest.approx(SEPARATIONS)
     assert list(curve["modes"]) == [1, 1]
     assert np.isfinite(curve["contrast"]).all()
@@ -170,9 +168,9 @@ def test_without_references_there_is_no_curve() -> None:
     science, references = frames()
     same = replace(science[1], observation=replace(science[1].observation, position_angles=None))
     with pytest.raises(IncompatibleSetupError, match="roll without references"):
-        klip_curve(reduction([science[0], same]))
+        klip_curve(*searched([science[0], same]))
     with pytest.raises(IncompatibleSetupError, match="rings are complete"):
-        klip_curve(reduction(science, references), 3.0)
+        klip_curve(*searched(science, references), 3.0)
 
 
 def test_small_samples_need_higher_thresholds() -> None:

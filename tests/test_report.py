@@ -27,15 +27,15 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.planning.choice import ModelError
-from pyklip_diffrender.refinement import Status
-from pyklip_diffrender.report import summarise, write_report
-from pyklip_diffrender.report.html import page
-from pyklip_diffrender.report.words import (
+from pyklip_diffrender.reduction import summarise, write_report
+from pyklip_diffrender.reduction.page import page
+from pyklip_diffrender.reduction.words import (
     advice,
     plus_minus,
     probability,
     scientific,
 )
+from pyklip_diffrender.refinement import Status
 
 PLANET = dr.Planet(2e-5, 0.6, 40.0)
 ROLL = 30.0
@@ -328,7 +328,7 @@ def test_a_header_cannot_write_into_the_page(tmp_path: Path) -> None:
 def _few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw the S/N map and the contrast curve alone."""
     for name in ("star_pictures", "wavefront_pictures"):
-        monkeypatch.setattr(f"pyklip_diffrender.report.write.{name}", lambda *_: [])
+        monkeypatch.setattr(f"pyklip_diffrender.reduction.products.{name}", lambda *_: [])
 
 
 @pytest.mark.usefixtures("_few_pictures")
@@ -384,7 +384,7 @@ def test_a_failure_of_klip_does_not_break_the_report(
         raise ValueError("singular")
 
     monkeypatch.setattr("pyklip_diffrender.pyklip_backend.klip_curve.klip_curve", broken)
-    monkeypatch.setattr("pyklip_diffrender.report.write.search_pictures", lambda *_: [])
+    monkeypatch.setattr("pyklip_diffrender.reduction.products.search_pictures", lambda *_: [])
     whole = reduction()
     sequence = replace(whole.sequence, references=whole.sequence.science)
     _, data = write_report(replace(whole, sequence=sequence), tmp_path)
@@ -400,7 +400,7 @@ def test_a_report_that_fails_leaves_the_old_one(
     def broken(*_: Any, **__: Any) -> str:
         raise ValueError("no disk")
 
-    monkeypatch.setattr("pyklip_diffrender.report.write.json.dumps", broken)
+    monkeypatch.setattr("pyklip_diffrender.reduction.products.json.dumps", broken)
     with pytest.raises(ValueError, match="no disk"):
         write_report(reduction(), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]

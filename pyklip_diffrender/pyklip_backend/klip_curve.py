@@ -1,4 +1,4 @@
-"""The contrast curve of KLIP (ADI and RDI) for the frames of a reduction.
+"""The contrast curve of KLIP (ADI and RDI) for the frames of a detection.
 
 It is what an observer would get without a model of the telescope. The same planets that the fit
 would search for, in units of the same star, are added to the frames to measure how much of them
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,14 +21,12 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
+from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.scene.detector_pixels import shift_frames
-
-if TYPE_CHECKING:
-    from pyklip_diffrender.reduction import Reduction
-    from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["KlipSubtraction", "klip_curve", "small_sample_factor"]
 
@@ -64,7 +62,9 @@ _CLOSE = 1.5
 """Pixels about the position of an injected planet in which its peak is sought."""
 
 
-def klip_curve(reduction: Reduction, separations: Any = None) -> QTable:
+def klip_curve(
+    detection: Detection, references: Sequence[Observation] = (), separations: Any = None
+) -> QTable:
     """Compute the 5-sigma contrast curve of KLIP for the frames that were fitted.
 
     Every roll is projected onto the Karhunen-Loeve modes of the other rolls and all frames of
@@ -75,9 +75,10 @@ def klip_curve(reduction: Reduction, separations: Any = None) -> QTable:
 
     Parameters
     ----------
-    reduction : Reduction
-        Frames are aligned by the fitted positions of the star, those of reference stars by the
-        recorded ones.
+    detection : Detection
+        Its frames are aligned by the fitted positions of the star.
+    references : sequence of Observation
+        Frames of reference stars, cut to the same pixels; aligned by the recorded positions.
     separations : array or Quantity, optional
         arcsec; by default twelve from 2 lambda/D to the edge of the frames. Those beyond the edge
         are left out.
@@ -94,10 +95,9 @@ def klip_curve(reduction: Reduction, separations: Any = None) -> QTable:
     IncompatibleSetupError
         If a roll has no references, or no separation is in the frames.
     """
-    detection = reduction.detection
     templates = Templates(detection.fits[0], detection.fits[0].frames[0])
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
-    klip = KlipSubtraction(templates, reduction.sequence.references, resolution)
+    klip = KlipSubtraction(templates, references, resolution)
     # The corners' smaller coordinates.
     edge = np.abs(klip.grid[[0, -1], [0, -1]]).min() - resolution / 2
     if separations is None:

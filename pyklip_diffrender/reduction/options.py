@@ -13,8 +13,9 @@ from astropy import units as u
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import require_bound, to_bytes
-from pyklip_diffrender.refinement import GaussNewton, Systematics, to_jansky
-from pyklip_diffrender.refinement.pattern_choice import PatternRequest, require_request
+from pyklip_diffrender.pattern import PatternRequest, require_request
+from pyklip_diffrender.refinement import GaussNewton, to_jansky
+from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = ["ReduceOptions"]
 

@@ -9,9 +9,11 @@ from pathlib import Path
 from astropy.table import QTable
 
 from pyklip_diffrender.detection import Detection, Disk, WideField
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.refinement import Refinement, Systematics
+from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = ["Reduction"]
 
@@ -117,25 +119,41 @@ class Reduction:
         return f"{head}\n{self.detection._repr_html_()}"
 
     def write(
-        self, folder: str | os.PathLike[str], *, linear_model: bool = False
+        self, folder: str | os.PathLike[str], *, overwrite: bool = False, derivatives: bool = False
     ) -> list[Path]:
         """Write maps, tables, the fit, the flat-field pattern, figures and a report.
 
         Parameters
         ----------
         folder : path
-            Made if it does not exist. Products of an earlier reduction that this one does not have
-            are removed.
-        linear_model : bool
-            Keep the derivatives in ``fit.fits``, which then takes ten times the space. `read`
-            computes them again where they are missing.
+            Made if it does not exist.
+        overwrite : bool
+            Replace the products of an earlier reduction, and remove those that this one does not
+            have.
+        derivatives : bool
+            Keep the derivatives of the images in ``fit.fits``, which then takes ten times the
+            space: they are needed to search the fit again (`detect`), and to measure at other
+            places (`Detection.read(...).measure`).
 
         Returns
         -------
         list of Path
             The files that were written.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If there are products in the folder, and `overwrite` is False.
         """
         # The one import against the order of the modules: the products know this class.
-        from pyklip_diffrender.reduction.products import write_products
+        from pyklip_diffrender.reduction.products import existing_products, write_products
 
-        return write_products(self, Path(folder), linear_model=linear_model)
+        folder = Path(folder)
+        existing = existing_products(folder)
+        if existing and not overwrite:
+            raise IncompatibleSetupError(
+                f"{folder}: got a folder with {', '.join(each.name for each in existing)}, "
+                "expected one without products. Choose another, or replace them with "
+                "overwrite=True"
+            )
+        return write_products(self, folder, derivatives=derivatives)
