@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the package installed:
 
-    python benchmarks/convergence.py
+    python -m benchmarks.convergence
 
 It writes docs/accuracy.md. poppy's FFT takes about 4 GB of memory at an oversampling of 8, four
 times as much at 16.
@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from compared import Array, largest
-from provenance import provenance
 
+from benchmarks.compared import Array, largest
+from benchmarks.provenance import provenance
 from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
@@ -124,7 +124,7 @@ def main() -> None:
                 "",
                 "Written by a script; do not edit.",
                 "",
-                *provenance("benchmarks/convergence.py"),
+                *provenance("-m benchmarks.convergence"),
                 "",
                 "## Cells in the occulter's disc",
                 "",

@@ -1,6 +1,6 @@
 """Peak memory of fits of real frames, with and without `GaussNewton.memory`.
 
-    python benchmarks/memory.py FRAMES OPD --target STAR
+    python -m benchmarks.memory FRAMES OPD --target STAR
 
 FRAMES is a folder of calints files. One frame of the target is fitted and searched, then all frames
 of the filter, those of other stars as references. Every row is a process of its own, for what is

@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the package and its extra "webbpsf" installed:
 
-    python benchmarks/parity.py --official ../shared/data/stpsf-data
+    python -m benchmarks.parity --official ../shared/data/stpsf-data
 
 It makes an offline STPSF data directory without symmetry, runs the real stpsf on it and on STScI's
 own files, and writes docs/parity.md. At 1024 samples it takes about ten minutes and 6 GB of memory.
@@ -25,9 +25,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from compared import Array, largest, timed
-from provenance import provenance
 
+from benchmarks.compared import Array, largest, timed
+from benchmarks.provenance import provenance
 from pyklip_diffrender.bridges import from_poppy, from_webbpsf, load_wss_opd
 from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
@@ -305,7 +305,7 @@ def main() -> None:
                 "Written by a script, but for the section on speed, which stays as it is unless "
                 "the script is run with --speed.",
                 "",
-                *provenance("benchmarks/parity.py", ("poppy", "stpsf", "pysiaf")),
+                *provenance("-m benchmarks.parity", ("poppy", "stpsf", "pysiaf")),
                 "",
                 f"{npix} x {npix} samples in the pupil, 80 x 80 pixels, 4.5 um unless another band "
                 "is named. stpsf runs on an offline data directory (`tests/stpsf_data.py`) whose "

@@ -1,6 +1,6 @@
 """What a plan saves, and what it changes, from a bright star to a faint one.
 
-    python benchmarks/planning.py
+    python -m benchmarks.planning
 
 Every frame (embedded generator, the wavefront map 40 h old) is fitted with the model as given, with
 a plan of its own, and with that plan once more, on one core; the star that is found and the planet
@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from provenance import provenance
 
 import pyklip_diffrender as dr
+from benchmarks.provenance import provenance
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.objects import PAPER_SEGMENT_GAP, Planet, Scene, Star
@@ -117,7 +117,7 @@ def main() -> None:
         for seed in case.seeds:
             print(row(case, seed), flush=True)  # As they come: the whole takes minutes.
     print()
-    print("\n".join(provenance("benchmarks/planning.py", packages=())))
+    print("\n".join(provenance("-m benchmarks.planning", packages=())))
 
 
 if __name__ == "__main__":

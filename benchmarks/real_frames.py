@@ -1,6 +1,6 @@
 """Real frames: is noise being fitted, and what does each part of the model buy?
 
-    python benchmarks/real_frames.py CALINTS OPD
+    python -m benchmarks.real_frames CALINTS OPD
 
 Every row is a fit to one integration, judged on the other, which it has never seen. Both see the
 same star through the same wavefront, so what a fit learns of the first one's noise raises the

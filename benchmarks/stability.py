@@ -2,7 +2,7 @@
 
 Run from the root of the project, with the package installed:
 
-    python benchmarks/stability.py
+    python -m benchmarks.stability
 
 It writes reports/stability.md. ``pytest --full -m hard`` holds every line to its limit.
 """
@@ -15,7 +15,8 @@ from importlib import import_module
 from pathlib import Path
 
 import torch
-from provenance import provenance
+
+from benchmarks.provenance import provenance
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"
 sys.path[:0] = [str(TESTS), str(TESTS / "hard")]
@@ -130,7 +131,7 @@ def main() -> None:
         "brighter": fits.error_of(1.01 * star + fits.BACKGROUND),
         "success": fits.SUCCESS,
     }
-    lines = [INTRODUCTION, *provenance("benchmarks/stability.py")]
+    lines = [INTRODUCTION, *provenance("-m benchmarks.stability")]
     lines += [OPTICS.format(npix=optics.NPIX), *optics_table()]
     lines += [FITS.format(**facts), *fits_table(), NOTES.format(**notes())]
     arguments.output.parent.mkdir(parents=True, exist_ok=True)

@@ -52,7 +52,7 @@ def _mast() -> _Mast:
     except ImportError as error:
         raise ArchiveError(
             "files from the archive need astroquery, which is not installed: "
-            'python -m pip install "pyklip-diffrender[archive]"'
+            "python -m pip install astroquery"
         ) from error
     failures = (
         RequestException,  # Astroquery lets these through.

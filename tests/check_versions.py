@@ -1,12 +1,13 @@
 """Run the tests with the oldest and with the newest libraries that the metadata allow.
 
-    python tests/check_versions.py                     # both ends, the quick tier
-    python tests/check_versions.py --end oldest        # one end
+    python tests/check_versions.py                     # all three, the quick tier
+    python tests/check_versions.py --end oldest        # one of them
     python tests/check_versions.py -- tests/test_optics.py -x
 
 Each end gets a fresh virtual environment with this interpreter and is removed afterwards. The
 oldest end pins every lower bound of ``pyproject.toml`` (the dependencies and the extras that users
-have); the newest takes what pip prefers. What follows ``--`` goes to pytest.
+have); the newest takes what pip prefers; "plain" does so without the extras, of which one caps
+numpy. What follows ``--`` goes to pytest.
 
 At the oldest end, deprecation warnings are not errors: old releases get them from newer libraries
 underneath, and only their authors could act on them.
@@ -15,6 +16,7 @@ underneath, and only their authors could act on them.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import subprocess
@@ -25,7 +27,7 @@ import venv
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-ENDS = ("oldest", "newest")
+ENDS = ("oldest", "newest", "plain")
 EXTRAS = ("archive", "survey", "webbpsf")
 LENIENT = (
     "-Wdefault::DeprecationWarning",
@@ -55,13 +57,22 @@ def lower_bounds(pyproject: Path = ROOT / "pyproject.toml") -> dict[str, str]:
     return bounds
 
 
+def tools(pyproject: Path = ROOT / "pyproject.toml") -> list[str]:
+    """Requirements of the extra ``test`` without the extras that it takes along."""
+    project = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]
+    own = f"{project['name']}["
+    return [each for each in project["optional-dependencies"]["test"] if not each.startswith(own)]
+
+
 def installed(python: Path, names: list[str]) -> dict[str, str]:
     """Versions in an environment."""
-    program = "import sys, importlib.metadata as m; print(*map(m.version, sys.argv[1:]), sep='\\n')"
-    done = subprocess.run(
-        [python, "-c", program, *names], capture_output=True, text=True, check=True
+    program = (
+        "import json; from importlib.metadata import distributions; "
+        "print(json.dumps({each.name.lower(): each.version for each in distributions()}))"
     )
-    return dict(zip(names, done.stdout.split(), strict=True))
+    done = subprocess.run([python, "-c", program], capture_output=True, text=True, check=True)
+    versions = json.loads(done.stdout)
+    return {name: versions[name.lower()] for name in names if name.lower() in versions}
 
 
 def same(version: str, bound: str) -> bool:
@@ -80,12 +91,13 @@ def check(end: str, folder: Path, arguments: list[str]) -> int:
     python = folder / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
     # What the caller has on the path must not stand in for what pip installs.
     env = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
-    install = [python, "-m", "pip", "install", "--quiet", "-c", constraints, f"{ROOT}[test]"]
+    wanted = [str(ROOT), *tools()] if end == "plain" else [f"{ROOT}[test]"]
+    install = [python, "-m", "pip", "install", "--quiet", "-c", constraints, *wanted]
     subprocess.run(install, check=True, env=env)
     versions = installed(python, list(bounds))
     print(f"{end}:", ", ".join(f"{name} {version}" for name, version in versions.items()))
     if end == "oldest":
-        wrong = [name for name, version in versions.items() if not same(version, bounds[name])]
+        wrong = [name for name in bounds if not same(versions.get(name, "none"), bounds[name])]
         if wrong:
             print(f"not the oldest that is allowed: {', '.join(wrong)}", file=sys.stderr)
             return 1
@@ -98,7 +110,7 @@ def check(end: str, folder: Path, arguments: list[str]) -> int:
 def main() -> int:
     """Run the command line; returns the exit status, 0 if all passed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--end", choices=ENDS, help="default: both, one after the other")
+    parser.add_argument("--end", choices=ENDS, help="default: all, one after the other")
     parser.add_argument("pytest", nargs="*", help="arguments of pytest, after --")
     options = parser.parse_args()
     failed = []

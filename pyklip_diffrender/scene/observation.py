@@ -377,7 +377,8 @@ class Observation:
         (ax,) = drawing.axes_for(ax, 1)
         valid = self.valid[frame]
         image = np.where(valid, self.data[frame], np.nan)
-        pixels = np.stack(np.indices(self.shape)[::-1], axis=-1)
+        ny, nx = self.shape
+        pixels = np.stack(np.meshgrid(np.arange(nx), np.arange(ny)), axis=-1)
         drawing.star_image(
             ax,
             image,

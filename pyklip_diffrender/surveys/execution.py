@@ -98,7 +98,7 @@ def with_dask(
     except ImportError as error:
         raise IncompatibleSetupError(
             f"dask.distributed is needed for more than one process and is not installed ({error}): "
-            'pip install "pyklip-diffrender[survey]", or set workers = 0'
+            'python -m pip install "dask[distributed]" pyarrow, or set workers = 0'
         ) from error
     order = _Order(todo, jobs)
     with ExitStack() as stack:

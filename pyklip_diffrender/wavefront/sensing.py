@@ -39,8 +39,7 @@ def stpsf_module(purpose: str) -> Any:
         import stpsf.mast_wss
     except ImportError as error:
         raise IncompatibleSetupError(
-            f"stpsf is needed {purpose} and is not installed ({error}): "
-            'pip install "pyklip-diffrender[webbpsf]"'
+            f"stpsf is needed {purpose} and is not installed ({error}): python -m pip install stpsf"
         ) from error
     return stpsf
 

@@ -1,0 +1,1 @@
+"""Sixty deliberate breakages of the package, and whether the tests notice them."""

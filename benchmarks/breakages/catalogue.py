@@ -1,0 +1,360 @@
+"""The breakages: one line of the package changed, and the property that is then lost.
+
+A change is found by its text, wherever the module is; the text must be in the package exactly
+once. The test files named with it are those that are run first.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+__all__ = ["BREAKAGES", "Breakage"]
+
+
+class Breakage(NamedTuple):
+    """A fault that tests should notice.
+
+    Attributes
+    ----------
+    name : str
+    lost : str
+        The property that no longer holds.
+    old, new : str
+        Text of the package and its replacement.
+    tests : str
+        Test files that are run first, without "test_" and ".py", separated by spaces.
+    """
+
+    name: str
+    lost: str
+    old: str
+    new: str
+    tests: str
+
+
+def _optics() -> list[Breakage]:
+    return [
+        Breakage(
+            "fourier-sign", "the image is not mirrored in y",
+            "RowTransform(y, pupil_y, wavelength, -1, dtype, fold)",
+            "RowTransform(y, pupil_y, wavelength, +1, dtype, fold)",
+            "optics propagation_poppy",
+        ),
+        Breakage(
+            "tilt-sign", "a source is imaged where it is",
+            "x_turns = -offset[..., 0:1]", "x_turns = offset[..., 0:1]", "optics",
+        ),
+        Breakage(
+            "adjoint-conjugate", "the inverse transform is the adjoint",
+            "self._matrix.conj().T @ field", "self._matrix.T @ field", "optics lattice",
+        ),
+        Breakage(
+            "pupil-centre", "the pupil is centred between samples",
+            "return (index - (self.npix - 1) / 2) * self.spacing",
+            "return (index - self.npix / 2) * self.spacing", "optics geometry",
+        ),
+        Breakage(
+            "detector-centre", "the middle of the array is between pixels for even sides",
+            "axis = (index - (samples - 1) / 2) * (scale / self.oversample)",
+            "axis = (index - samples / 2) * (scale / self.oversample)", "optics",
+        ),
+        Breakage(
+            "detector-shift", "detector_shift moves the image to positive x and y",
+            "axis = axis - shift[..., k].to(self.device)",
+            "axis = axis + shift[..., k].to(self.device)", "optics",
+        ),
+        Breakage(
+            "crosstalk-kernel", "light spreads as the kernel says, not mirrored",
+            "self.kernel.flip(0, 1).to(image)[None, None]",
+            "self.kernel.to(image)[None, None]", "detector_effects",
+        ),
+        Breakage(
+            "stop-rotation", "lyot_rotation is counter-clockwise",
+            "torch.stack([cosine, sine]), torch.stack([-sine, cosine])",
+            "torch.stack([cosine, -sine]), torch.stack([sine, cosine])", "geometry optics",
+        ),
+        Breakage(
+            "coverage", "pixels at the edge of a polygon are covered in part",
+            "index_add(0, flat, (height * (1 - inside_x))[kept])",
+            "index_add(0, flat, height[kept])", "geometry instrument",
+        ),
+        Breakage(
+            "absorption", "an imaginary OPD absorbs light",
+            "torch.exp(-wavenumber * opd.imag)", "torch.exp(wavenumber * opd.imag)",
+            "optics forward_model",
+        ),
+        Breakage(
+            "noll-parity", "even Noll indices are cosines",
+            "magnitude if j % 2 == 0 else -magnitude", "magnitude if j % 2 else -magnitude",
+            "optics instrument",
+        ),
+        Breakage(
+            "blur-width", "blur is a standard deviation",
+            "gain = torch.exp(-2 * (math.pi", "gain = torch.exp(-1 * (math.pi", "optics",
+        ),
+        Breakage(
+            "array-turn", "a turned array shows the turned pupil",
+            "((a + b, -1), (c + d, -2))", "((a + b, -2), (c + d, -1))",
+            "orientation bridges_poppy",
+        ),
+    ]  # fmt: skip
+
+
+def _instrument_and_wavefront() -> list[Breakage]:
+    return [
+        Breakage(
+            "sombrero", "the masks are the square of a jinc",
+            "torch.where(s < _SECOND_ZERO_OF_J1, jinc**2, 0.0)",
+            "torch.where(s < _SECOND_ZERO_OF_J1, jinc, 0.0)", "instrument parity_stpsf",
+        ),
+        Breakage(
+            "wedge-tilt", "the wedge's dispersion has the sign of the entrance pupil",
+            "3: float(-(tilt(", "3: float(+(tilt(", "instrument parity_stpsf",
+        ),
+        Breakage(
+            "mask-centre", "positions of masks count pixels from 0",
+            "return x - 1, y - 1", "return x, y", "instrument detector_pixels",
+        ),
+        Breakage(
+            "flight-struts", "pupil='flight' has the obscurations seen in flight",
+            '"flight": "flight_strut"', '"flight": "strut"', "instrument parity_stpsf",
+        ),
+        Breakage(
+            "quadrature", "condensed wavelengths keep the integrals of polynomials",
+            "nodes.tolist()), tuple((vectors[0] ** 2).tolist()))\n\n    @property",
+            "nodes.tolist()), tuple(abs(vectors[0]).tolist()))\n\n    @property", "bandpass",
+        ),
+        Breakage(
+            "drift-sign", "drift goes from the first map to the second",
+            'first + hours / to_number(interval', 'first - hours / to_number(interval', "opd",
+        ),
+        Breakage(
+            "sine-modes", "sums of modes are the modes that derivatives are of",
+            "torch.complex(pairs[:, 0], -pairs[:, 1])",
+            "torch.complex(pairs[:, 0], pairs[:, 1])", "bases",
+        ),
+        Breakage(
+            "map-before", "the rule 'before' takes the last map before the frames",
+            "before = max((each for each in maps if each[0] <= when)",
+            "before = min((each for each in maps if each[0] <= when)", "map_choice",
+        ),
+        Breakage(
+            "map-unit", "maps are converted to metres",
+            "data = raw * u.Unit(spelled).to(u.m)", "data = raw * u.Unit(spelled).to(u.um)",
+            "opd",
+        ),
+        Breakage(
+            "evidence", "scales of a prior are those of the highest evidence",
+            "determined = 1 - precision[others:] * variance[others:]",
+            "determined = precision[others:] * variance[others:]", "refinement recovery",
+        ),
+        Breakage(
+            "prior-weight", "the prior holds back modes that the data do not determine",
+            ".add_((1 + damping) * precision)", ".add_(1e-9 + damping * precision)",
+            "refinement recovery",
+        ),
+    ]  # fmt: skip
+
+
+def _frames_and_files() -> list[Breakage]:
+    return [
+        Breakage(
+            "planet-angle", "position angles are counter-clockwise from +y",
+            "math.degrees(math.atan2(-x, y))", "math.degrees(math.atan2(x, y))", "simulation",
+        ),
+        Breakage(
+            "roll-sign", "the sky turns on the detector against the telescope's roll",
+            "return other.position_angle - self.position_angle",
+            "return self.position_angle - other.position_angle", "observation",
+        ),
+        Breakage(
+            "header-roll", "the position angle of +y follows from ROLL_REF and V3I_YANG",
+            'angle = number("ROLL_REF", np.nan) - number(',
+            'angle = number("ROLL_REF", np.nan) + number(', "observation",
+        ),
+        Breakage(
+            "saturated", "saturated pixels are left out",
+            "BAD_PIXEL_BITS = 1 | 2 | 512 | 1024", "BAD_PIXEL_BITS = 1 | 512 | 1024",
+            "observation backend_jwst",
+        ),
+        Breakage(
+            "fits-pixels", "FITS counts pixels from 1",
+            "else np.array(star) - 1,", "else np.array(star),", "observation",
+        ),
+        Breakage(
+            "dither", "dithers off the mask are no dithers behind it",
+            "if 0 < np.hypot(x, y) < _BEHIND_THE_MASK else None",
+            "if 0 < np.hypot(x, y) else None", "observation",
+        ),
+        Breakage(
+            "read-noise", "simulated errors include the read noise",
+            "error = np.sqrt(np.maximum(counts, 0.0) + scene.read_noise**2)",
+            "error = np.sqrt(np.maximum(counts, 1.0))", "simulation",
+        ),
+        Breakage(
+            "far-noise", "the variance of the background is corrected, not its root",
+            "(ratio**2 - 1) * floor**2", "(ratio - 1) * floor**2", "noise",
+        ),
+        Breakage(
+            "unaligned", "shifts of aligned frames are undone, not doubled",
+            "shift_frames(np.nan_to_num(each), pixels - net)",
+            "shift_frames(np.nan_to_num(each), net - pixels)", "detector_pixels",
+        ),
+        Breakage(
+            "combined", "frames are averaged with inverse variances",
+            "np.where(self.valid, np.where(self.valid, self.error, 1.0) ** -2, 0.0)",
+            "np.where(self.valid, np.where(self.valid, self.error, 1.0) ** -1, 0.0)",
+            "observation",
+        ),
+        Breakage(
+            "other-mask", "frames behind another mask are no references",
+            '("CORONMSK", "PUPIL", "SUBARRAY", "DETECTOR")', '("PUPIL", "SUBARRAY", "DETECTOR")',
+            "sequence",
+        ),
+        Breakage(
+            "wcs", "east is left of north in the WCS of products",
+            "steps = np.array([[-cosine, sine], [sine, cosine]]) @ steps / 3600",
+            "steps = np.array([[cosine, sine], [-sine, cosine]]) @ steps / 3600",
+            "sky detection",
+        ),
+        Breakage(
+            "atomic", "a product is there whole or not at all",
+            "        yield temporary\n        if path.exists():",
+            "        temporary = path\n        yield temporary\n        if not path.exists():",
+            "files_units",
+        ),
+        Breakage(
+            "checksum", "files whose data changed are refused",
+            "if hdu.verify_datasum() == 0:", "if hdu.verify_datasum() is None:", "files_units",
+        ),
+        Breakage(
+            "masked", "masked values do not enter as numbers",
+            "np.ma.filled(value.astype(np.float64), np.nan)",
+            "np.ma.filled(value.astype(np.float64), 0.0)", "files_units quantities",
+        ),
+    ]  # fmt: skip
+
+
+def _fits() -> list[Breakage]:
+    return [
+        Breakage(
+            "template-roll", "planets turn with the sky from frame to frame",
+            "[[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]],\n",
+            "[[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]],\n",
+            "detection recovery",
+        ),
+        Breakage(
+            "absorbed", "errors include the uncertainty of the star",
+            "TemplateProducts(numerator, photon - absorbed, photon)",
+            "TemplateProducts(numerator, photon, photon)", "linear_model detection",
+        ),
+        Breakage(
+            "mismatch", "a fit that does not explain its data says so",
+            "return Status.CONVERGED if chi2 < _EXPLAINED else Status.MODEL_MISMATCH",
+            "return Status.CONVERGED", "refinement",
+        ),
+        Breakage(
+            "outliers", "hot pixels are left out, planets are not",
+            "_explained(model, k, pixel) > _BETTER * by_source)",
+            "_explained(model, k, pixel) < _BETTER * by_source)", "outliers",
+        ),
+        Breakage(
+            "no-map", "without a map the star's flux is uncertain by 40 %",
+            "return _UNTIED if fit.initial.data.any() else _WITHOUT_MAP", "return _UNTIED",
+            "star_flux",
+        ),
+        Breakage(
+            "pattern-place", "the pattern is matched on the detector's pixels",
+            "x, y = np.subtract(self.first_pixel, observation.first_pixel)",
+            "x, y = np.subtract(observation.first_pixel, self.first_pixel)", "systematics",
+        ),
+        Breakage(
+            "own-pattern", "the target's own frames are not in its pattern",
+            "patterns += [each for each in known if _plain(each.star) not in stars]",
+            "patterns += known", "systematics sequence",
+        ),
+        Breakage(
+            "pattern-size", "the size of a pattern is 1 where frames show it",
+            "return 1 + float(products.numerator) / information",
+            "return float(products.numerator) / information", "systematics sequence",
+        ),
+    ]  # fmt: skip
+
+
+def _detection() -> list[Breakage]:
+    return [
+        Breakage(
+            "sky-mirror", "east is left of north in tables",
+            "return np.array([[-cosine, sine], [sine, cosine]])",
+            "return np.array([[cosine, sine], [-sine, cosine]])", "sky",
+        ),
+        Breakage(
+            "small-sample", "limits near the star have the small-sample correction",
+            "stats.t.isf(stats.norm.sf(sigmas), self._freedom_at(separation))",
+            "stats.norm.isf(stats.norm.sf(sigmas), 0 * self._freedom_at(separation))",
+            "error_factor detection",
+        ),
+        Breakage(
+            "inner", "nothing is searched inside the smallest separation",
+            "(separation_of(grid) >= inner) & far_from(grid, sources, distance)",
+            "far_from(grid, sources, distance)", "detection search",
+        ),
+        Breakage(
+            "inflation", "errors grow with the square root of chi-squared",
+            "return math.sqrt(max(1.0, reduced * share))", "return max(1.0, reduced * share)",
+            "detection error_factor",
+        ),
+        Breakage(
+            "flux-error", "errors of contrasts include that of the star's flux",
+            "torch.hypot(errors[0], torch.full_like(errors[0], untied))", "errors[0]",
+            "detection star_flux",
+        ),
+        Breakage(
+            "injected-roll", "injected planets turn with the sky",
+            "x, y = star + planet.rotated(roll).offset",
+            "x, y = star + planet.rotated(-roll).offset", "recovery",
+        ),
+    ]  # fmt: skip
+
+
+def _around() -> list[Breakage]:
+    return [
+        Breakage(
+            "unregister", "unregister restores pyKLIP's code",
+            "        self._set(*self._saved)\n", "", "backend_contract backend",
+        ),
+        Breakage(
+            "injected-in-dataset", "companions added to a dataset reach the fit",
+            "data[i] += np.nan_to_num(align_and_scale(added, **shift))",
+            "np.nan_to_num(align_and_scale(added, **shift))", "backend_jwst",
+        ),
+        Breakage(
+            "pointings", "only frames of one orientation are averaged",
+            "                and abs(angle - angles[other]) <= _SAME_ANGLE\n", "",
+            "backend backend_refine",
+        ),
+        Breakage(
+            "library-frames", "frames marked as references are not the target's",
+            'header.get("IS_PSF", False)', 'header.get("IS_PSFS", False)', "backend_references",
+        ),
+        Breakage(
+            "tried-again", "failed jobs of a survey are tried again",
+            'return self.records.get(job.key, {}).get("status") == "finished"',
+            "return job.key in self.records", "survey",
+        ),
+        Breakage(
+            "job-content", "a survey notices frames whose content changed",
+            '"frames": sorted(inputs[str(path)] for path in files)',
+            '"frames": sorted(map(str, files))', "survey",
+        ),
+        Breakage(
+            "half-a-job", "a job without all of its products is not finished",
+            'whole = sizes == record["products"] and', 'whole = bool(sizes) and', "survey",
+        ),
+    ]  # fmt: skip
+
+
+BREAKAGES: tuple[Breakage, ...] = (
+    *_optics(), *_instrument_and_wavefront(), *_frames_and_files(), *_fits(), *_detection(),
+    *_around(),
+)  # fmt: skip
