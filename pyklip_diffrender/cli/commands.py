@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from contextlib import nullcontext, redirect_stdout
-from json import dumps, loads
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,17 +20,11 @@ from pyklip_diffrender.cli.run import Run
 from pyklip_diffrender.errors import IncompatibleSetupError
 
 if TYPE_CHECKING:
-    from pyklip_diffrender.io.opd_map import OPDMap
     from pyklip_diffrender.scene.sequence import Sequence
 
 __all__ = ["demo", "detect_in_file", "psf", "reduce_frames", "survey"]
 
 _DEMO = ("demo.fits", "demo.ecsv", "candidates.ecsv", "demo.png")
-_REDUCTION = (
-    "detection.fits", "candidates.ecsv", "contrast.ecsv", "fit.fits", "systematics.fits",
-    "astrometry.csv", "wide_field.fits", "wide_field_candidates.ecsv", "wide_field_contrast.ecsv",
-    "disk.fits", "injections.ecsv", "report.html", "summary.json", "detection.png",
-)  # fmt: skip
 
 
 @click.command(
@@ -108,9 +99,9 @@ def demo(
     cls=Command,
     epilog="""\b
 Examples:
-  pyklip-diffrender reduce frames --opd-folder maps -o products
+  pyklip-diffrender reduce frames --opd maps -o products
   pyklip-diffrender reduce frames --target G-7-34 --filter F444W --opd map.fits -o products
-  pyklip-diffrender reduce frames --opd-folder maps -o products --dry-run
+  pyklip-diffrender reduce frames --opd maps -o products --dry-run
   pyklip-diffrender reduce --program 1184 --target G-7-34 --filter F444W --opd map.fits -o out""",
 )
 @click.argument("frames", type=file_type(), nargs=-1)
@@ -145,7 +136,7 @@ def reduce_frames(
     cache: Path | None,
     **options: Any,
 ) -> None:
-    """Search all rolls of a target, with what its reference stars teach.
+    """Subtract the star from all rolls of a target and search for planets.
 
     FRAMES are calints files, or one folder of them. With --program they come from MAST.
     """
@@ -167,7 +158,9 @@ def reduce_frames(
             )
         return Sequence.from_files(files, target=target, filter=filter)
 
-    _reduction(run, read, **options)
+    from pyklip_diffrender.cli.reduction import run_reduction
+
+    run_reduction(run, read, **options)
 
 
 @click.command(
@@ -176,8 +169,8 @@ def reduce_frames(
     epilog="""\b
 Examples:
   pyklip-diffrender detect calints.fits --opd map.fits -o products
-  pyklip-diffrender detect calints.fits --opd-folder maps --opd-date before -o products
-  pyklip-diffrender detect calints.fits --opd-folder maps -o products --json | jq .sentence""",
+  pyklip-diffrender detect calints.fits --opd maps --opd-date before -o products
+  pyklip-diffrender detect calints.fits --opd maps -o products --json | jq .sentence""",
 )
 @click.argument("frames", type=file_type())
 @wavefront
@@ -185,7 +178,7 @@ Examples:
 @outputs()
 @click.pass_obj
 def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
-    """Search a single file.
+    """Subtract the star from a single file and search for planets.
 
     FRAMES is a calints file.
     """
@@ -201,7 +194,9 @@ def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
         observation = Observation.from_fits(frames)
         return Sequence(observation.target, (observation,))
 
-    _reduction(run, read, **options)
+    from pyklip_diffrender.cli.reduction import run_reduction
+
+    run_reduction(run, read, **options)
 
 
 @click.command(
@@ -282,78 +277,6 @@ def survey(run: Run, /, plan: Path, output: Path, scheduler: str | None) -> int:
     return run_survey(plan, output, scheduler, progress=run.progress)
 
 
-def _reduction(
-    run: Run,
-    read: Any,
-    *,
-    output: Path,
-    overwrite: bool,
-    json: bool,
-    dry_run: bool,
-    size: int,
-    threshold: float,
-    wide: bool,
-    disk: bool,
-    injections: int,
-    systematics: str,
-    star_flux: str | None,
-    star_flux_error: float,
-    memory: str | None,
-    opd: Path | None,
-    opd_folder: Path | None,
-    opd_date: str | None,
-) -> None:
-    """Reduce a sequence, write all products and say what they show."""
-    if (opd is not None) == (opd_folder is not None or opd_date is not None):
-        raise click.UsageError("Give either --opd FILE, or --opd-folder FOLDER or --opd-date.")
-    if dry_run and json:
-        raise click.UsageError("A --dry-run has no summary to print with --json.")
-    run.claim_folder(output, _REDUCTION, overwrite)
-    # Libraries may print, too.
-    with redirect_stdout(sys.stderr) if json else nullcontext():
-        sequence = read()
-        _show(sequence)
-        map_ = _map(sequence, opd, opd_folder, opd_date)
-        click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
-        if dry_run:
-            from pyklip_diffrender.cli.estimate import describe_plan
-
-            parts: dict[str, Any] = {"wide": wide, "disk": disk, "injections": injections}
-            parts["star_flux"] = star_flux is not None
-            click.echo(describe_plan(sequence, size, systematics, **parts))
-            return
-        from pyklip_diffrender.io.progress import stage
-        from pyklip_diffrender.reduction import reduce
-        from pyklip_diffrender.scene.systematics import Systematics
-
-        known: Any = systematics
-        if known not in ("auto", "references", "off"):
-            known = Systematics.read(known)
-        reduction = reduce(
-            sequence,
-            map_,
-            size=size,
-            systematics=known,
-            threshold=threshold,
-            wide=wide,
-            disk=disk,
-            injections=injections,
-            star_flux=star_flux,
-            star_flux_error=star_flux_error,
-            device=run.device,
-            memory=memory,
-            progress=run.progress,
-        )
-        with stage("4 of 4: products"):
-            written = reduction.write(output)
-        click.echo(f"\n{reduction}")
-        for path in written:
-            click.echo(f"wrote {path}")
-    if json:
-        summary = loads((output / "summary.json").read_text(encoding="utf-8"))
-        click.echo(dumps(summary, indent=2))
-
-
 def _is_to_fetch(program: int, target: str | None, filter: str | None, cache: Path | None) -> bool:
     """List the files of a programme; whether some of them would have to be fetched."""
     from pyklip_diffrender.archive import list_calints
@@ -365,36 +288,3 @@ def _is_to_fetch(program: int, target: str | None, filter: str | None, cache: Pa
     size = missing["size"].to_value("Mbyte").sum()
     click.echo(f"to fetch: {len(missing)} of {len(listing)} files, {size:.0f} MB")
     return len(missing) > 0
-
-
-def _show(sequence: Sequence) -> None:
-    click.echo("\n".join(sequence.table.pformat(max_lines=-1, max_width=-1)))
-    for name, reason in sequence.excluded:
-        click.echo(f"left out: {name}: {reason}")
-
-
-def _age(opd: OPDMap, sequence: Sequence) -> str:
-    """When a map was sensed, as an apposition."""
-    days = None if sequence.date is None else opd.days_after(sequence.date)
-    if opd.date is None or days is None:
-        return ""
-    side = "after" if days > 0 else "before"
-    return f", sensed {opd.date.isot[:16]}, {abs(days):.1f} days {side} the frames"
-
-
-def _map(sequence: Sequence, opd: Path | None, folder: Path | None, rule: str | None) -> OPDMap:
-    """The wavefront map that the options ask for."""
-    from pyklip_diffrender.wavefront.map_choice import choose_map
-    from pyklip_diffrender.wavefront.opd import as_opd_map
-    from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
-
-    if opd is not None:
-        return as_opd_map(str(opd))
-    date, rule = sequence.date, rule or "nearest"
-    if date is None:
-        raise IncompatibleSetupError(
-            "the frames have no date (DATE-BEG) to choose a wavefront map by; give one with --opd"
-        )
-    if folder is not None:
-        return choose_map(folder, date, rule)  # type: ignore[arg-type]
-    return load_wss_opd_by_date(date, "closest" if rule == "nearest" else rule)
