@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         wide_field,
     )
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+    from pyklip_diffrender.instrument.star_flux import star_flux_density
     from pyklip_diffrender.linear.model import LinearModel
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pattern import known_systematics, learn_systematics
@@ -100,6 +101,7 @@ __all__ = [
     "refine",
     "register",
     "simulate",
+    "star_flux_density",
     "survey",
     "unregister",
     "wide_field",
@@ -110,6 +112,7 @@ _NAMES = {
     "bridges": "from_poppy from_webbpsf",
     "detection": "Detection Disk WideField contrast_curve detect fit_disk measure wide_field",
     "instrument.nircam": "nircam_coronagraph",
+    "instrument.star_flux": "star_flux_density",
     "linear.model": "LinearModel",
     "optics.system": "OpticalSystem",
     "planning": "Plan plan",

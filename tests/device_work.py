@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
-from pyklip_diffrender.linear.responses import Responses
+from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement import GaussNewton, Refinement
-from pyklip_diffrender.refinement.gauss_newton import Solver
 from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.solver import Solver
 from pyklip_diffrender.wavefront.bases import FourierModes
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
@@ -156,7 +156,7 @@ def response(device: Any, **changes: object) -> list[Array]:
     model = model_on(device, **changes)
     values = {name: value.cpu() for name, value in tensors(model).items()}
     start = torch.as_tensor(opd(), device=device)
-    responses = Responses(model, BASIS, npix=NPIX // 2)
+    responses = ResponseCache(model, BASIS, npix=NPIX // 2)
     with torch.no_grad():
         fields = model.fields(start, **values)
     names = ("star_offset", "lyot_shift", "blur")

@@ -19,10 +19,10 @@ from pyklip_diffrender.refinement.accurate_step import (
     accurate_step,
     conjugate_gradients,
 )
-from pyklip_diffrender.refinement.gauss_newton import Solver
 from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.solver import Solver
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
@@ -72,7 +72,7 @@ def solver_of(frames: int, **changes: object) -> tuple[Solver, State]:
 def gradient(solver: Solver, state: State, *, exact: bool) -> Tensor:
     """Minus half the derivative of chi-squared."""
     if exact:
-        weights = solver.objective.weights(state, 0.01, 4.0)
+        weights = solver.objective.errors(state, 0.01, 4.0)
         return ModelDerivatives(solver.objective, state, weights).gradient()
     equations = linearise(solver.objective, state, 0.01, len(BASIS), 4.0)
     return equations.gradient - equations.curvature @ equations.current
@@ -84,7 +84,7 @@ def test_the_gradient_is_that_of_chi_squared(frames: int) -> None:
     solver, state = solver_of(frames)
     assert solver.objective.shares_pattern == (frames > 1)
     objective, layout = solver.objective, state.joint
-    weights = objective.weights(state, 0.01, 4.0)
+    weights = objective.errors(state, 0.01, 4.0)
     exact, coarse = (gradient(solver, state, exact=value) for value in (True, False))
     names = [unknown.name for unknown in layout.unknowns()]
     assert {*FREE, "amplitude", "modes"} <= set(names)
@@ -122,7 +122,7 @@ def test_the_gradient_by_companions_is_that_of_chi_squared() -> None:
     solver = of_the_model_itself(solver)
     objective = solver.objective
     state = objective.at(*state.joint.with_companions([dr.Planet(3e-3, 0.4, 20.0)], state.vector))
-    weights = objective.weights(state, 0.01, 4.0)
+    weights = objective.errors(state, 0.01, 4.0)
     exact = gradient(solver, state, exact=True)
     where = state.joint.where("companions")
     for place, step in zip(range(where.start, where.stop), (1e-6, 1e-4, 1e-4), strict=True):
@@ -157,7 +157,7 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> No
     step = 0.01 * unit * torch.from_numpy(rng.normal(size=len(unit)))
     curved, products = [], []
     for each in (solver, same):
-        weights = each.objective.weights(state, 0.01, 4.0)
+        weights = each.objective.errors(state, 0.01, 4.0)
         equations = linearise(each.objective, state, 0.01, len(BASIS), 4.0)
         curved.append(unit * ModelDerivatives(each.objective, state, weights).product(step))
         products.append(unit * (equations.curvature @ step))
@@ -171,11 +171,11 @@ def test_an_accurate_step_ends_where_that_of_the_model_does(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """In as many iterations as are needed, whatever the coarse copy that preconditions them."""
-    monkeypatch.setattr(accurate, "_ITERATIONS", 60)
+    monkeypatch.setattr(accurate, "_ITERATIONS", 20)
     monkeypatch.setattr(accurate, "_SUFFICIENT", 0.0)
     solver, state = solver_of(1)
     same = of_the_model_itself(solver)
-    weights = solver.objective.weights(state, 0.01, 4.0)
+    weights = solver.objective.errors(state, 0.01, 4.0)
     deviation = solver.prior_deviation(state.joint)
     coarse, fine = (
         linearise(each.objective, state, 0.01, len(BASIS), 4.0) for each in (solver, same)
@@ -250,7 +250,7 @@ def count_linearisations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         calls.append(int(bool(arguments[5])))
         return linearise(*arguments)
 
-    monkeypatch.setattr("pyklip_diffrender.refinement.gauss_newton.linearise", counted)
+    monkeypatch.setattr("pyklip_diffrender.refinement.solver.linearise", counted)
     return calls
 
 
@@ -260,7 +260,7 @@ def test_accurate_steps_keep_their_equations(monkeypatch: pytest.MonkeyPatch) ->
     solver, state = solver_of(1, relinearise=0.1, accurate_steps=True, robust=4.0)
     # Of the model itself: one iteration is enough with equations of nearly the same state.
     solver = of_the_model_itself(solver)
-    weights = solver.objective.weights(state, 0.01, 4.0)
+    weights = solver.objective.errors(state, 0.01, 4.0)
     before = solver._cost(state, weights)
     after, _ = solver._accurate_step(state, 0.01, len(BASIS))
     assert solver._cost(after, weights) < 0.9 * before
@@ -293,7 +293,7 @@ def test_equations_that_lead_nowhere_are_replaced(monkeypatch: pytest.MonkeyPatc
         step, settled = right(*arguments, **options)
         return (step if calls else -step), settled
 
-    monkeypatch.setattr("pyklip_diffrender.refinement.gauss_newton.accurate_step", wrong)
+    monkeypatch.setattr("pyklip_diffrender.refinement.solver.accurate_step", wrong)
     last, gain = solver._accurate_step(after, 0.01, len(BASIS))
     assert calls == [0]
     assert gain > 0

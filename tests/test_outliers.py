@@ -7,11 +7,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-import torch
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement import annealing, refine_again
+from pyklip_diffrender.refinement import refine_again
 
 SIZE, NPIX, SCENE = 32, 64, 5
 PIXEL = (9, 21)
@@ -62,16 +61,6 @@ def here(*, row: float = PIXEL[0], column: float = PIXEL[1], contrast: float) ->
     return dr.Planet.from_offset(contrast, float(x), float(y))
 
 
-@pytest.fixture
-def trusting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fits that take all pixels for good ones."""
-    monkeypatch.setattr(
-        annealing,
-        "isolated_outliers",
-        lambda objective, state, linear: [torch.zeros(SIZE, SIZE, dtype=torch.bool)],
-    )
-
-
 def test_a_hot_pixel_is_no_planet() -> None:
     frame = spoiled(shot(), 25.0)
     before = frame.data.copy(), frame.valid.copy()
@@ -81,13 +70,6 @@ def test_a_hot_pixel_is_no_planet() -> None:
     assert fit.reduced_chi2 == pytest.approx(1.0, abs=0.15)
     np.testing.assert_array_equal(frame.data, before[0])
     np.testing.assert_array_equal(frame.valid, before[1])
-
-
-@pytest.mark.usefixtures("trusting")
-def test_it_would_be_one() -> None:
-    table = dr.detect(fitted(spoiled(shot(), 25.0))).table
-    separation = np.hypot(*here(contrast=1.0).offset)
-    assert table["separation"][0].value == pytest.approx(separation, abs=0.1)
 
 
 def test_the_star_is_fitted_without_a_dead_pixel() -> None:
@@ -120,11 +102,12 @@ def test_a_bright_companion_of_the_fit_keeps_its_core() -> None:
     ("name", "shift", "contrast"),
     [
         ("F444W", (0.0, 0.0), 2e-6),
-        ("F444W", (0.5, 0.3), 1e-4),
         # An image that is hardly wider than a pixel.
         ("F250M", (0.0, 0.0), 2e-6),
-        ("F250M", (0.0, 0.0), 1e-4),
-        ("F250M", (0.25, 0.25), 1e-4),
+        # Fits that do not have the planet take many steps.
+        pytest.param("F444W", (0.5, 0.3), 1e-4, marks=pytest.mark.slow),
+        pytest.param("F250M", (0.0, 0.0), 1e-4, marks=pytest.mark.slow),
+        pytest.param("F250M", (0.25, 0.25), 1e-4, marks=pytest.mark.slow),
     ],
 )
 def test_planets_are_kept(name: str, shift: tuple[float, float], contrast: float) -> None:

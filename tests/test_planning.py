@@ -23,7 +23,6 @@ from pyklip_diffrender.errors import (
     ShapeError,
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.instrument.spectrum import filter_bandpass
 from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.linear.response import coarse_copy, coarse_npix, downsample
 from pyklip_diffrender.optics.bandpass import Bandpass
@@ -32,7 +31,7 @@ from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import Economy, ModelError, Option, Plan, coarse_steps, plan, probes
 from pyklip_diffrender.planning.noise_model import RidgeResidual
-from pyklip_diffrender.planning.systems import CheapSystem, quadrature
+from pyklip_diffrender.planning.systems import CheapSystem
 from pyklip_diffrender.planning.trial import PROBED, START, Trial
 from pyklip_diffrender.refinement import Adam, GaussNewton, refine
 from pyklip_diffrender.scene.objects import Planet, Scene, Star
@@ -208,22 +207,6 @@ def test_data_far_from_the_model_widen_the_prior() -> None:
 
 
 # -- systems -------------------------------------------------------------------------------------
-
-
-def test_quadrature_keeps_the_moments() -> None:
-    given = filter_bandpass("F444W", 12)
-    few = quadrature(given, 4)
-    assert len(few.wavelengths) == 4
-    assert min(given.wavelengths) < min(few.wavelengths)
-    assert max(few.wavelengths) < max(given.wavelengths)
-    for power in range(8):
-        exact, found = (
-            np.dot(band.weights, (np.array(band.wavelengths) / 4.4e-6) ** power)
-            for band in (given, few)
-        )
-        assert found == pytest.approx(exact, rel=1e-10)
-    assert quadrature(given, 12) is given
-    assert quadrature(given, 1).wavelengths[0] == pytest.approx(given.mean_wavelength)
 
 
 def test_a_cheap_system_keeps_its_wavelengths_in_copies() -> None:

@@ -30,8 +30,8 @@ from pyklip_diffrender.refinement import (
     GaussNewton,
     Refinement,
     Status,
-    gauss_newton,
     refine,
+    solver,
 )
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import (
@@ -634,13 +634,13 @@ def test_derivatives_from_far_away_do_not_end_a_fit(monkeypatch: pytest.MonkeyPa
         counts, np.sqrt(np.maximum(counts, 0) + 42.0**2), pixelscale=system.detector.pixelscale
     )
     prior = WavefrontPrior({"segment": 20.0, "texture": 20.0}, fit_scales=False)
-    right, calls = gauss_newton.accurate_step, []
+    right, calls = solver.accurate_step, []
 
     def recorded(*arguments: Any) -> tuple[torch.Tensor, bool]:
         calls.append(relinearise)
         return right(*arguments)
 
-    monkeypatch.setattr(gauss_newton, "accurate_step", recorded)
+    monkeypatch.setattr(solver, "accurate_step", recorded)
     chi2 = []
     for relinearise in (0.3, 0.02):
         settings = GaussNewton(

@@ -18,7 +18,7 @@ from pyklip_diffrender.linear.last_pupil import LastPupil
 from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
 from pyklip_diffrender.linear.response import WavefrontResponse, coarse_copy, downsample
-from pyklip_diffrender.linear.responses import Responses
+from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
@@ -125,7 +125,7 @@ def test_responses_that_are_not_stored_are_the_same(
     fields = model.fields(start, **values)
     images = {}
     for memory in (math.inf, 8 * len(basis) * 20 * 24, 100.0):
-        responses = Responses(model, basis, npix=64, keep=2, memory=memory)
+        responses = ResponseCache(model, basis, npix=64, keep=2, memory=memory)
         near, far = (
             responses.near(shifted, values)
             for shifted in (start, start + 2e-7 * model.entrance.lit)
@@ -189,7 +189,7 @@ def test_frames_share_derivatives_that_follow(
     """Two frames a few mas apart need one response; a star far from there needs its own."""
     model, start = system(npix=64, fov_pixels=(44, 48)), downsample(opd, 64)
     basis = FourierModes(3)
-    responses = Responses(model, basis, npix=64, keep=3)
+    responses = ResponseCache(model, basis, npix=64, keep=3)
     moved = {**values, "star_offset": values["star_offset"] + torch.tensor([0.008, 0.0])}
     far = {**values, "star_offset": values["star_offset"] + torch.tensor([0.05, 0.0])}
     first = responses.near(start, values)
@@ -223,7 +223,7 @@ def test_an_aberration_in_front_of_the_occulter_is_not_followed(
         other = copy.copy(model)
         other.planes = planes
         assert ("si_zernikes" in other.parameters_behind) is follows
-        responses = Responses(other, FourierModes(3), npix=64, keep=2, relinearise=0.01)
+        responses = ResponseCache(other, FourierModes(3), npix=64, keep=2, relinearise=0.01)
         first = responses.near(start, values)
         assert (responses.near(start, moved) is first) is follows
 

@@ -16,18 +16,30 @@ import os
 import re
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import traceback
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from benchmarks.breakages.catalogue import BREAKAGES, Breakage
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "pyklip_diffrender"
 PARTS = (PACKAGE, "benchmarks", "docs", "examples", "tests", "*.toml", "*.md", "*.cff")
+LIBRARIES = (
+    "torch", "scipy.stats", "scipy.optimize", "astropy.table", "astropy.wcs", "matplotlib.pyplot",
+    "photutils.aperture", "poppy", "pyklip.klip", "pyklip.fm", "hypothesis", "xdist", "pytest",
+)  # fmt: skip
+"""Imported once, because that takes longer than most tests."""
 TOO_LONG = 3600
 """Seconds after which tests that hang count as a failure."""
+
+Result = dict[str, Any]
+"""What became of a breakage: the test that noticed it or None, the stage, and the CPU time."""
 
 
 def place_of(breakage: Breakage, root: Path) -> Path:
@@ -65,40 +77,78 @@ def copy_of(root: Path, folder: Path) -> Path:
 
 def failing_test(copy: Path, arguments: list[str]) -> str | None:
     """Return the first quick test that fails, None if all pass."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider"]
-    environment = {
-        **os.environ, "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1",
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }  # fmt: skip
-    try:
-        done = subprocess.run(
-            [*command, *arguments], cwd=copy, env=environment, capture_output=True, text=True,
-            check=False, timeout=TOO_LONG,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return "(no end)"
-    if done.returncode == 0:
+    report = copy / "pytest.txt"
+    process = os.fork()
+    if process == 0:
+        with report.open("wb") as file:
+            os.dup2(file.fileno(), 1)
+            os.dup2(file.fileno(), 2)
+            signal.alarm(TOO_LONG)
+            code = 3
+            try:
+                code = run_pytest(copy, arguments)
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                # Nothing of the parent's is done twice, such as removing the copy.
+                sys.stderr.flush()
+                os._exit(code)
+    code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+    if code == 0:
         return None
-    if done.returncode != 1 and "error" not in done.stdout:
-        sys.exit(f"pytest cannot run: {done.stdout[-2000:]}{done.stderr[-2000:]}")
-    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-    return failed[1].removeprefix("tests/") if failed else "(collection)"
+    text = report.read_text(encoding="utf-8")
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", text, re.MULTILINE)
+    if failed and code == 1:
+        return failed[1].removeprefix("tests/")
+    if code == -signal.SIGALRM:
+        return "(no end)"
+    if "not found:" in text:
+        return None  # The test of an earlier run is no more.
+    # An error while tests are collected or pytest starts is one that nobody overlooks.
+    return "(collection)"
 
 
-def judge(breakage: Breakage, copy: Path, likely_only: bool) -> dict[str, object]:
-    """Break the copy, test it, and mend it."""
+def run_pytest(copy: Path, arguments: list[str]) -> int:
+    """Run the tests of the copy in this process, which has the libraries but not the package."""
+    os.chdir(copy)
+    os.environ |= {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    sys.dont_write_bytecode = True
+    sys.path[:] = [str(copy), *(each for each in sys.path if Path(each or ".").resolve() != ROOT)]
+    for name in [each for each in sys.modules if each.split(".")[0] == "benchmarks"]:
+        del sys.modules[name]
+    import pytest
+
+    return int(pytest.main(["-x", "-q", "-n0", "-p", "no:cacheprovider", *arguments]))
+
+
+def judge(breakage: Breakage, copy: Path, before: str | None, likely_only: bool) -> Result:
+    """Break the copy, test it, and mend it.
+
+    Parameters
+    ----------
+    breakage : Breakage
+    copy : Path
+    before : str or None
+        The test that noticed it in an earlier run, which is run first.
+    likely_only : bool
+        Leave out the test files that are not named with the breakage.
+    """
     path = place_of(breakage, copy)
     whole = path.read_text(encoding="utf-8")
     began = resource.getrusage(resource.RUSAGE_CHILDREN)
     likely = [f"tests/test_{name}.py" for name in breakage.tests.split()]
     likely = [name for name in likely if (copy / name).is_file()]
-    stage = "likely files"
+    stages = {"likely files": likely} if likely else {}
+    if before and (copy / "tests" / before.split("::")[0]).is_file():
+        stages = {"test of an earlier run": [f"tests/{before}"], **stages}
+    if not likely_only:
+        stages["all quick tests"] = ["tests", *(f"--ignore={name}" for name in likely)]
+    caught, stage = None, ""
     try:
         path.write_text(whole.replace(breakage.old, breakage.new), encoding="utf-8")
-        caught = failing_test(copy, likely) if likely else None
-        if caught is None and not likely_only:
-            stage = "all quick tests"
-            caught = failing_test(copy, ["tests", *(f"--ignore={name}" for name in likely)])
+        while stages and not caught:
+            stage = next(iter(stages))
+            caught = failing_test(copy, stages.pop(stage))
     finally:
         path.write_text(whole, encoding="utf-8")
     ended = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -106,7 +156,7 @@ def judge(breakage: Breakage, copy: Path, likely_only: bool) -> dict[str, object
     return {"caught": caught, "stage": stage, "cpu_seconds": round(seconds, 1)}
 
 
-def table(results: dict[str, dict[str, object]]) -> str:
+def table(results: dict[str, Result]) -> str:
     """Markdown, with the number caught."""
     lines = ["| breakage | property | noticed by | CPU, s |", "|---|---|---|---|"]
     known = [(each, results[each.name]) for each in BREAKAGES if each.name in results]
@@ -126,6 +176,9 @@ def main() -> int:
     names = [each.name for each in BREAKAGES]
     parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help="some of them")
     parser.add_argument("--record", type=Path, help="JSON file to add results to, and go on from")
+    parser.add_argument(
+        "--again", action="store_true", help="also what is recorded, the same test first"
+    )
     parser.add_argument("--root", type=Path, default=ROOT, help="checkout; default this one")
     parser.add_argument("--likely-only", action="store_true", help="not the rest of the tests")
     parser.add_argument("--check", action="store_true", help="only look for the texts")
@@ -135,17 +188,21 @@ def main() -> int:
         place_of(breakage, options.root)
     if options.check:
         return 0
-    results: dict[str, dict[str, object]] = {}
+    os.environ |= {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    for name in LIBRARIES:
+        import_module(name)
+    results: dict[str, Result] = {}
     if options.record and options.record.exists():
         results = json.loads(options.record.read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory(prefix="breakages-") as folder:
         copy = copy_of(options.root.resolve(), Path(folder))
         for breakage in chosen:
-            known = results.get(breakage.name)
-            enough = options.likely_only or (known and known["stage"] == "all quick tests")
-            if known and (known["caught"] or enough):
+            known = results.get(breakage.name, {})
+            enough = options.likely_only or known.get("stage") == "all quick tests"
+            if known and (known["caught"] or enough) and not options.again:
                 continue
-            results[breakage.name] = judge(breakage, copy, options.likely_only)
+            before = known.get("caught")
+            results[breakage.name] = judge(breakage, copy, before, options.likely_only)
             print(breakage.name, results[breakage.name], flush=True)
             if options.record:
                 text = json.dumps(results, indent=1) + "\n"

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.bridges.orientation import Orientation
+from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.optics.differentiation import Cache, Position, cached, position_of
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.planes import EntrancePupil, Plane, Values, Wavefront, phase_factor
@@ -80,12 +81,7 @@ class OrientedPupil(EntrancePupil):
         self.orientation = orientation
         self.pointing = torch.tensor(pointing, dtype=torch.float64, device=device)
         self.chromatic = {w: extra.to(device) for w, extra in (chromatic or {}).items()}
-        angle = math.radians(-turned)
-        self._tilt = torch.tensor(
-            [[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]],
-            dtype=torch.float64,
-            device=device,
-        )
+        self._tilt = torch.from_numpy(rotation_matrix(-turned).T.copy()).to(device)
 
     def on_window(self, maps: Tensor) -> Tensor:
         """See `EntrancePupil.on_window`; the maps have the frame of the entrance pupil."""

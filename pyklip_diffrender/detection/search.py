@@ -30,7 +30,7 @@ from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.tables import measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import ARCSEC, to_arcsec
+from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["contrast_curve", "detect", "measure"]
@@ -157,7 +157,7 @@ def detect(
             separations,
             [error[*ring] for ring in rings],
             [photon[*ring] for ring in rings],
-            _resolution(fits[0]),
+            fits[0].model.resolution,
             factor,
             Sky.of(fits).star_jansky,
         ),
@@ -305,7 +305,7 @@ def contrast_curve(
         separations,
         errors,
         photon,
-        _resolution(fits[0]),
+        fits[0].model.resolution,
         ErrorFactor.constant(scatter),
         Sky.of(fits).star_jansky,
     )
@@ -426,7 +426,7 @@ def _error_factor(
     least = error_inflation(fits, maps.groups, offsets)
     if explained and not fits[0].frames[0].observation.is_nircam:
         return ErrorFactor.constant(least)
-    measured = scatter_profile(snr, maps.grid, offsets, inner, _resolution(fits[0]))
+    measured = scatter_profile(snr, maps.grid, offsets, inner, fits[0].model.resolution)
     return measured.at_least(least)
 
 
@@ -436,8 +436,3 @@ def _without_weakest(
     """The other candidates, fitted again."""
     weakest = int(candidates.snr(factor).argmin())
     return refine_candidates(groups, candidates.without(weakest), pixel / 2, _STEPS)
-
-
-def _resolution(fit: Refinement) -> float:
-    """lambda/D, arcsec."""
-    return fit.model.bandpass.mean_wavelength / fit.model.diameter / ARCSEC

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.fast.point_sources import PointSources
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -83,12 +84,7 @@ class Templates:
 
     def _turned(self, k: int, offsets: Tensor) -> Tensor:
         """Positions in frame k, from the star, of positions in the first frame."""
-        angle = math.radians(self.rolls[k])
-        turn = torch.tensor(
-            [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]],
-            dtype=torch.float64,
-        )
-        return offsets @ turn.T
+        return offsets @ torch.from_numpy(rotation_matrix(self.rolls[k])).T
 
     def _points(self, k: int, right: int = 0, up: int = 0) -> PointSources:
         """Sources of frame k, `right` and `up` in `_FINE` parts of a pixel off the centres."""

@@ -16,6 +16,7 @@ from scipy.ndimage import convolve, map_coordinates
 from scipy.signal import fftconvolve
 
 from pyklip_diffrender.detection.field import Image, separation_of
+from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.refinement.frame_fit import pixel_grid
 from pyklip_diffrender.scene.observation import Observation
@@ -195,8 +196,7 @@ class WholeFrame:
 
     @property
     def _turn(self) -> NDArray[np.float64]:
-        angle = math.radians(self.roll)
-        return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        return rotation_matrix(self.roll)
 
     def on_first(self, grid: Image, image: Image) -> tuple[Image, Image]:
         """`products` at the positions of the first frame's pixels; 0 outside this frame."""

@@ -57,8 +57,8 @@ _COVERED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class _Source:
-    """A source as measured: contrast, x and y, their variances, reduced chi-squared."""
+class _Measurement:
+    """Contrast, x and y of a source, their variances, and the reduced chi-squared."""
 
     values: Image
     variance: Image
@@ -324,7 +324,7 @@ def _search(
     grid: Image,
     threshold: float,
     detection: Detection,
-) -> tuple[Image, list[_Source], ErrorFactor]:
+) -> tuple[Image, list[_Measurement], ErrorFactor]:
     """Information of contrasts, the sources, and the error factor.
 
     The highest peak is fitted and subtracted, until none is left: sources have side lobes.
@@ -333,7 +333,7 @@ def _search(
     distance = separation_of(grid)
     inner = float(distance[outer].min())
     known = detection.candidates.offsets
-    sources: list[_Source] = []
+    sources: list[_Measurement] = []
     while True:
         images = [frame.residual - frame.light(*_light_of(sources)) for frame in frames]
         products = [f.on_first(grid, image) for f, image in zip(frames, images, strict=True)]
@@ -364,13 +364,13 @@ def _search(
     return information, _refined(frames, sources), factor
 
 
-def _light_of(sources: Sequence[_Source]) -> tuple[Image, Image]:
+def _light_of(sources: Sequence[_Measurement]) -> tuple[Image, Image]:
     """Positions (k, 2) and contrasts (k,)."""
     values = np.array([each.values for each in sources]).reshape(-1, 3)
     return values[:, 1:], values[:, 0]
 
 
-def _refined(frames: Sequence[WholeFrame], sources: list[_Source]) -> list[_Source]:
+def _refined(frames: Sequence[WholeFrame], sources: list[_Measurement]) -> list[_Measurement]:
     """Fit every source once more, with all others subtracted."""
     for k, source in enumerate(sources):
         others = _light_of([*sources[:k], *sources[k + 1 :]])
@@ -382,7 +382,7 @@ def _refined(frames: Sequence[WholeFrame], sources: list[_Source]) -> list[_Sour
 
 def _measured(
     frames: Sequence[WholeFrame], images: Sequence[Image], offset: Image, contrast: float
-) -> _Source | None:
+) -> _Measurement | None:
     """Fit a source in every frame and average; None if it is in none of them."""
     fits = [f.photometry(i, offset, contrast) for f, i in zip(frames, images, strict=True)]
     usable = [each for each in fits if each is not None]
@@ -390,14 +390,14 @@ def _measured(
         return None
     weights = np.array([errors**-2.0 for _, errors, _ in usable])
     values = np.array([each for each, _, _ in usable])
-    return _Source(
+    return _Measurement(
         (weights * values).sum(axis=0) / weights.sum(axis=0),
         weights.sum(axis=0) ** -1.0,
         float(np.mean([chi2 for _, _, chi2 in usable])),
     )
 
 
-def _candidates(sources: Sequence[_Source]) -> Candidates:
+def _candidates(sources: Sequence[_Measurement]) -> Candidates:
     places, contrasts = _light_of(sources)
     variance = np.array([each.variance for each in sources]).reshape(-1, 3)
     return replace(

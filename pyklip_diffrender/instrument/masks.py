@@ -10,7 +10,14 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 
-__all__ = ["ROUND_MASKS", "RoundMask", "filter_shift", "mask_center", "require_mask_and_filter"]
+__all__ = [
+    "ROUND_MASKS",
+    "RoundMask",
+    "filter_shift",
+    "mask_center",
+    "mask_of_header",
+    "require_mask_and_filter",
+]
 
 _SECOND_ZERO_OF_J1 = 7.015586669815619
 
@@ -119,6 +126,14 @@ def require_mask_and_filter(mask: str | None, name: str) -> RoundMask:
         f"filter: got {name!r} with image mask {mask!r}, which do not go together. Legal "
         f"combinations are {legal}"
     )
+
+
+def mask_of_header(value: object) -> str:
+    """Return the name of an image mask, as ``CORONMSK`` has it, without the module: MASK335R.
+
+    Headers name NIRCam's module A with the mask: MASKA335R.
+    """
+    return str(value).strip().upper().replace("MASKA", "MASK")
 
 
 # J. Leisenring's measurements in flight, as in spaceKLIP's resources crpix_jarron.json and

@@ -19,9 +19,9 @@ from pyklip_diffrender.instrument.aberrations import (
     parity_in_y,
 )
 from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
-from pyklip_diffrender.instrument.masks import ROUND_MASKS, require_mask_and_filter
+from pyklip_diffrender.instrument.masks import ROUND_MASKS, RoundMask, require_mask_and_filter
 from pyklip_diffrender.instrument.spectrum import filter_bandpass, filter_throughput
-from pyklip_diffrender.io.units import to_metres, to_number, to_pair
+from pyklip_diffrender.io.units import Bound, to_metres, to_number, to_pair
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.detector_effects import ChainDetector, PixelCrosstalk
@@ -175,103 +175,16 @@ def nircam_coronagraph(
     >>> tuple(model().shape)
     (24, 24)
     """
-    if monochromatic is not None:
-        monochromatic = to_number(monochromatic, u.m, "monochromatic", "positive")
-    if fov_arcsec is not None:
-        fov_arcsec = to_number(fov_arcsec, u.arcsec, "fov_arcsec", "positive")
-    if pixelscale is not None:
-        pixelscale = to_pair(pixelscale, u.arcsec, "pixelscale", "positive")
-    if segment_gap is not None:
-        segment_gap = to_number(segment_gap, u.m, "segment_gap", "not negative")
-    if chromatic_reference is not None:
-        chromatic_reference = to_number(chromatic_reference, u.m, "chromatic_reference", "positive")
-    if not isinstance(source, tuple):
-        source = to_number(source, u.K, "source", "positive")
-    if not isinstance(si_wfe, bool | Tensor):
-        si_wfe = to_metres(si_wfe, "si_wfe")
-    recipe: dict[str, Any] = {k: v for k, v in locals().items() if k != "recipe"}
-    recipe["defaults"] = dict(defaults or {})  # A copy, because the caller may change theirs.
+    recipe = _in_plain_numbers(dict(locals()))
     mask = require_mask_and_filter(image_mask, filter)
-    if pupil_mask not in ("MASKRND", None):
-        raise IncompatibleSetupError(
-            f"pupil_mask: got {pupil_mask!r}, expected 'MASKRND' or None. Other stops come through "
-            "from_webbpsf"
-        )
-    if crosstalk and mask.short_wave:
-        raise IncompatibleSetupError(
-            f"crosstalk: the embedded kernels are those of the long-wave detector NRCA5, and "
-            f"{filter} is a short-wave filter; use crosstalk=False"
-        )
-    wavelengths, _ = filter_throughput(filter)
-    if monochromatic is None:
-        bandpass = filter_bandpass(filter, nlambda, source)
-    else:
-        low, high = float(wavelengths[0]), float(wavelengths[-1])
-        if not low <= monochromatic <= high:
-            raise IncompatibleSetupError(
-                f"monochromatic: {monochromatic:.4g} m is outside {filter} ({low:.4g} to "
-                f"{high:.4g} m). Wavelengths are in metres"
-            )
-        bandpass = Bandpass((float(monochromatic),), (1.0,))
-    if dtype not in (torch.float32, torch.float64):
-        raise IncompatibleSetupError(f"dtype: got {dtype}, expected torch.float32 or float64")
-
-    scale = to_pair(mask.pixelscale if pixelscale is None else pixelscale, u.arcsec, "pixelscale")
-    shape = _field_of_view(fov_pixels, fov_arcsec, scale)
-    field = max(shape[1] * scale[0], shape[0] * scale[1])
-    needed = samples_for_field(field, min(bandpass.wavelengths))
-    if npix < needed:
-        raise IncompatibleSetupError(
-            f"npix: got {npix} samples across the pupil, whose image repeats inside the field of "
-            f"{field:.3g} arcsec; expected npix at least {needed}, or a smaller field"
-        )
-    torch_device = torch.device(device)
-    planes: list[Plane] = []
-    if image_mask is not None:
-        planes.append(
-            CompactOcculter(
-                mask.complement,
-                mask.radius,
-                occulter_sampling,
-                JWST_DIAMETER,
-                dtype,
-                torch_device,
-                name=mask.name,
-            )
-        )
-    if pupil_mask is not None:
-        planes.append(
-            LyotStop(maskrnd_openings(), npix, JWST_DIAMETER, dtype, torch_device, name=pupil_mask)
-        )
-    if si_wfe is not False:
-        coefficients = internal_wavefront_error(mask.name, flip_si_wfe)
-        if si_wfe is not True:
-            coefficients = torch.as_tensor(si_wfe, dtype=torch.float64)
-            if not flip_si_wfe:
-                coefficients = coefficients * parity_in_y(len(coefficients))
-        chromatic = ChromaticAberration(
-            chromatic_reference or bandpass.mean_wavelength, mask.short_wave
-        )
-        planes.append(
-            InternalAberration(
-                coefficients,
-                JWST_DIAMETER,
-                dtype,
-                torch_device,
-                chromatic,
-                name="NIRCam internal WFE",
-            )
-        )
-    detector = Detector(shape, scale, oversample, dtype, torch_device, shear)
-    if crosstalk:
-        effects = PixelCrosstalk(_IPC_NRCA5), PixelCrosstalk(_PPC_NRCA5)
-        detector = ChainDetector(
-            shape, scale, oversample, dtype, torch_device, shear, on_pixels=effects
-        )
-    entrance = _pupil(npix, segment_gap, pupil).to(torch_device)
+    _require_supported(mask, recipe)
+    bandpass = _bandpass(recipe)
+    detector = _detector(mask, recipe)
+    _require_samples(npix, detector, bandpass)
+    amplitude = _pupil(npix, recipe["segment_gap"], pupil).to(detector.device)
     return OpticalSystem(
-        EntrancePupil(entrance, JWST_DIAMETER, dtype, name="JWST pupil"),
-        planes,
+        EntrancePupil(amplitude, JWST_DIAMETER, dtype, name="JWST pupil"),
+        _planes(mask, bandpass, recipe),
         detector,
         bandpass,
         recipe=recipe,
@@ -279,6 +192,131 @@ def nircam_coronagraph(
         route=route,
         defaults=defaults,
     )
+
+
+def _in_plain_numbers(recipe: dict[str, Any]) -> dict[str, Any]:
+    """The arguments with lengths in m, angles in arcsec and temperatures in K."""
+    bounds: tuple[tuple[str, u.UnitBase, Bound], ...] = (
+        ("monochromatic", u.m, "positive"),
+        ("fov_arcsec", u.arcsec, "positive"),
+        ("segment_gap", u.m, "not negative"),
+        ("chromatic_reference", u.m, "positive"),
+    )
+    for name, unit, bound in bounds:
+        if recipe[name] is not None:
+            recipe[name] = to_number(recipe[name], unit, name, bound)
+    if recipe["pixelscale"] is not None:
+        recipe["pixelscale"] = to_pair(recipe["pixelscale"], u.arcsec, "pixelscale", "positive")
+    if not isinstance(recipe["source"], tuple):
+        recipe["source"] = to_number(recipe["source"], u.K, "source", "positive")
+    if not isinstance(recipe["si_wfe"], bool | Tensor):
+        recipe["si_wfe"] = to_metres(recipe["si_wfe"], "si_wfe")
+    recipe["defaults"] = dict(recipe["defaults"] or {})  # The caller may change theirs.
+    return recipe
+
+
+def _require_supported(mask: RoundMask, recipe: Mapping[str, Any]) -> None:
+    if recipe["pupil_mask"] not in ("MASKRND", None):
+        raise IncompatibleSetupError(
+            f"pupil_mask: got {recipe['pupil_mask']!r}, expected 'MASKRND' or None. Other stops "
+            "come through from_webbpsf"
+        )
+    if recipe["crosstalk"] and mask.short_wave:
+        raise IncompatibleSetupError(
+            f"crosstalk: the embedded kernels are those of the long-wave detector NRCA5, and "
+            f"{recipe['filter']} is a short-wave filter; use crosstalk=False"
+        )
+    if recipe["dtype"] not in (torch.float32, torch.float64):
+        raise IncompatibleSetupError(
+            f"dtype: got {recipe['dtype']}, expected torch.float32 or float64"
+        )
+
+
+def _bandpass(recipe: Mapping[str, Any]) -> Bandpass:
+    name, monochromatic = recipe["filter"], recipe["monochromatic"]
+    if monochromatic is None:
+        return filter_bandpass(name, recipe["nlambda"], recipe["source"])
+    wavelengths, _ = filter_throughput(name)
+    low, high = float(wavelengths[0]), float(wavelengths[-1])
+    if not low <= monochromatic <= high:
+        raise IncompatibleSetupError(
+            f"monochromatic: {monochromatic:.4g} m is outside {name} ({low:.4g} to "
+            f"{high:.4g} m). Wavelengths are in metres"
+        )
+    return Bandpass((monochromatic,), (1.0,))
+
+
+def _detector(mask: RoundMask, recipe: Mapping[str, Any]) -> Detector:
+    scale = to_pair(recipe["pixelscale"] or mask.pixelscale, u.arcsec, "pixelscale")
+    shape = _field_of_view(recipe["fov_pixels"], recipe["fov_arcsec"], scale)
+    common = (
+        shape,
+        scale,
+        recipe["oversample"],
+        recipe["dtype"],
+        torch.device(recipe["device"]),
+        recipe["shear"],
+    )
+    if not recipe["crosstalk"]:
+        return Detector(*common)
+    return ChainDetector(
+        *common, on_pixels=(PixelCrosstalk(_IPC_NRCA5), PixelCrosstalk(_PPC_NRCA5))
+    )
+
+
+def _require_samples(npix: int, detector: Detector, bandpass: Bandpass) -> None:
+    (ny, nx), (x, y) = detector.shape, detector.pixelscale
+    field = max(nx * x, ny * y)
+    needed = samples_for_field(field, min(bandpass.wavelengths))
+    if npix < needed:
+        raise IncompatibleSetupError(
+            f"npix: got {npix} samples across the pupil, whose image repeats inside the field of "
+            f"{field:.3g} arcsec; expected npix at least {needed}, or a smaller field"
+        )
+
+
+def _planes(mask: RoundMask, bandpass: Bandpass, recipe: Mapping[str, Any]) -> list[Plane]:
+    """The planes between the entrance pupil and the detector: occulter, stop, aberration."""
+    dtype, device = recipe["dtype"], torch.device(recipe["device"])
+    planes: list[Plane] = []
+    if recipe["image_mask"] is not None:
+        sampling = recipe["occulter_sampling"]
+        planes.append(
+            CompactOcculter(
+                mask.complement, mask.radius, sampling, JWST_DIAMETER, dtype, device, mask.name
+            )
+        )
+    if recipe["pupil_mask"] is not None:
+        planes.append(
+            LyotStop(
+                maskrnd_openings(),
+                recipe["npix"],
+                JWST_DIAMETER,
+                dtype,
+                device,
+                recipe["pupil_mask"],
+            )
+        )
+    if recipe["si_wfe"] is not False:
+        reference = recipe["chromatic_reference"] or bandpass.mean_wavelength
+        planes.append(
+            InternalAberration(
+                _internal_coefficients(mask, recipe["si_wfe"], recipe["flip_si_wfe"]),
+                JWST_DIAMETER,
+                dtype,
+                device,
+                ChromaticAberration(reference, mask.short_wave),
+                name="NIRCam internal WFE",
+            )
+        )
+    return planes
+
+
+def _internal_coefficients(mask: RoundMask, si_wfe: bool | ArrayLike, flip: bool) -> Tensor:
+    if si_wfe is True:
+        return internal_wavefront_error(mask.name, flip)
+    coefficients = torch.as_tensor(si_wfe, dtype=torch.float64)
+    return coefficients if flip else coefficients * parity_in_y(len(coefficients))
 
 
 def _field_of_view(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-__all__ = ["LinearFrame", "Unknown", "pixel_pieces", "summed_rows"]
+__all__ = ["LinearFrame", "Unknown", "pixel_pieces"]
 
 _PIXELS = 1024
 """Number of pixels that are processed at a time, where there is a number for every unknown."""
@@ -57,7 +56,10 @@ class LinearFrame:
     first_mode : int
         Index of the first wavefront mode among the rows.
     common : Tensor, (ny, nx), float64
-        c of the pattern that the frames share, in the data's unit; 0 without one.
+        c of the pattern that the frames share, see `linear.noise`, in the data's unit; 0 without
+        one.
+    light : Tensor, (ny, nx), float64
+        Starlight, in the data's unit, to which the correlated error of the model is proportional.
     """
 
     residual: Tensor
@@ -67,6 +69,7 @@ class LinearFrame:
     drift: Tensor
     first_mode: int
     common: Tensor
+    light: Tensor
 
     def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
         """Sum values by row, (rows, k), to values by unknown, (size, k)."""
@@ -81,25 +84,10 @@ class LinearFrame:
         rows[self.first_mode : self.first_mode + len(self.drift)] += values[self.drift]
         return rows
 
-    def summed(self, images: Tensor) -> Tensor:
-        """This frame's part of the sum W c x over frames, for images x, (..., ny, nx)."""
-        return images * (self.weight**2 * self.common).to(images.dtype)
-
     def image(self, values: Tensor) -> Tensor:
         """Change of the image, (..., ny, nx), for changes of the unknowns, (size, ...)."""
         on_rows = self.of_unknowns(values).float()
         return torch.tensordot(on_rows, self.jacobian, dims=([0], [0])).double()
-
-
-def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Tensor:
-    """W c summed over frames with the derivative by every unknown, (unknowns, pixels), float32."""
-    total = torch.zeros(unknowns, frames[0].weight.numel(), dtype=torch.float32)
-    for frame in frames:
-        scale = frame.summed(torch.ones(())).flatten()
-        for pixels in pixel_pieces(total.shape[1]):
-            on_rows = frame.jacobian.flatten(1)[:, pixels] * scale[pixels]
-            total[:, pixels] += frame.onto_unknowns(on_rows, unknowns)
-    return total
 
 
 def pixel_pieces(pixels: int) -> list[slice]:

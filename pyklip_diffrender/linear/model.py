@@ -10,15 +10,8 @@ Cholesky factor of P + G G^T. The flux of a template p and its error are
 This marginalisation is in section 2.7 of C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes
 for Machine Learning" (2006). Unknowns are rows of G, pixels are columns.
 
-Frames of the same pixels of a detector share the error of its flat field. A pattern m_p with a
-Gaussian prior of width g_p multiplies the star s_fp of every frame f in pixel p. The noise of one
-pixel is therefore correlated between frames, with the covariance C = diag(1 / w_f^2) + g^2 s s^T.
-Its inverse is diagonal but for one term (the Sherman-Morrison formula):
-
-    C^-1 = W - W c c^T W,    c_f = s_f g / sqrt(1 + g^2 sum_f w_f^2 s_f^2),    W = diag(w_f^2).
-
-Every inner product above therefore loses the product of two images that are summed over frames
-with the weights W c. The frames' `common` is c.
+Where pixels share errors of the model, their noise has a covariance C, see `linear.noise`. G G^T
+then stands for J C^-1 J^T, with the derivatives J that are not whitened.
 """
 
 from __future__ import annotations
@@ -34,7 +27,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.linear.frames import LinearFrame, Unknown, pixel_pieces, summed_rows
+from pyklip_diffrender.linear.frames import LinearFrame, Unknown, pixel_pieces
+from pyklip_diffrender.linear.noise import (
+    UNCORRELATED,
+    CorrelatedError,
+    Noise,
+    curvature_of,
+    weighted_rows,
+)
 
 __all__ = ["LinearModel", "TemplateProducts"]
 
@@ -75,7 +75,9 @@ class LinearModel:
     mean, deviation : Tensor, (unknowns,)
         Mean and standard deviation of the priors; inf for no prior.
     curvature : Tensor, (unknowns, unknowns)
-        G G^T over all frames (J C^-1 J^T where they share a pattern), float64.
+        J C^-1 J^T over all frames, float64.
+    correlated : CorrelatedError
+        Size of the error of the model that neighbouring pixels share.
 
     Examples
     --------
@@ -96,6 +98,7 @@ class LinearModel:
     mean: Tensor
     deviation: Tensor
     curvature: Tensor
+    correlated: CorrelatedError = UNCORRELATED
 
     def __repr__(self) -> str:
         ny, nx = self.frames[0].residual.shape
@@ -108,24 +111,25 @@ class LinearModel:
         return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
-    def shares_pattern(self) -> bool:
-        """Whether the frames share a pattern of the detector."""
-        return any(bool((frame.common != 0).any()) for frame in self.frames)
+    def noise(self) -> Noise:
+        """Covariance of the noise of all frames."""
+        return Noise(
+            tuple(frame.weight for frame in self.frames),
+            tuple(frame.common for frame in self.frames),
+            tuple(frame.light for frame in self.frames),
+            self.correlated,
+        )
+
+    def with_correlated_error(self, error: CorrelatedError) -> LinearModel:
+        """Return the model with another size of the error that neighbouring pixels share."""
+        changed = replace(self, correlated=error)
+        curvature = curvature_of(changed.frames, changed.noise, len(self.vector))
+        return replace(changed, curvature=curvature)
 
     @cached_property
-    def _summed_rows(self) -> Tensor:
-        """W c summed over frames with the derivative by every unknown, (unknowns, pixels)."""
-        return summed_rows(self.frames, len(self.vector))
-
-    def _whitened(self, images: Mapping[int, Tensor]) -> dict[int, Tensor]:
-        """C^-1 x over w of images x by frame, (..., ny, nx), for all frames."""
-        whitened = {k: self.frames[k].weight * image for k, image in images.items()}
-        if self.shares_pattern:
-            total = sum(self.frames[k].summed(image) for k, image in images.items())
-            for k, frame in enumerate(self.frames):
-                shared = frame.weight * frame.common * total
-                whitened[k] = whitened[k] - shared if k in whitened else -shared
-        return whitened
+    def _weighted_rows(self) -> tuple[Tensor, ...]:
+        """J C^-1 over w of every frame, (unknowns, pixels), float32."""
+        return weighted_rows(self.frames, self.noise, len(self.vector))
 
     @cached_property
     def _scale(self) -> Tensor:
@@ -157,24 +161,45 @@ class LinearModel:
         It is small after a fit that has converged. The unknowns themselves may be far from the
         means of the priors, so that single precision would not do for them.
         """
-        gradient = -(self.vector - self.mean) / self.deviation**2
-        for frame in self.frames:
-            weighted = (frame.weight**2 * frame.residual).flatten()
-            on_rows = frame.jacobian.flatten(1) @ weighted.float()
-            gradient = gradient + frame.onto_unknowns(on_rows.double(), len(self.vector))
-        if self.shares_pattern:
-            total = torch.stack([frame.summed(frame.residual) for frame in self.frames]).sum(dim=0)
-            gradient = gradient - self._summed_rows.double() @ total.flatten()
+        residuals = {k: frame.residual[None] for k, frame in enumerate(self.frames)}
+        gradient = self._pulled(residuals)[:, 0] - (self.vector - self.mean) / self.deviation**2
         scaled = torch.cholesky_solve((gradient * self._scale)[:, None], self._factor)[:, 0]
         return scaled * self._scale
 
     @cached_property
     def cleaned(self) -> tuple[Tensor, ...]:
         """Sigma^-1 r of every frame, (ny, nx): the whitened residual of the most probable model."""
-        whitened = self._whitened(
+        whitened = self.noise.inverse(
             {k: frame.residual - frame.image(self.step) for k, frame in enumerate(self.frames)}
         )
         return tuple(whitened[k] for k in range(len(self.frames)))
+
+    @cached_property
+    def log_evidence(self) -> float:
+        """Logarithm of the evidence, up to a constant of the data, their noise and the unknowns.
+
+        Differences compare sizes of the correlated error.
+        """
+        images = [frame.residual - frame.image(self.step) for frame in self.frames]
+        offset = (self.vector + self.step - self.mean) / self.deviation
+        determinant = 2 * float((self._factor.diagonal() / self._scale).log().sum())
+        determinant += self.noise.log_determinant
+        return -0.5 * (self.noise.chi2(images) + float((offset**2).sum()) + determinant)
+
+    def _pulled(self, images: Mapping[int, Tensor]) -> Tensor:
+        """J C^-1 x of images x, (k, ny, nx) by frame, (unknowns, k), float64."""
+        size = len(self.vector)
+        total = torch.zeros(size, len(next(iter(images.values()))), dtype=torch.float64)
+        if self.correlated:
+            for k, image in images.items():
+                weighted = image * self.frames[k].weight.to(image.dtype)
+                total += (self._weighted_rows[k] @ weighted.flatten(1).T.float()).double()
+            return total
+        for k, weighted in self.noise.weighted(images).items():
+            frame = self.frames[k]
+            on_rows = frame.jacobian.flatten(1) @ weighted.flatten(1).T.to(frame.jacobian.dtype)
+            total += frame.onto_unknowns(on_rows.double(), size)
+        return total
 
     def projected(self, templates: Mapping[int, Tensor]) -> Tensor:
         """Projection L^-1 G p of templates onto the unknowns, with P + G G^T = L L^T.
@@ -191,24 +216,8 @@ class LinearModel:
         count = {len(t) for t in templates.values()}
         if len(count) != 1:
             raise ShapeError(f"templates: got {sorted(count)} of them, expected one number")
-        total = torch.zeros(len(self.vector), *count, dtype=torch.float64)
-        for k, images in templates.items():
-            frame = self.frames[k]
-            weighted = (images * (frame.weight**2).to(images.dtype)).flatten(1)
-            on_rows = frame.jacobian.flatten(1) @ weighted.T.to(frame.jacobian.dtype)
-            total += frame.onto_unknowns(on_rows.double(), len(self.vector))
-        if self.shares_pattern:
-            summed = self._summed(templates)
-            total -= (self._summed_rows @ summed.T.to(self._summed_rows.dtype)).double()
         return torch.linalg.solve_triangular(
-            self._factor, total * self._scale[:, None], upper=False
-        )
-
-    def _summed(self, templates: Mapping[int, Tensor]) -> Tensor:
-        """W c summed over frames with templates, (k, pixels)."""
-        return sum(
-            (self.frames[k].summed(images.double()).flatten(1) for k, images in templates.items()),
-            start=torch.zeros(()),
+            self._factor, self._pulled(templates) * self._scale[:, None], upper=False
         )
 
     def weigh(self, templates: Mapping[int, Tensor]) -> TemplateProducts:
@@ -230,13 +239,11 @@ class LinearModel:
         for start in range(0, total, _BATCH):
             part = {k: images[start : start + _BATCH] for k, images in templates.items()}
             absorbed = (self.projected(part) ** 2).sum(dim=0)
-            numerator, photon = torch.zeros_like(absorbed), torch.zeros_like(absorbed)
+            numerator = torch.zeros_like(absorbed)
             for k, images in part.items():
-                whitened = (images * self.frames[k].weight.to(images.dtype)).double()
-                numerator += torch.tensordot(whitened, self.cleaned[k], dims=2)
-                photon += (whitened**2).sum(dim=(1, 2))
-            if self.shares_pattern:
-                photon -= (self._summed(part) ** 2).sum(dim=1)
+                weighted = (images * self.frames[k].weight.to(images.dtype)).double()
+                numerator += torch.tensordot(weighted, self.cleaned[k], dims=2)
+            photon = (self.noise.whitened(part).double() ** 2).sum(dim=1)
             parts.append(TemplateProducts(numerator, photon - absorbed, photon))
         return TemplateProducts(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
@@ -263,20 +270,17 @@ class LinearModel:
             images[k] = -frame.image(change)
             if k in templates:
                 images[k] += templates[k].double()
-        return self._whitened(images)
+        return self.noise.inverse(images)
 
     def normal_equations(self, templates: Mapping[int, Tensor]) -> tuple[Tensor, Tensor]:
         """Return p_i . Sigma^-1 p_j and p_i . Sigma^-1 r of templates that are fitted together."""
         projected = self.projected(templates)
-        matrix = -projected.T @ projected
+        white = self.noise.whitened(templates).double()
+        matrix = white @ white.T - projected.T @ projected
         vector = torch.zeros(len(matrix), dtype=torch.float64)
         for k, images in templates.items():
-            whitened = (images.double() * self.frames[k].weight).flatten(1)
-            matrix += whitened @ whitened.T
-            vector += whitened @ self.cleaned[k].flatten()
-        if self.shares_pattern:
-            summed = self._summed(templates)
-            matrix -= summed @ summed.T
+            weighted = (images.double() * self.frames[k].weight).flatten(1)
+            vector += weighted @ self.cleaned[k].flatten()
         return matrix, vector
 
     def without(
@@ -316,19 +320,16 @@ class LinearModel:
             self.mean[remaining],
             self.deviation[remaining],
             self.curvature[remaining][:, remaining],
+            self.correlated,
         )
 
-    def _predictors(self, frame: LinearFrame) -> Tensor:
-        """L^-1 G of a frame with P + G G^T = L L^T, (unknowns, pixels), float64."""
-        basis = torch.empty(len(self.vector), frame.weight.numel(), dtype=torch.float64)
-        weight, shared = frame.weight.flatten(), (frame.weight * frame.common).flatten()
+    def _predictors(self, frame: int) -> Tensor:
+        """L^-1 J C^-1 over w of a frame with P + G G^T = L L^T, (unknowns, pixels), float64."""
+        basis = torch.empty(self._weighted_rows[frame].shape, dtype=torch.float64)
         for pixels in pixel_pieces(basis.shape[1]):
-            white = frame.jacobian.flatten(1)[:, pixels].double() * weight[pixels]
-            whitened = frame.onto_unknowns(white, len(self.vector))
-            if self.shares_pattern:
-                whitened -= self._summed_rows[:, pixels] * shared[pixels]
+            weighted = self._weighted_rows[frame][:, pixels].double()
             basis[:, pixels] = torch.linalg.solve_triangular(
-                self._factor, whitened * self._scale[:, None], upper=False
+                self._factor, weighted * self._scale[:, None], upper=False
             )
         return basis
 
@@ -349,10 +350,7 @@ class LinearModel:
         """
         part = self.frames[frame]
         ny, nx = part.residual.shape
-        precision = torch.ones(ny, nx, dtype=torch.float64)
-        if self.shares_pattern:
-            precision -= (part.weight * part.common) ** 2
-        basis = self._predictors(part).reshape(-1, ny, nx)
+        basis = self._predictors(frame).reshape(-1, ny, nx)
         residual = torch.full((ny, nx), torch.nan, dtype=torch.float64)
         deviation = residual.clone()
         for y in range(0, ny, size):
@@ -362,7 +360,8 @@ class LinearModel:
                 if not bool(counts.any()):
                     continue
                 inside = basis[:, window[0], window[1]][:, counts]
-                inverse = torch.diag(precision[window][counts]) - inside.T @ inside
+                inverse = self.noise.precision(frame, window)[counts.flatten()][:, counts.flatten()]
+                inverse = inverse - inside.T @ inside
                 covariance = torch.linalg.inv(inverse)
                 weight = part.weight[window][counts]
                 prediction_error = covariance @ self.cleaned[frame][window][counts] / weight

@@ -11,7 +11,8 @@ _CPU_BYTES = 3e6
 the C library returns their memory to the operating system, which has to clear it for the next."""
 
 _GPU_BYTES = 1e8
-"""The same on an accelerator, which needs many arrays at a time to be busy; not measured."""
+"""Bytes of one array of a batch on an accelerator, which needs many arrays at a time to be busy;
+not measured."""
 
 
 def batch_of(size: int, dtype: torch.dtype, device: torch.device) -> int:

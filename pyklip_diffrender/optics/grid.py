@@ -178,10 +178,7 @@ def resample(opd: NDArray[np.float64], npix: int, name: str = "opd") -> NDArray[
 def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
     """Fraction of each pixel's area that lies inside non-overlapping polygons.
 
-    The area is exact, whatever the grid, and differentiable in the vertices: every edge is cut
-    where it crosses pixel borders, each piece adds its signed area to its pixel and its height
-    to all pixels on its right (the scan-line accumulation of font rasterisers; by Green's
-    theorem the sum is the enclosed area).
+    The area is exact, whatever the grid, and differentiable in the vertices; see the notes.
 
     Parameters
     ----------
@@ -193,6 +190,26 @@ def polygon_coverage(polygons: list[Tensor], grid: PupilGrid) -> Tensor:
     -------
     Tensor, (rows, columns), float64
         Between 0 and 1.
+
+    Notes
+    -----
+    In units of pixels, let C(i, j) be the covered area of the pixel in row i, column j. By Green's
+    theorem the area of a polygon is the integral of x dy along its edges, and so is that of its
+    part to the left of any vertical line, with x cut off there. All edges are cut at the borders
+    of pixels (`_border_crossings`). A piece in pixel (i, j), from y1 to y2 with its middle at
+    x = j + f, is straight, so that of the strip between it and the right end of row i it bounds
+
+        (y1 - y2) (1 - f)   in the pixel (i, j) itself, a trapezium,
+        (y1 - y2)           in every pixel (i, j + 1), (i, j + 2), ... to its right,
+
+    for edges that run counter-clockwise. Summed over the pieces, areas outside the polygon
+    cancel. The second line needs no loop: each piece adds
+
+        D(i, j) += (y1 - y2) (1 - f),    D(i, j + 1) += (y1 - y2) f,
+
+    and C(i, j) = D(i, 0) + ... + D(i, j), a cumulative sum (the accumulation buffer of font
+    rasterisers). The derivative with respect to the vertices is that of the pieces' ends; the
+    integers i, j are constant except where a vertex crosses a border, where C is continuous.
     """
     rows, columns = grid.shape
     origin = torch.tensor([grid.columns[0], grid.rows[0]], dtype=torch.float64)

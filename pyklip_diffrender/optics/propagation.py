@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.io.units import require_finite, to_metres, to_unit, warn_of_rms
+from pyklip_diffrender.io.units import ARCSEC, require_finite, to_metres, to_unit, warn_of_rms
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.detector import Detector
 from pyklip_diffrender.optics.fast.path import LatticeRoute
@@ -94,6 +94,11 @@ class Propagation:
     def diameter(self) -> float:
         """Side of the pupil array, m."""
         return self.entrance.full.diameter
+
+    @property
+    def resolution(self) -> float:
+        """lambda/D at the mean wavelength, arcsec."""
+        return self.bandpass.mean_wavelength / self.diameter / ARCSEC
 
     @property
     def dtype(self) -> torch.dtype:

@@ -156,7 +156,7 @@ class OpticalSystem(Propagation):
         return frozenset(names if self._is_sampled else {*names, "bandpass"})
 
     def with_fidelity(self, **changes: Any) -> OpticalSystem:
-        """The same system with other numerical settings, such as ``npix=256``.
+        """Return a copy of the system with other numerical settings, such as ``npix=256``.
 
         Parameters
         ----------
@@ -189,7 +189,7 @@ class OpticalSystem(Propagation):
         return system if bandpass is None else system.at_wavelengths(bandpass)
 
     def at_wavelengths(self, bandpass: Bandpass) -> OpticalSystem:
-        """The same system with another bandpass.
+        """Return a copy of the system with another bandpass.
 
         The planes and their cached results are shared. `with_fidelity` of the result keeps the
         bandpass.

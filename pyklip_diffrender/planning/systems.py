@@ -6,7 +6,6 @@ import copy
 from collections.abc import Sequence
 from typing import Any, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +15,7 @@ from pyklip_diffrender.optics.planes import Values
 from pyklip_diffrender.optics.system import OpticalSystem, Value
 from pyklip_diffrender.planning.choice import Choice
 
-__all__ = ["CheapSystem", "build", "coarse_steps", "quadrature"]
+__all__ = ["CheapSystem", "build", "coarse_steps"]
 
 
 class CheapSystem(OpticalSystem):
@@ -104,28 +103,7 @@ def coarse_steps(
         return coarse.stepping_from(model.fields(opd), downsample(opd, npix), {})
 
 
-def quadrature(bandpass: Bandpass, count: int) -> Bandpass:
-    """Replace the wavelengths by `count` nodes of their Gauss quadrature.
-
-    The nodes integrate polynomials up to degree 2 `count` - 1 exactly as the original wavelengths
-    do (G. Golub and J. Welsch, Math. Comp. 23, 221, 1969). A bandpass without more wavelengths
-    than `count` is returned unchanged.
-    """
-    wavelengths = np.array(bandpass.wavelengths)
-    if count >= len(wavelengths):
-        return bandpass
-    low, high = wavelengths.min(), wavelengths.max()
-    middle, half = (high + low) / 2, (high - low) / 2
-    x = (wavelengths - middle) / half
-    # Polynomials at these wavelengths, orthonormal under their weights. In this basis,
-    # multiplication by x is a matrix whose eigenvalues are the nodes.
-    powers = np.polynomial.chebyshev.chebvander(x, count - 1)
-    basis, _ = np.linalg.qr(np.sqrt(np.array(bandpass.weights))[:, None] * powers)
-    nodes, vectors = np.linalg.eigh(basis.T @ (x[:, None] * basis))
-    return Bandpass(tuple((middle + half * nodes).tolist()), tuple((vectors[0] ** 2).tolist()))
-
-
 def build(model: OpticalSystem, choice: Choice) -> CheapSystem:
     """The system of a choice, without the constant that makes it exact at one wavefront."""
     base = model if choice.npix == model.npix else model.with_fidelity(npix=choice.npix)
-    return CheapSystem(base, quadrature(model.bandpass, choice.wavelengths))
+    return CheapSystem(base, model.bandpass.condensed(choice.wavelengths))

@@ -167,8 +167,7 @@ class FittedPointing:
     @property
     def resolution(self) -> float:
         """lambda/D, arcsec."""
-        model = self.frame.model
-        return float(model.bandpass.mean_wavelength / model.diameter / ARCSEC)
+        return self.frame.model.resolution
 
     def _rendered(self, box: Window, source: tuple[float, float] | None) -> Image:
         x, y = self.pointing.observation.center[0] + self.away - (box.x, box.y)

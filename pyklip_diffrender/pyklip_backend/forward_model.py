@@ -139,7 +139,7 @@ def planet_in_frames(
     for result in dict.fromkeys(pointing.result for pointing in pointings):
         parts = [pointing for pointing in pointings if pointing.result is result]
         sources = [
-            _Source.of(
+            _PlanetImage.of(
                 fm_class,
                 part,
                 float(angles[part.pointing.frames[0]]),
@@ -175,7 +175,7 @@ def _light(fm_class: Any, frames: NDArray[np.intp], wavelength: float) -> NDArra
 
 
 @dataclass(frozen=True, eq=False)
-class _Source:
+class _PlanetImage:
     """A planet in one pointing.
 
     Attributes
@@ -183,7 +183,7 @@ class _Source:
     offset : ndarray, (2,)
         x, y in pixels from the star.
     image : ndarray, (ny, nx)
-        It in the frames, as bright as the star; NaN where there is no model.
+        Image of the planet in the frames, as bright as the star; NaN where there is no model.
     scale : float
         Light of the user's PSF over that of `image`.
     """
@@ -201,7 +201,7 @@ class _Source:
         wavelength: float,
         flipx: bool,
         filtered: Filter | None,
-    ) -> _Source:
+    ) -> _PlanetImage:
         """Place the planet, and compare its image with the user's PSF at the same place."""
         direction = np.radians(90.0 + (-1 if flipx else 1) * fm_class.pa - angle)
         offset = fm_class.sep * np.array([np.cos(direction), np.sin(direction)])
@@ -244,7 +244,7 @@ class _Source:
 def _change_of_star(
     result: Refinement,
     parts: Sequence[FittedPointing],
-    sources: Sequence[_Source],
+    sources: Sequence[_PlanetImage],
     factors: Sequence[float],
 ) -> list[NDArray[np.float64]]:
     """Light of the planet that the fit takes for star, on the fitted square of every pointing."""
@@ -260,7 +260,7 @@ def _change_of_star(
     return [part.change_of_star(change) for part in parts]
 
 
-def _is_companion(result: Refinement, part: FittedPointing, source: _Source) -> bool:
+def _is_companion(result: Refinement, part: FittedPointing, source: _PlanetImage) -> bool:
     """Whether the planet is one of the companions of the fit, within lambda/D."""
     if not len(result.companions):
         return False

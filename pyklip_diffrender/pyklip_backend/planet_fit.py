@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from astropy.io import fits
 
+from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 
 if TYPE_CHECKING:
@@ -83,8 +84,7 @@ def planet_cards(
     # From arcsec along x and y to pixels, then as pyKLIP turns the frames; east is to the left.
     pixels = np.linalg.inv([[1.0, 0.0], [detector.shear, 1.0]])
     pixels /= np.array(detector.pixelscale)[:, np.newaxis]
-    cosine, sine = np.cos(np.radians(angle)), np.sin(np.radians(angle))
-    turn = np.array([[cosine, -sine], [sine, cosine]])
+    turn = rotation_matrix(angle)
     turn[0] *= 1 if flipx else -1
     place = turn @ (planet.offset + pixels @ moved)
     jacobian = turn @ pixels

@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
 
-from pyklip_diffrender.io.units import ARCSEC
-
 if TYPE_CHECKING:
     from pyklip_diffrender.detection.templates import Templates
     from pyklip_diffrender.optics.system import OpticalSystem
@@ -115,7 +113,7 @@ def _cores(model: OpticalSystem, places: NDArray[np.float64]) -> NDArray[np.floa
     """Gaussians narrower than an image of a source, about rows and columns (2, k): (k, ny, nx)."""
     detector = model.detector
     pixel = math.sqrt(math.prod(detector.pixelscale))
-    fwhm = _CORE * model.bandpass.mean_wavelength / model.diameter / ARCSEC / pixel
+    fwhm = _CORE * model.resolution / pixel
     y, x = (
         np.exp(-4 * math.log(2) * ((np.arange(count) - place[:, None]) / fwhm) ** 2)
         for count, place in zip(detector.shape, places, strict=True)

@@ -8,12 +8,13 @@ of an earlier step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.refinement.objective import Objective, State, Weights
+from pyklip_diffrender.linear.noise import Noise
+from pyklip_diffrender.refinement.objective import Objective, State
 
 __all__ = ["ModelDerivatives", "accurate_step", "conjugate_gradients"]
 
@@ -36,12 +37,12 @@ class ModelDerivatives:
     ----------
     objective : Objective
     state : State
-    weights : sequence of Weights
+    noise : Noise
         Of all frames.
     """
 
-    def __init__(self, objective: Objective, state: State, weights: Sequence[Weights]) -> None:
-        self._objective, self._state, self._weights = objective, state, weights
+    def __init__(self, objective: Objective, state: State, noise: Noise) -> None:
+        self._objective, self._state, self._noise = objective, state, noise
         self._levels = [
             forward.levels(point).double()
             for forward, point in zip(objective.forwards, state.points, strict=True)
@@ -49,27 +50,27 @@ class ModelDerivatives:
 
     def gradient(self) -> Tensor:
         """Minus half the derivative of chi-squared, (unknowns,)."""
-        return self._pull(self._objective.residuals(self._state))
+        return self._pull(dict(enumerate(self._objective.residuals(self._state))))
 
     def product(self, step: Tensor) -> Tensor:
         """Product of the curvature with a step, (unknowns,)."""
         state = self._state
         ahead = self._objective.at(state.joint, state.vector + _DIFFERENCE * step)
-        images = [
-            (after.total - before.total) / _DIFFERENCE
-            for after, before in zip(ahead.points, state.points, strict=True)
-        ]
+        images = {
+            k: (after.total - before.total) / _DIFFERENCE
+            for k, (after, before) in enumerate(zip(ahead.points, state.points, strict=True))
+        }
         return self._pull(images)
 
-    def _pull(self, images: Sequence[Tensor]) -> Tensor:
+    def _pull(self, images: Mapping[int, Tensor]) -> Tensor:
         """Product of the whitened Jacobian with images of all frames, which it whitens as well."""
         objective, joint = self._objective, self._state.joint
         total = torch.zeros(joint.size, dtype=torch.float64)
-        whitened = objective.whiten(images, self._weights)
+        whitened = self._noise.inverse(images)
         for k, (forward, point) in enumerate(
             zip(objective.forwards, self._state.points, strict=True)
         ):
-            pixels = self._weights[k].weight * whitened[k]
+            pixels = self._noise.weight[k] * whitened[k]
             layout, levels = point.unknowns, self._levels[k]
             of_frame = torch.zeros(len(point.vector), dtype=torch.float64)
             last = layout.where("companions").stop

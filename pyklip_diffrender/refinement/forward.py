@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.linear.response import coarse_copy, downsample
-from pyklip_diffrender.linear.responses import Responses
+from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.frame_layout import FrameLayout
@@ -66,11 +66,11 @@ class Forward:
     Parameters
     ----------
     problem : Problem
-    responses : Responses
+    responses : ResponseCache
         Of the model to the basis; shared by frames.
     """
 
-    def __init__(self, problem: Problem, responses: Responses) -> None:
+    def __init__(self, problem: Problem, responses: ResponseCache) -> None:
         self.problem, self.model = problem, problem.model
         self.basis, self.responses = responses.basis, responses
         self.coarse = coarse_copy(problem.model, responses.npix)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
+from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.scene.objects import Planet
 
@@ -112,8 +112,7 @@ class FrameLayout:
     @property
     def turn(self) -> Tensor:
         """Matrix from positions in the first frame to positions in this one, (2, 2)."""
-        cosine, sine = math.cos(math.radians(self.roll)), math.sin(math.radians(self.roll))
-        return torch.tensor([[cosine, -sine], [sine, cosine]], dtype=torch.float64)
+        return torch.from_numpy(rotation_matrix(self.roll))
 
     def prior_deviation(self) -> Tensor:
         """Prior standard deviations of all unknowns before the amplitude and the modes."""

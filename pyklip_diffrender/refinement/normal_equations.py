@@ -10,7 +10,8 @@ import torch
 from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
-from pyklip_diffrender.linear.frames import LinearFrame, summed_rows
+from pyklip_diffrender.linear.frames import LinearFrame
+from pyklip_diffrender.linear.noise import curvature_of, summed_rows
 from pyklip_diffrender.refinement.objective import Objective, State
 
 __all__ = ["NormalEquations", "linearise"]
@@ -28,9 +29,9 @@ class NormalEquations:
     robust : float
         Residual, in standard deviations, of half weight; inf for least squares.
     curvature : Tensor, (unknowns, unknowns)
-        G G^T, with the whitened Jacobian G; see `linear.model` for frames that share a pattern.
+        J C^-1 J^T, with the Jacobian J and the covariance C of the noise, see `linear.noise`.
     gradient : Tensor, (unknowns,)
-        G r, with the residual r at the starting values.
+        J C^-1 r, with the residual r at the starting values.
     current : Tensor, (unknowns,)
         Unknowns of the state minus their starting values.
     frames : tuple of LinearFrame
@@ -101,16 +102,18 @@ def linearise(
     curvature = torch.zeros(size, size, dtype=torch.float64)
     gradient = torch.zeros(size, dtype=torch.float64)
     frames = []
-    weights = objective.weights(state, kappa, robust)
+    noise = objective.errors(state, kappa, robust)
     residuals = objective.residuals(state)
-    whitened = objective.whiten(residuals, weights)
+    whitened = noise.inverse(dict(enumerate(residuals)))
     for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
-        residual, weight, common = (each.cpu() for each in (residuals[k], *weights[k]))
+        residual, weight, common, light = (
+            each.cpu() for each in (residuals[k], noise.weight[k], noise.common[k], noise.light[k])
+        )
         rendered = jacobians[k] if jacobians else forward.jacobian(point, modes)
         first = point.unknowns.where("modes").start
         rows = joint.rows(k)[: len(rendered)]
         drift = joint.drift_rows(k) if modes else torch.zeros(0, dtype=torch.int64)
-        frames.append(LinearFrame(residual, weight, rendered, rows, drift, first, common))
+        frames.append(LinearFrame(residual, weight, rendered, rows, drift, first, common, light))
         product, pulled = _accumulate(
             rendered.flatten(1), weight.flatten(), whitened[k].cpu().flatten()
         )
@@ -122,7 +125,9 @@ def linearise(
             gradient.index_add_(0, to, pulled[which])
             for onto, selection in ((rows, slice(None)), (drift, leading)):
                 curvature[to[:, None], onto] += product[which, selection]
-    if objective.shares_pattern:
+    if noise.correlated:
+        curvature = curvature_of(frames, noise.to_cpu(), size)
+    elif noise.shares_pattern:
         rows = summed_rows(frames, size)
         ones = torch.ones(rows.shape[1], dtype=torch.float64)
         curvature -= _accumulate(rows, ones, ones)[0]

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from pyklip_diffrender.linear.noise import UNCORRELATED, Noise
 from pyklip_diffrender.refinement.forward import Forward, Point
 from pyklip_diffrender.refinement.joint_layout import JointLayout
 from pyklip_diffrender.refinement.problem import Problem
 
-__all__ = ["Objective", "State", "Weights"]
+__all__ = ["Objective", "State"]
 
 
 _MAX_KAPPA = 10.0
@@ -43,21 +43,6 @@ class State:
         return self.points[0].unknowns.level("flux", self.points[0].vector)
 
 
-class Weights(NamedTuple):
-    """Weights of a frame's pixels, (ny, nx) each.
-
-    Attributes
-    ----------
-    weight : Tensor
-        1 / standard deviation; 0 where masked.
-    common : Tensor
-        c of the pattern that the frames share, see `linear.model`.
-    """
-
-    weight: Tensor
-    common: Tensor
-
-
 class Objective:
     """Compares states with the data of all frames.
 
@@ -73,12 +58,15 @@ class Objective:
     shares_pattern : bool
         Whether all frames show the same pixels of the detector, and the error of the systematics
         is therefore one unknown in all of them; otherwise it is noise of every frame.
+    correlated : CorrelatedError
+        Error of the model that neighbouring pixels share; none until it is set.
     """
 
     def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
         self.forwards = tuple(forwards)
         self.shares_pattern = _share_pattern([forward.problem for forward in self.forwards])
         self.robust = robust
+        self.correlated = UNCORRELATED
 
     @property
     def pixels(self) -> int:
@@ -107,8 +95,8 @@ class Objective:
         problem = self.forwards[frame].problem
         return torch.where(problem.valid, (problem.data - point.total) / sigma, 0.0)
 
-    def weights(self, state: State, kappa: float, robust: float) -> list[Weights]:
-        """Weights of all frames, made robust about a state.
+    def errors(self, state: State, kappa: float, robust: float) -> Noise:
+        """Noise of all frames, made robust about a state.
 
         Parameters
         ----------
@@ -128,14 +116,16 @@ class Objective:
                 # Outliers show against all errors, that of the pattern included.
                 residual = self.whitened(k, point, whole)
                 weight = weight * torch.rsqrt(1 + (residual / robust) ** 2)
-            weights.append(Weights(weight, torch.zeros_like(weight)))
-        if not self.shares_pattern:
-            return weights
-        error = self.forwards[0].problem.gain_error
-        light = [point.multiplied for point in state.points]
-        seen = sum((each.weight * s) ** 2 for each, s in zip(weights, light, strict=True))
-        scale = error / torch.sqrt(1 + error**2 * seen)
-        return [Weights(each.weight, s * scale) for each, s in zip(weights, light, strict=True)]
+            weights.append(weight)
+        common = [torch.zeros_like(weight) for weight in weights]
+        if self.shares_pattern:
+            error = self.forwards[0].problem.gain_error
+            light = [point.multiplied for point in state.points]
+            seen = sum((weight * s) ** 2 for weight, s in zip(weights, light, strict=True))
+            scale = error / torch.sqrt(1 + error**2 * seen)
+            common = [s * scale for s in light]
+        star = tuple(point.light.clamp(min=0.0) for point in state.points)
+        return Noise(tuple(weights), tuple(common), star, self.correlated)
 
     def residual(self, frame: int, point: Point) -> Tensor:
         """Data minus model; 0 where masked."""
@@ -146,38 +136,14 @@ class Objective:
         """Data minus model of all frames."""
         return [self.residual(k, point) for k, point in enumerate(state.points)]
 
-    def chi2(self, state: State, weights: Sequence[Weights]) -> float:
-        """Chi-squared of all frames, with the pattern that they share marginalised."""
-        residuals = self.residuals(state)
-        total = sum(
-            float(((each.weight * residual) ** 2).sum())
-            for each, residual in zip(weights, residuals, strict=True)
-        )
-        return total - float((self._summed(residuals, weights) ** 2).sum())
-
-    def whiten(self, images: Sequence[Tensor], weights: Sequence[Weights]) -> list[Tensor]:
-        """Images of all frames over their errors, with the pattern that they share marginalised.
-
-        Those of the residuals, times the weights, are minus half the derivative of chi-squared by
-        the rendered pixels.
-        """
-        summed = self._summed(images, weights)
-        return [
-            each.weight * (image - each.common * summed)
-            for each, image in zip(weights, images, strict=True)
-        ]
-
-    def _summed(self, images: Sequence[Tensor], weights: Sequence[Weights]) -> Tensor:
-        """What the images say of the pattern that the frames share; 0 if there is none."""
-        total = torch.zeros_like(images[0])
-        if self.shares_pattern:
-            for each, image in zip(weights, images, strict=True):
-                total += each.weight**2 * each.common * image
-        return total
+    def chi2(self, state: State, noise: Noise) -> float:
+        """Chi-squared of all frames, with the errors that pixels share marginalised."""
+        return noise.chi2(self.residuals(state))
 
     def chi2_per_pixel(self, state: State) -> float:
         """Chi-squared per pixel without a model error."""
-        return self.chi2(state, self.weights(state, 0.0, math.inf)) / self.pixels
+        noise = replace(self.errors(state, 0.0, math.inf), correlated=UNCORRELATED)
+        return self.chi2(state, noise) / self.pixels
 
     def model_error(self, state: State) -> float:
         """The model error kappa at which chi-squared per pixel is 1, at least 0 and at most 10."""

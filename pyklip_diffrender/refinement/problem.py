@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
+from pyklip_diffrender.instrument.masks import mask_of_header
 from pyklip_diffrender.io.units import to_number
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
@@ -196,8 +197,7 @@ def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
     for aspect, expected, actual in setups:
         if not isinstance(expected, str) or not isinstance(actual, str):
             continue
-        # Headers name the module with the mask.
-        if actual.strip().upper().replace("MASKA", "MASK") != expected.upper():
+        if mask_of_header(actual) != expected.upper():
             raise IncompatibleSetupError(
                 f"{observation.name}: these frames have {aspect} {actual}, the model {expected}. "
                 "Make the model for the frames, with nircam_coronagraph or from_webbpsf"

@@ -106,7 +106,7 @@ class GaussNewton:
         result do not include it where the noise explains the residual.
     relinearise : float
         Relative error of derivatives (radians of phase, rms over the pupil) beyond which the
-        response to the wavefront is recomputed, see `pyklip_diffrender.linear.responses.Responses`.
+        response to the wavefront is recomputed, see ``linear.response_cache``.
     accurate_steps : bool
         Follow a step that fails, gains less than expected or is the last by steps with derivatives
         of the model itself, see ``pyklip_diffrender.refinement.accurate_step``. Fits of bright

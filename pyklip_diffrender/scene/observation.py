@@ -19,6 +19,7 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
+from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import (
     native_float64,
@@ -311,8 +312,7 @@ class Observation:
         -------
         ndarray, (k, 2)
         """
-        turn = np.deg2rad(self.roll_from(other))
-        matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        matrix = rotation_matrix(self.roll_from(other))
         return np.reshape(places, (-1, 2)) @ matrix.T
 
     def cutout(self, size: int, *, first_pixel: tuple[int, int] | None = None) -> Observation:

@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.masks import ROUND_MASKS, mask_of_header
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.optics.grid import samples_for_field
@@ -80,9 +80,8 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
         "pixelscale": observation.pixelscale,
     }
     if observation.is_nircam:
-        # Headers name the module with the mask: MASKA335R.
         mask_name = str(observation.header.get("CORONMSK", "MASK335R")).strip().upper()
-        name = overrides.get("image_mask") or mask_name.replace("MASKA", "MASK")
+        name = overrides.get("image_mask") or mask_of_header(mask_name)
         if name not in ROUND_MASKS:
             raise IncompatibleSetupError(
                 f"{observation.name}: these frames have image mask {mask_name}, expected one of "

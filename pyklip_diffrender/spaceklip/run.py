@@ -15,7 +15,7 @@ from astropy.table import Table
 
 from pyklip_diffrender.detection import Detection, detect
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
-from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.masks import ROUND_MASKS, mask_of_header
 from pyklip_diffrender.io.units import require_bound
 from pyklip_diffrender.pyklip_backend.jwst_files import reduce_jwst_files
 from pyklip_diffrender.refinement import to_jansky, with_star_flux
@@ -187,7 +187,7 @@ def why_unsupported(table: Table) -> str | None:
     if "SCI" not in table["TYPE"]:
         return "it has no frames of a target (TYPE is SCI)"
     first = table[list(table["TYPE"]).index("SCI")]
-    mask = str(first["CORONMSK"]).upper().replace("MASKA", "MASK")
+    mask = mask_of_header(first["CORONMSK"])
     if first["INSTRUME"] != "NIRCAM" or first["EXP_TYPE"] != "NRC_CORON" or mask not in ROUND_MASKS:
         return (
             f"{first['INSTRUME']} {first['EXP_TYPE']} with mask {first['CORONMSK']}; only NIRCam's "

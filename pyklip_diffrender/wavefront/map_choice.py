@@ -41,7 +41,7 @@ _BROKEN = (
     OSError, EOFError, ValueError, TypeError, KeyError, zlib.error, fits.VerifyError,
     AstropyUserWarning,
 )  # fmt: skip
-"""What astropy raises for files that are cut or damaged; it only warns of some."""
+"""Exceptions, and the warning, that astropy raises for files that are cut or damaged."""
 
 _OUTDATED = 200.0
 """Days between a map and the frames above which a warning is given: the telescope is realigned

@@ -162,7 +162,7 @@ class EvidenceUpdate:
     log_evidence: float
 
     def in_units(self, unit: Tensor) -> EvidenceUpdate:
-        """The same in other units, of which `unit` make up one old unit, (parameters,)."""
+        """Return the prior in other units, of which `unit` make up one old unit, (parameters,)."""
         variance = None if self.variance is None else self.variance * unit**2
         return replace(self, step=self.step * unit, variance=variance)
 

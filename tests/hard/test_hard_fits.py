@@ -175,7 +175,7 @@ def test_the_jacobian_of_a_fit_matches_finite_differences_in_every_column() -> N
         step = STEPS[name]
         ends = [image({**at, label: at[label] + k * step}) for k in (1, -1)]
         slope = (ends[0] - ends[1]) / (2 * step)
-        # Responses are kept in single precision; areas of pixels that an edge of the Lyot stop
+        # ResponseCache are kept in single precision; areas of pixels that an edge of the Lyot stop
         # cuts are only once differentiable.
         limit = 2e-3 if name.startswith("lyot") else 1e-4
         # Piston, the first Zernike, has no slope but rounding.

@@ -1,17 +1,34 @@
 """A round occulter by convolution on a lattice aligned with the detector's samples.
 
-Behind an occulter of transmission t the field in the pupil is E - F^-1[(1 - t) F[E]]. Let L be the
-product of all planes that follow in the pupil. The field on the detector at x is
+Notation: E is the field in the pupil in front of the occulter, t the occulter's transmission, L the
+product of all planes behind it, F the transform from the pupil to the sky, * a convolution. Behind
+the occulter the field in the pupil is E - F^-1[(1 - t) F[E]] (`planes`). Behind L, on the detector,
 
-    A(x) = F[L E](x) - (cell / lambda) sum_c (1 - t)(c) F[E](c) F[L](x - c),
+    A = F[L (E - F^-1[(1 - t) F[E]])]
+      = F[L E] - F[L] * ((1 - t) F[E])                   a product in the pupil is a convolution
+    A(x) = F[L E](x) - (cell / lambda) sum_c F[L](x - c) (1 - t)(c) F[E](c),
 
-summed over the cells c of the disc of the mask. If the cells lie on the lattice of the detector's
-samples, or on a refinement of it, so do the differences x - c. The sum is then a small FFT
-convolution, without a transform back to the pupil. Pixels may be rectangular and sheared.
+summed over the cells c, of solid angle `cell`, in the disc of the mask. The terms:
 
-The sum is exact if the spectrum of 1 - t is zero at the frequencies that alias onto that of
-F[E] F[L]. The spectrum of a mask with an edge is not limited, so it is cut off on a finer lattice
-before the mask is sampled. The propagation plane by plane samples the mask directly.
+    F[L E](x)      matrix transform to the detector's samples             `LatticeRoute.field`
+    F[E](c)        matrix transform to the cells                          `OcculterLattice.focus`
+    (1 - t)(c)     times cell / lambda, once for all                      `OcculterLattice.blocked`
+    F[L](x - c)    matrix transform to all differences, once for a stop   `OcculterLattice.kernel`
+    sum_c          product of FFTs                                        `OcculterLattice.convolve`
+
+Differences. Along each axis let the samples be s apart and the cells h. Either s = h n (`cells` n
+per sample: the mask needs finer cells than the detector) or h = s p (`phases` p: the detector is
+oversampled). In the first case all x - c are multiples of h, and every n-th point of the
+convolution is a sample: its spectrum is folded n times before the inverse FFT. In the second case
+the samples of equal index modulo p form a lattice of spacing h of their own, each with a kernel of
+its own. Shear makes y depend on x and is part of the matrix transforms, so that pixels may be
+rectangular and sheared.
+
+Sampling. The sum over cells equals the integral if the spectrum of 1 - t vanishes at the
+frequencies that alias onto the band of F[E] F[L], up to (D_E + D_L) / 2 lambda < D / lambda. The
+spectrum of a mask with an edge does not vanish. It is cut off on a lattice `_FINER` times
+finer, by a windowed sinc (`_Axis.band_limiting`), before the mask is sampled; a change of 1 - t
+outside the band does not change A. The propagation plane by plane samples the mask directly.
 """
 
 from __future__ import annotations

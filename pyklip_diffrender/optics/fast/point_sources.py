@@ -1,10 +1,22 @@
 """Point sources at every detector pixel, by convolution on a lattice aligned with the pixels.
 
-A source at p tilts the wavefront in the pupil. The propagation (see `occulter`) needs F[E] at the
-cells c of the occulter and F[L E] at the samples x of the detector. For a source at p these are
-F[E](c - p) and F[L E](x - p). If cells, samples and sources are points of one lattice, so are all
-these differences. Both transforms are therefore computed only once, on larger parts of the lattice,
-and every source costs two small FFTs.
+In the notation of `occulter`, a source on the axis has the field
+
+    A(x) = F[L E](x) - sum_c K(x - c) B(c) F[E](c),     K = F[L],   B = (1 - t) cell / lambda.
+
+A source at p multiplies E by exp(-2 pi i p xi / lambda), which shifts its transforms by p:
+
+    A_p(x) = F[L E](x - p) - sum_c K(x - c) B(c) F[E](c - p).
+
+Mask and stop stay where they are, so K and B do not change. If samples x, cells c and sources p are
+points of one lattice, so are x - p and c - p. Both transforms are computed once, on the parts of
+the lattice that hold all differences: for n pixels of k samples, k (2 n - 1) differences x - p; for
+2 h + 1 cells, q per pixel, 2 h + 1 + q (n - 1) differences c - p. For each source, a window of the
+first and one of the second are cut out, and the sum is two FFTs of the size of the detector.
+
+Intensities are added over wavelengths, and binned to pixels in the end. Where B F[E](c - p) changes
+an image by a percent at most (far from the mask), the sum is left out, and all images are one
+array, shifted.
 """
 
 from __future__ import annotations

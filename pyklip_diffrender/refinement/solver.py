@@ -18,14 +18,15 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.linear.responses import Responses
+from pyklip_diffrender.linear.noise import Noise
+from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.refinement.accurate_step import ModelDerivatives, accurate_step
 from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.refinement.joint_layout import JointLayout
 from pyklip_diffrender.refinement.mode_priors import ModePriors
 from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
-from pyklip_diffrender.refinement.objective import Objective, State, Weights
+from pyklip_diffrender.refinement.objective import Objective, State
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.wavefront.bases import Basis
@@ -102,7 +103,7 @@ class Solver:
             )
         jacobians = 4.0 * len(problems) * (len(basis) + settings.prior.amplitude_modes(basis))
         jacobians *= math.prod(problems[0].observation.shape)
-        self._responses = responses = Responses(
+        self._responses = responses = ResponseCache(
             problems[0].model,
             basis,
             npix=settings.response_npix,
@@ -212,7 +213,7 @@ class Solver:
         )
         # New derivatives that fail show that the model is not linear, as do large steps.
         is_stale = may_repeat and self._responses.farthest > 0 and kappa < _FAR
-        weights = objective.weights(state, kappa, objective.robust)
+        noise = objective.errors(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else self.damping
         update = self._solve(layout, equations, fit_scales=fits_scales, damping=damping)
@@ -221,14 +222,14 @@ class Solver:
         if expected < self.settings.tolerance * objective.pixels:
             # The gain is too small for another linearisation.
             return None if may_repeat else (state, expected / objective.pixels)
-        before = self._cost(state, weights)
+        before = self._cost(state, noise)
         for _ in range(_TRIES):
             if self.damping != damping:
                 damping = self.damping
                 update = self._solve(layout, equations, damping=self.damping)
                 expected = self._predicted_gain(layout, equations, update.step)
             trial = self._moved(state, update.step - equations.current)
-            after = self._cost(trial, weights)
+            after = self._cost(trial, noise)
             if after < before:
                 ratio = (before - after) / expected
                 if is_stale and ratio < _POOR:
@@ -244,9 +245,9 @@ class Solver:
     def _accurate_step(self, state: State, kappa: float, modes: int) -> tuple[State, float]:
         """Take a step, or a part of it, with derivatives of the model itself."""
         objective = self.objective
-        weights = objective.weights(state, kappa, objective.robust)
-        before = self._cost(state, weights)
-        derivatives = ModelDerivatives(objective, state, weights)
+        noise = objective.errors(state, kappa, objective.robust)
+        before = self._cost(state, noise)
+        derivatives = ModelDerivatives(objective, state, noise)
         offset = state.vector - state.joint.initial()
         deviation = self.prior_deviation(state.joint)
         enough = self.settings.tolerance * objective.pixels / 2
@@ -263,7 +264,7 @@ class Solver:
             self._has_poor_equations = not settled
             for part in _PARTS:
                 trial = self._moved(state, part * step)
-                after = self._cost(trial, weights)
+                after = self._cost(trial, noise)
                 if after < before:
                     return trial, (before - after) / objective.pixels
             if equations.state is state:
@@ -354,6 +355,7 @@ class Solver:
             mean=layout.initial()[:count],
             deviation=self.prior_deviation(layout)[:count],
             curvature=equations.curvature,
+            correlated=self.objective.correlated,
         )
 
     def posterior(self, state: State) -> EvidenceUpdate:
@@ -394,14 +396,14 @@ class Solver:
         )
         return update.in_units(unit)
 
-    def _cost(self, state: State, weights: Sequence[Weights]) -> float:
+    def _cost(self, state: State, noise: Noise) -> float:
         """Penalised chi-squared.
 
         With weights that were made robust about the state before a step, a step that lowers it also
         lowers Cauchy's loss.
         """
         offset = (state.vector - state.joint.initial()) / self.prior_deviation(state.joint)
-        return self.objective.chi2(state, weights) + float((offset**2).sum())
+        return self.objective.chi2(state, noise) + float((offset**2).sum())
 
     def _predicted_gain(
         self, layout: JointLayout, equations: NormalEquations, step: Tensor

@@ -17,7 +17,7 @@ from pyklip_diffrender.linear.response import WavefrontResponse, coarse_copy, do
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.bases import Basis
 
-__all__ = ["Responses"]
+__all__ = ["ResponseCache"]
 
 _Derivatives = TypeVar("_Derivatives")
 
@@ -57,7 +57,7 @@ class _About:
     now: dict[str, Tensor]
 
 
-class Responses:
+class ResponseCache:
     """Cache of wavefront responses, and of derivatives with respect to other parameters.
 
     Parameters

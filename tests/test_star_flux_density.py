@@ -1,0 +1,97 @@
+"""A star's flux in a filter from its spectrum, against closed forms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import QTable, Table
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
+from pyklip_diffrender.instrument.spectrum import filter_throughput
+
+GRID = np.geomspace(1.0, 6.0, 400) * u.micron
+
+
+def rayleigh_jeans(wavelength: u.Quantity) -> u.Quantity:
+    return 2.0 * (wavelength / u.micron) ** -2 * u.Jy
+
+
+def expected(filter: str) -> float:
+    """The mean over photons, by a sum that shares no code with the package's."""
+    wavelength, throughput = filter_throughput(filter)
+    fine = np.linspace(wavelength[0], wavelength[-1], 20001)
+    weight = np.interp(fine, wavelength, throughput)
+    weight[weight < 0.01] = 0
+    flux = 2.0 * (fine * 1e6) ** -2
+    return float(np.trapezoid(flux * weight / fine, fine) / np.trapezoid(weight / fine, fine))
+
+
+def as_text(path: Path) -> Path:
+    np.savetxt(path / "star.txt", np.c_[GRID.value, rayleigh_jeans(GRID).value], header="um Jy")
+    return path / "star.txt"
+
+
+def as_ecsv(path: Path) -> Path:
+    table = QTable({"nu": GRID.to(u.THz, u.spectral()), "flux": rayleigh_jeans(GRID).to(u.mJy)})
+    table.write(path / "star.ecsv")
+    return path / "star.ecsv"
+
+
+def as_calspec(path: Path) -> Path:
+    flam = rayleigh_jeans(GRID).to(u.erg / u.s / u.cm**2 / u.AA, u.spectral_density(GRID))
+    columns = [
+        fits.Column("WAVELENGTH", "D", "ANGSTROMS", array=GRID.to_value(u.AA)),
+        fits.Column("FLUX", "D", "FLAM", array=flam.value),
+    ]
+    table = fits.BinTableHDU.from_columns(columns)
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(path / "star.fits")
+    return path / "star.fits"
+
+
+def as_photometry(path: Path) -> Path:
+    bands = np.repeat([1.66, 2.16, 3.35, 4.60, 11.6], 3) * u.micron
+    # Two catalogues agree, and the third is wrong: the median is that of the two.
+    flux = rayleigh_jeans(bands).value * np.tile([1.0, 1.0, 3.0], 5)
+    table = Table({"sed_freq": bands.to(u.GHz, u.spectral()).value, "sed_flux": flux})
+    table.write(path / "star.vot", format="votable")
+    return path / "star.vot"
+
+
+@pytest.mark.parametrize("write", [as_text, as_ecsv, as_calspec, as_photometry])
+@pytest.mark.parametrize("filter", ["F200W", "F356W", "F444W"])
+def test_power_law_in_every_format(tmp_path, write, filter):
+    flux = dr.star_flux_density(write(tmp_path), filter)
+    # The package interpolates power laws exactly; what remains are the two quadratures.
+    assert flux.to_value(u.Jy) == pytest.approx(expected(filter), rel=1e-4)
+
+
+def test_reduce_takes_the_flux(tmp_path):
+    from pyklip_diffrender.refinement import to_jansky
+
+    flux = dr.star_flux_density(as_text(tmp_path), "F444W")
+    assert to_jansky(flux) == pytest.approx(flux.value)
+
+
+def test_files_that_do_not_say_the_flux(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"missing\.txt: no such file"):
+        dr.star_flux_density(tmp_path / "missing.txt", "F444W")
+    path = tmp_path / "star.txt"
+    path.write_text("<html>not found</html>")
+    with pytest.raises(CorruptFileError, match="wavelength in micron and flux density in Jy"):
+        dr.star_flux_density(path, "F444W")
+    path.write_text("3.0 -1\n4.0 nan\n5.0 0.5\n")
+    with pytest.raises(CorruptFileError, match="1 of 3 samples"):
+        dr.star_flux_density(path, "F444W")
+    path.write_text("0.5 1.0\n1.5 0.5\n2.2 0.3\n")
+    with pytest.raises(IncompatibleSetupError, match=r"covers 0\.500 to 2\.200 micron"):
+        dr.star_flux_density(path, "F444W")
+    path.write_text("1.0 1.0\n2.0 0.5\n8.0 0.3\n")
+    with pytest.raises(IncompatibleSetupError, match=r"no sample between 2\.00 and 8\.00 micron"):
+        dr.star_flux_density(path, "F444W")
+    with pytest.raises(IncompatibleSetupError, match="F999W"):
+        dr.star_flux_density(as_text(tmp_path), "F999W")
