@@ -194,7 +194,22 @@ def test_the_same_job_twice_is_a_mistake(tmp_path: Path) -> None:
         planned(config)
 
 
-def test_of_a_folder_of_maps_the_nearest_in_time_is_used(tmp_path: Path) -> None:
+def calints_file(path: Path, star: str, day: str | None, *, reference: bool = False) -> None:
+    primary = fits.PrimaryHDU()
+    primary.header.update({"FILTER": "F444W", "TARGPROP": star, "IS_PSF": reference})
+    if day is not None:
+        primary.header["DATE-BEG"] = f"{day}T00:00:00"
+    data = np.random.default_rng(1).normal(10, 2, (2, 8, 10)).astype(np.float32)
+    planes = {"SCI": data, "ERR": np.ones_like(data), "DQ": np.zeros(data.shape, dtype=np.uint32)}
+    hdus = [primary, *(fits.ImageHDU(array, name=name) for name, array in planes.items())]
+    hdus[1].header.update(
+        {"BUNIT": "MJy/sr", "PIXAR_A2": 0.00396, "CRPIX1": 6.0, "CRPIX2": 5.0,
+         "ROLL_REF": 100.0, "V3I_YANG": -0.5, "VPARITY": -1}
+    )  # fmt: skip
+    fits.HDUList(hdus).writeto(path, overwrite=True)
+
+
+def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path: Path) -> None:
     config = inputs(tmp_path, 1)
     maps = tmp_path / "maps"
     maps.mkdir()
@@ -205,14 +220,18 @@ def test_of_a_folder_of_maps_the_nearest_in_time_is_used(tmp_path: Path) -> None
         hdu.writeto(maps / f"map{day}.fits")
     (maps / "broken.fits").write_bytes(b"nothing")
     config["sequence"][0]["opd"] = str(maps)
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    config["sequence"][0]["files"] = str(frames)
+    calints_file(frames / "target.fits", "HD-1", None)
     with pytest.raises(IncompatibleSetupError, match="no date"):
         planned(config)
-    frame = fits.PrimaryHDU(np.ones((4, 4)))
-    frame.header["DATE-BEG"] = "2022-08-15T00:00:00"
-    frame.writeto(config["sequence"][0]["files"], overwrite=True)
+    # The reference star was observed when another map was the nearest.
+    calints_file(frames / "target.fits", "HD-1", "2022-08-15")
+    calints_file(frames / "reference.fits", "HD-2", "2022-08-01", reference=True)
     (job,) = planned(config)
     assert job.opd == str(maps / "map11.fits")
-    assert list(job.inputs) == [config["sequence"][0]["files"], job.opd]
+    assert sorted(job.inputs) == sorted([*map(str, frames.iterdir()), job.opd])
 
 
 def test_a_sequence_may_have_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
