@@ -62,9 +62,7 @@ NOTES = """
 - With another number of threads sums are taken in another order: results agree to rounding, not
   bit by bit. At a fixed number of threads they are the same bits.
 - No image shows piston of the whole pupil. Gauss-Newton with free segments (prior 4 nm) leaves it
-  at {piston:.2f} nm and reports an error of {unknown:.2f} nm. Adam on OPD pixels, the paper's
-  recipe, lets it drift by {drift:.2f} nm while it moves the wavefront by {moved:.2f} nm rms;
-  no image notices.
+  at {piston:.2f} nm and reports an error of {unknown:.2f} nm.
 - A plain FITS file holds no checksum: a changed pixel value cannot be noticed. Gzipped files are
   checked, and files with CHECKSUM and DATASUM: data that do not add up are an error, a header
   that was edited under its CHECKSUM is a warning.
@@ -104,15 +102,11 @@ def fits_table() -> list[str]:
 def notes() -> dict[str, float]:
     """Numbers of the last paragraph."""
     pistons = fits.piston_of_segments()
-    adam, start = fits.adam_on_pixels()
-    moved = 1e9 * (adam.wavefront - start)[fits.model().entrance.lit.numpy()]
     return {
         "summed": optics.summed_in_float32(0.3),
         "summed_far": optics.summed_in_float32(1.0),
         "piston": abs(pistons.together) / 18**0.5,
         "unknown": pistons.error / 18**0.5,
-        "drift": abs(moved.mean()),
-        "moved": moved.std(),
     }
 
 

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     )
     from pyklip_diffrender.reduction import Reduction, reduce
     from pyklip_diffrender.refinement import (
-        Adam,
         GaussNewton,
         Refinement,
         Status,
@@ -57,7 +56,6 @@ if TYPE_CHECKING:
     from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
 
 __all__ = [
-    "Adam",
     "Detection",
     "DiffrenderSettings",
     "Disk",
@@ -119,7 +117,7 @@ _NAMES = {
     "pyklip_backend": "DiffrenderSettings backend observation_from_dataset register unregister",
     "reduction": "Reduction reduce",
     "pattern": "known_systematics learn_systematics",
-    "refinement": "Adam GaussNewton Refinement Status refine",
+    "refinement": "GaussNewton Refinement Status refine",
     "scene.objects": "Planet Scene Star",
     "scene.observation": "Observation",
     "scene.real_frames": "model_for",

@@ -33,7 +33,7 @@ from pyklip_diffrender.pyklip_backend import (
 )
 from pyklip_diffrender.pyklip_backend.frames import frames_of
 from pyklip_diffrender.pyklip_backend.references import References
-from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement
+from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 
@@ -313,13 +313,9 @@ def test_references_that_are_asked_for_must_be_there() -> None:
         subtract_by_refinement(frame("TARGET"), OPD, replace(settings, model=model))
 
 
-@pytest.mark.parametrize(
-    ("cards", "fit", "expected"),
-    [({}, None, "off"), ({"INSTRUME": "NIRCAM"}, Adam(), "off"),
-     ({"INSTRUME": "NIRCAM"}, None, "auto")],
-)  # fmt: skip
-def test_simulations_and_the_adam_recipe_use_no_pattern_by_default(
-    cards: dict[str, str], fit: Any, expected: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("cards", "expected"), [({}, "off"), ({"INSTRUME": "NIRCAM"}, "auto")])
+def test_simulations_use_no_pattern_by_default(
+    cards: dict[str, str], expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     requests: list[str] = []
 
@@ -334,7 +330,7 @@ def test_simulations_and_the_adam_recipe_use_no_pattern_by_default(
     model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
     star = replace(frame("TARGET"), header=fits.Header(cards))
     with pytest.raises(Stop):
-        subtract_by_refinement(star, OPD, DiffrenderSettings(model=model, fit=fit))
+        subtract_by_refinement(star, OPD, DiffrenderSettings(model=model))
     assert requests == [expected]
 
 
@@ -397,7 +393,6 @@ def test_a_map_needs_a_folder_and_the_frames_a_date(
         ({"model_options": {"npx": 64}}, {}, "npx: not known to nircam_coronagraph"),
         ({"systematics": "maybe"}, {}, "'maybe', expected 'auto', 'references'"),
         ({"max_chi2": -1.0}, {}, "max_chi2: got -1.0"),
-        ({"keep_detected": True, "fit": Adam()}, {}, "no linear model"),
         ({"model": {4.0: "a"}}, {}, "none for wavelength"),
     ],
 )

@@ -13,7 +13,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-import pyklip_diffrender as dr
 from pyklip_diffrender.optics.system import OpticalSystem
 
 Array = NDArray[np.float64]
@@ -77,13 +76,3 @@ def test_a_model_is_on_the_gpu_throughout() -> None:
     assert model.with_fidelity(npix=128).device.type == "cuda"
     with pytest.raises(RuntimeError, match="device"):
         _ = image + torch.ones(image.shape)
-
-
-def test_adam() -> None:
-    seen = work.frame()
-    losses = [
-        [step["loss"] for step in dr.refine(work.model_on(device), seen, work.opd(),
-                                            settings=dr.Adam(iterations=5)).history]
-        for device in ("cuda", "cpu")
-    ]  # fmt: skip
-    np.testing.assert_allclose(*losses, rtol=1e-6)

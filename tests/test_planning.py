@@ -33,7 +33,7 @@ from pyklip_diffrender.planning import Economy, ModelError, Option, Plan, coarse
 from pyklip_diffrender.planning.noise_model import RidgeResidual
 from pyklip_diffrender.planning.systems import CheapSystem
 from pyklip_diffrender.planning.trial import PROBED, START, Trial
-from pyklip_diffrender.refinement import Adam, GaussNewton, refine
+from pyklip_diffrender.refinement import GaussNewton, refine
 from pyklip_diffrender.scene.objects import Planet, Scene, Star
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.simulation import simulate, star_photons
@@ -486,8 +486,6 @@ def test_bad_plans_are_refused() -> None:
         refine(model(), frame(), before(), plan="cheap")
     with pytest.raises(IncompatibleSetupError, match="made for"):
         refine(model(npix=128), frame(), before(), plan=faint_plan())
-    with pytest.raises(IncompatibleSetupError, match="uses the full model"):
-        refine(model(), frame(), before(), settings=Adam(), plan=faint_plan())
 
 
 def test_a_simulated_star_is_that_of_the_scene() -> None:

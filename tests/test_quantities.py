@@ -167,7 +167,6 @@ CASES = {
         {"star_offset": 3 * u.mas, "lyot_rotation": 12 * u.arcmin, "flux": 5 * u.percent},
         {"star_offset": 0.003, "lyot_rotation": 0.2, "flux": 0.05},
     ),
-    "Adam": Case(dr.Adam, {"learning_rate": 10 * u.pm}, {"learning_rate": 1e-11}),
     "Observation": Case(
         observation,
         {
@@ -259,7 +258,6 @@ def test_another_dimension_is_refused_by_name(name: str) -> None:
         (lambda: dr.reduce("nowhere", OPD, threshold=-5), r"threshold: got -5, expected a pos"),
         (lambda: dr.reduce("nowhere", OPD, threshold=0), r"threshold: got 0, expected a pos"),
         (lambda: dr.WavefrontPrior({"segment": -4}), r"scales: segment: got -4 nm"),
-        (lambda: dr.Adam(learning_rate=-1e-11), r"learning_rate: got -1e-11 m"),
         (lambda: dr.drift(OPD, OPD, 3, interval=0), r"interval: got 0 h"),
     ],
 )

@@ -125,8 +125,3 @@ def test_errors_that_are_not_positive_are_refused(fit: Refinement, error: float)
     sequence = dr.Sequence("a star", (fit.frames[0].observation,))
     with pytest.raises((IncompatibleSetupError, UnitError, ValueError), match="star_flux_error"):
         dr.reduce(sequence, fit.initial, star_flux=0.4, star_flux_error=error)
-
-
-def test_the_adam_recipe_has_no_prior(fit: Refinement) -> None:
-    with pytest.raises(IncompatibleSetupError, match="expected GaussNewton"):
-        with_star_flux(replace(fit, settings=dr.Adam()), 0.4, 0.03)

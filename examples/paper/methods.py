@@ -9,15 +9,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from recipe import AdamFit, adam_recipe
 from scene import Frame, Image, Planet, Scene, Setting, Star, planet_photons, star_photons
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.demo import simulate_references
 from pyklip_diffrender.planning import coarse_steps
 from pyklip_diffrender.pyklip_backend.comparison import klip_rdi
-from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement
+from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.scene.objects import ALPHA_PICTORIS_W2
 from pyklip_diffrender.scene.simulation import simulate
+from pyklip_diffrender.wavefront.opd import resample
 
 STEPS = 1000
 """Of Adam, in the paper."""
@@ -39,11 +41,14 @@ class Subtracted:
         NaN where the method has no result.
     seconds : float
     fit : Refinement or None
+    recipe : AdamFit or None
+        Of the paper's recipe.
     """
 
     image: Image
     seconds: float
     fit: Refinement | None = None
+    recipe: AdamFit | None = None
 
 
 # -- frames --------------------------------------------------------------------------------------
@@ -113,14 +118,14 @@ def adam(setup: Setting, shot: Frame, steps: int = STEPS) -> Subtracted:
     """
     began = time.perf_counter()
     coarse = coarse_steps(setup.model, setup.measured, min(256, setup.model.npix // 2))
-    fit = dr.refine(
+    fit = adam_recipe(
         coarse,
         shot.observation,
-        setup.measured,
-        settings=Adam(iterations=steps),
-        start={"flux": Star().photons, "background": 0.0},
+        resample(setup.measured, coarse.npix),
+        flux=Star().photons,
+        steps=steps,
     )
-    return Subtracted(fit.frames[0].residual[0], time.perf_counter() - began, fit)
+    return Subtracted(fit.residual, time.perf_counter() - began, recipe=fit)
 
 
 def gauss_newton(setup: Setting, shot: Frame, **changes: Any) -> Subtracted:

@@ -21,7 +21,6 @@ from matplotlib.figure import Figure
 
 from pyklip_diffrender.instrument.jwst import maskrnd_openings
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage
-from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.wavefront.opd import resample
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -49,10 +48,10 @@ def seen_change(setup: Setting, opd: Image) -> Image:
     return np.where(stop, change - change[stop].mean(), np.nan)
 
 
-def judge(setup: Setting, shot: Frame, step: Subtracted, fit: Refinement | None) -> dict[str, Any]:
+def judge(setup: Setting, shot: Frame, step: Subtracted, wavefront: Image) -> dict[str, Any]:
     """Numbers of one stage."""
     true_change = seen_change(setup, shot.opd)
-    fitted_change = seen_change(setup, setup.measured if fit is None else np.real(fit.wavefront))
+    fitted_change = seen_change(setup, wavefront)
     return {
         "annulus_snr": paper_snr(setup, step.image, PLANET),
         "star_error": star_error(setup, shot, step.image),
@@ -66,7 +65,7 @@ def one_seed(setup: Setting, counts: tuple[int, ...], steps: tuple[int, ...], se
     """One row for each stage."""
     shot = frame(setup, HOURS, seed, [PLANET])
     began = time.perf_counter()
-    start = judge(setup, shot, initial(setup, shot), None)
+    start = judge(setup, shot, initial(setup, shot), setup.measured)
     maps = {"true": seen_change(setup, shot.opd)}
     rows = [
         {"method": method, "step": 0, "seed": seed, **start} for method in ("Adam", "Gauss-Newton")
@@ -74,22 +73,25 @@ def one_seed(setup: Setting, counts: tuple[int, ...], steps: tuple[int, ...], se
     stages = [("Gauss-Newton", n) for n in counts] + [("Adam", n) for n in steps]
     for method, count in stages:
         if method == "Adam":
-            subtracted = adam(setup, shot, count)
+            subtracted, steps_done = adam(setup, shot, count), count
+            assert subtracted.recipe is not None
+            wavefront = subtracted.recipe.wavefront
         else:
             # One basis for all stages: it would grow where the first one is not done.
             subtracted = gauss_newton(setup, shot, max_iterations=count, cycles=(24.0,))
-        assert subtracted.fit is not None
-        # Those that stop by themselves have fewer.
-        steps_done = count if method == "Adam" else min(count, len(subtracted.fit.history))
+            assert subtracted.fit is not None
+            wavefront = np.real(subtracted.fit.wavefront)
+            # Those that stop by themselves have fewer.
+            steps_done = min(count, len(subtracted.fit.history))
         rows.append(
             {
                 "method": method,
                 "step": steps_done,
                 "seed": seed,
-                **judge(setup, shot, subtracted, subtracted.fit),
+                **judge(setup, shot, subtracted, wavefront),
             }
         )
-        maps[method] = seen_change(setup, np.real(subtracted.fit.wavefront))
+        maps[method] = seen_change(setup, wavefront)
     table = Table(rows=rows)
     table.meta = {"seconds": time.perf_counter() - began}
     for name in ("true", "Gauss-Newton", "Adam"):

@@ -17,10 +17,10 @@ import numpy as np
 from astropy.table import Table
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.refinement import Adam
 
 sys.path.insert(0, str(Path(__file__).parent))
-from scene import Planet, Setting, frame, options, setting, timed_table
+from recipe import adam_recipe
+from scene import Planet, Setting, Star, frame, options, setting, timed_table
 
 PLANET = Planet(1e-6, 0.6, 54.0)
 HOURS = 40.0
@@ -68,13 +68,7 @@ def recipe(setup: Setting) -> dict[str, Any]:
     seconds = []
     for steps in (2, 2 + STEPS):
         began = time.perf_counter()
-        dr.refine(
-            setup.model,
-            shot.observation,
-            setup.measured,
-            settings=Adam(iterations=steps),
-            start={"flux": 2.7807e12, "background": 0.0},
-        )
+        adam_recipe(setup.model, shot.observation, setup.measured, flux=Star().photons, steps=steps)
         seconds.append(time.perf_counter() - began)
     milliseconds = 1000 * (seconds[1] - seconds[0]) / STEPS
     return {

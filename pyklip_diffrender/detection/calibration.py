@@ -75,7 +75,6 @@ def _by_modes(templates: Templates, k: int, frame: LinearFrame, offset: Tensor) 
         return modes  # The wavefront was not fitted.
     modes.requires_grad_()
     model, basis = templates.frames[k].model, templates.fit.basis
-    assert basis is not None
     grid = PupilGrid.full(model.npix, model.diameter)
     image = templates.image(k, offset, basis.opd(modes * NANOMETRE, grid))
     weighted = image.detach() * frame.weight.to(image.device) ** 2

@@ -96,7 +96,7 @@ def detect(
     Raises
     ------
     IncompatibleSetupError
-        For fits that failed or have no linear model (the Adam recipe), for fits of a reference
+        For fits that failed or were read without their linear model, for fits of a reference
         star only, or for a threshold or separation that is not positive.
 
     Examples

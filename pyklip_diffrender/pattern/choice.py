@@ -18,7 +18,7 @@ from pyklip_diffrender.pattern.placement import place_on_detector
 from pyklip_diffrender.pattern.presence import lacks_pattern
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
+from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import OPDMap
@@ -73,7 +73,7 @@ class PatternChoice:
         which pixels they have.
     systematics : Systematics or None
         The pattern.
-    settings : GaussNewton, Adam or None
+    settings : GaussNewton or None
         Settings of the target's fit.
     references : tuple of Refinement
         One for each reference star that was fitted.
@@ -87,7 +87,7 @@ class PatternChoice:
 
     science: tuple[Observation, ...]
     systematics: Systematics | None
-    settings: GaussNewton | Adam | None
+    settings: GaussNewton | None
     references: tuple[Refinement, ...] = ()
     failed: tuple[tuple[str, str], ...] = ()
     origin: Origin = "none"
@@ -140,7 +140,7 @@ def choose_systematics(
     *,
     systematics: PatternRequest = "auto",
     library: bool = True,
-    settings: GaussNewton | Adam | None = None,
+    settings: GaussNewton | None = None,
     memory: float | None = None,
     progress: bool = False,
 ) -> PatternChoice:
@@ -162,7 +162,7 @@ def choose_systematics(
     library : bool
         False leaves the library out, for frames that do not show its pattern, see
         `PatternChoice.is_refuted_by`.
-    settings : GaussNewton or Adam, optional
+    settings : GaussNewton, optional
         Of the fits; default those of `refine`.
     memory : float, optional
         See `GaussNewton.memory`; by default that of the settings.
@@ -210,10 +210,10 @@ def choose_systematics(
 
 
 def _limited(
-    settings: GaussNewton | Adam | None, observation: Observation, memory: float | None
-) -> GaussNewton | Adam | None:
+    settings: GaussNewton | None, observation: Observation, memory: float | None
+) -> GaussNewton | None:
     """Settings with a limit of the memory, if there is one."""
-    if memory is None or isinstance(settings, Adam):
+    if memory is None:
         return settings
     return replace(settings or settings_for(observation), memory=memory)
 
@@ -287,13 +287,11 @@ def _rough_fit(
     observation: Observation,
     opd: OPDMap,
     *,
-    settings: GaussNewton | Adam | None,
+    settings: GaussNewton | None,
     progress: bool,
 ) -> Refinement:
     """Fit until the pattern dominates the residual."""
-    settings = settings or settings_for(observation)
-    if isinstance(settings, GaussNewton):
-        settings = replace(settings, **_ROUGH)
+    settings = replace(settings or settings_for(observation), **_ROUGH)
     return refine(model, observation, opd, settings=settings, progress=progress)
 
 

@@ -19,9 +19,9 @@ def fit_with_pattern(
     references: ReferenceFrames,
     model: OpticalSystem,
     opd: OPDMap,
-    fit: Callable[[PatternChoice, bool], Sequence[Refinement]],
+    fit: Callable[[PatternChoice, bool], Refinement],
     **options: Any,
-) -> tuple[PatternChoice, list[Refinement]]:
+) -> tuple[PatternChoice, Refinement]:
     """Choose a pattern and fit the target; once more without the library if it is refuted.
 
     Frames that were calibrated with another flat field do not have the library's pattern, which
@@ -33,7 +33,6 @@ def fit_with_pattern(
         See `choose_systematics`.
     fit : callable
         Fits the target with a choice. The second argument is True for the fit without the library.
-        Frames that cannot be fitted together may have several fits.
     **options
         Keywords of `choose_systematics`.
 
@@ -41,7 +40,7 @@ def fit_with_pattern(
     -------
     choice : PatternChoice
         The pattern of the last fit.
-    fits : list of Refinement
+    fit : Refinement
 
     Raises
     ------
@@ -49,9 +48,8 @@ def fit_with_pattern(
         As `choose_systematics` and `fit`.
     """
     choice = choose_systematics(science, references, model, opd, **options)
-    fits = list(fit(choice, False))
-    # All of them, because every fit that lacks its pattern is to be mentioned in the log.
-    if any([choice.is_refuted_by(each) for each in fits]):
+    result = fit(choice, False)
+    if choice.is_refuted_by(result):
         choice = choose_systematics(science, references, model, opd, library=False, **options)
-        fits = list(fit(choice, True))
-    return choice, fits
+        result = fit(choice, True)
+    return choice, result

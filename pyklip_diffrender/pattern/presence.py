@@ -60,7 +60,7 @@ def pattern_size(fit: Refinement) -> tuple[float, float] | None:
     >>> print(f"{size:.1f} +- {error:.1f}")
     0.2 +- 0.0
     """
-    if fit.systematics is None or fit.linear is None:
+    if fit.systematics is None:
         return None
     templates = {}
     for k, frame in enumerate(fit.frames):

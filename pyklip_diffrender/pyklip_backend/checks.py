@@ -79,7 +79,6 @@ def check_settings(settings: DiffrenderSettings) -> None:
         return
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
     from pyklip_diffrender.pattern.choice import require_request
-    from pyklip_diffrender.refinement import Adam
 
     known = set(inspect.signature(nircam_coronagraph).parameters) - {"filter"}
     wrong = sorted(set(settings.model_options) - known)
@@ -90,11 +89,6 @@ def check_settings(settings: DiffrenderSettings) -> None:
         )
     if settings.systematics is not None:
         require_request(settings.systematics)
-    if settings.keep_detected and isinstance(settings.fit, Adam):
-        raise IncompatibleSetupError(
-            "keep_detected: a fit by method 'adam' has no linear model with which to detect; use "
-            "fit=GaussNewton()"
-        )
     if settings.max_chi2 is not None and not settings.max_chi2 > 0:
         raise IncompatibleSetupError(
             f"max_chi2: got {settings.max_chi2}, expected a positive number; inf for no limit"

@@ -106,14 +106,12 @@ class FittedPointing:
             Those of companions do not count.
         """
         linear = self.result.linear
-        assert linear is not None
         star = torch.tensor([unknown.name != "companions" for unknown in linear.unknowns])
         change = torch.where(star, change, 0.0)
         return np.asarray(linear.frames[self.index].image(change[:, None])[0].numpy())
 
     def change_in_frames(self, change: Tensor) -> Image:
         """The same on the pixels of the frames, (Ny, Nx); only background outside the square."""
-        assert self.result.linear is not None
         background = sum(
             float(value)
             for unknown, value in zip(self.result.linear.unknowns, change, strict=True)
@@ -128,7 +126,7 @@ class FittedPointing:
         from pyklip_diffrender.refinement import Status
 
         # Before a fit has converged, its linear model may not be good for so long a step.
-        if self.result.linear is None or self.result.status is Status.ITERATION_LIMIT:
+        if self.result.status is Status.ITERATION_LIMIT:
             return np.zeros(self.pointing.observation.shape)
         return self.change_in_frames(self.result.linear.step)
 

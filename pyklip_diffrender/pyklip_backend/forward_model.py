@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 
@@ -73,8 +73,6 @@ def check_forward_model(fm_class: Any, settings: DiffrenderSettings) -> None:
     """
     from pyklip.fmlib.nofm import NoFM
 
-    from pyklip_diffrender.refinement import Adam
-
     if type(fm_class) is NoFM:
         return
     if not is_planet(fm_class):
@@ -89,10 +87,10 @@ def check_forward_model(fm_class: Any, settings: DiffrenderSettings) -> None:
             "injected_into: a planet is measured in a fit to the frames that show it. Call "
             "pyklip.fm.klip_dataset outside the block with injected_into"
         )
-    if settings.subtractor is not None or isinstance(settings.fit, Adam):
+    if settings.subtractor is not None:
         raise IncompatibleSetupError(
             "fm_class: the forward model of a planet needs the linear model of a fit by "
-            "GaussNewton, which a subtractor of your own and the Adam recipe do not have"
+            "GaussNewton, which a subtractor of your own does not have"
         )
 
 
@@ -248,8 +246,6 @@ def _change_of_star(
     factors: Sequence[float],
 ) -> list[NDArray[np.float64]]:
     """Light of the planet that the fit takes for star, on the fitted square of every pointing."""
-    if result.linear is None:
-        raise RefinementError("fm_class: the fit has no linear model", result)
     if _is_companion(result, parts[0], sources[0]):
         return [np.zeros(part.window.shape) for part in parts]
     templates = {

@@ -31,7 +31,7 @@ from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
 
 if TYPE_CHECKING:
     from pyklip_diffrender.planning import Plan
-    from pyklip_diffrender.refinement import Adam, GaussNewton
+    from pyklip_diffrender.refinement import GaussNewton
     from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = [
@@ -86,7 +86,7 @@ class DiffrenderSettings:
         Unit of the frames. Read from BUNIT if present, else dimensionless.
     seed : int, optional
         Passed to `refine`; 0 by default.
-    fit : GaussNewton or Adam, optional
+    fit : GaussNewton, optional
         Settings of the fit; see `refine`.
     start : dict, optional
         Starting values by parameter name; see `refine`.
@@ -136,7 +136,7 @@ class DiffrenderSettings:
     error: ArrayLike | None = None
     unit: u.UnitBase | None = None
     seed: int | None = None
-    fit: GaussNewton | Adam | None = None
+    fit: GaussNewton | None = None
     start: Mapping[str, Any] | None = None
     systematics: Systematics | Literal["auto", "references", "off"] | None = None
     plan: Plan | str | None = None

@@ -170,9 +170,7 @@ def subtract_by_refinement(
     model = model_of(observation, settings)
     # Takes a second to import, so only after the input has been checked.
     from pyklip_diffrender.pattern import fit_with_pattern
-    from pyklip_diffrender.refinement import Adam
 
-    adam, seed = isinstance(settings.fit, Adam), _seed_of(settings)
     groups = list(pointings_of(observation) if pointings is None else pointings)
     windows = [Window.about(g.observation.center[0], model.detector.shape) for g in groups]
     cut = [window.of(group.observation) for window, group in zip(windows, groups, strict=True)]
@@ -182,14 +180,14 @@ def subtract_by_refinement(
         tell("fitting the reference stars")
         return references.cut(model.detector.shape, cut[0])
 
-    def fit(choice: PatternChoice, again: bool) -> list[Refinement]:
+    def fit(choice: PatternChoice, again: bool) -> Refinement:
         if again:
             tell("the frames do not show the pattern of the library")
         elif references and not choice.references:
             tell("the reference frames are not needed")
         return _refined(choice, model, opd, settings, tell)
 
-    choice, results = fit_with_pattern(
+    choice, result = fit_with_pattern(
         cut,
         frames_of_references if references else (),
         model,
@@ -199,26 +197,24 @@ def subtract_by_refinement(
         settings=settings.fit,
     )
     keep, error_factor = settings.keep_detected, None
-    if (observation.is_nircam and not adam) if keep is None else keep:
-        results, error_factor = _with_companions(results, tell)
+    if observation.is_nircam if keep is None else keep:
+        result, error_factor = _with_companions(result, tell)
     star = np.full(observation.data.shape, np.nan)
-    fits, fitted = [], []
-    for chosen, result in zip(_together(len(cut), adam), results, strict=True):
-        # It may have been refined again with companions.
-        require_plausible(cut[chosen[0]].name, result, settings.max_chi2)
-        warn_of_status(cut[chosen[0]].name, result)
-        for place, k in enumerate(chosen):
-            away = result.frames[place].observation.center[0] - cut[k].center[0]
-            fitted.append(FittedPointing(result, place, groups[k], windows[k], away))
-            star[groups[k].frames] = fitted[-1].star()
-        frames = np.sort(np.concatenate([groups[k].frames for k in chosen]))
-        status = result.status.name.lower()
-        fits.append(Fit(tuple(map(int, frames)), status, float(result.chi2_per_pixel), result))
+    # It may have been refined again with companions.
+    require_plausible(cut[0].name, result, settings.max_chi2)
+    warn_of_status(cut[0].name, result)
+    fitted = []
+    for k, (group, window) in enumerate(zip(groups, windows, strict=True)):
+        away = result.frames[k].observation.center[0] - cut[k].center[0]
+        fitted.append(FittedPointing(result, k, group, window, away))
+        star[group.frames] = fitted[-1].star()
+    frames = np.sort(np.concatenate([group.frames for group in groups]))
+    status = result.status.name.lower()
     return Subtraction(
         star,
-        results[0].method,
-        seed,
-        tuple(fits),
+        result.method,
+        _seed_of(settings),
+        (Fit(tuple(map(int, frames)), status, float(result.chi2_per_pixel), result),),
         choice.label,
         choice.reference_frames,
         tuple(fitted),
@@ -236,12 +232,9 @@ def _requested_pattern(
     IncompatibleSetupError
         If "references" is asked for without any.
     """
-    from pyklip_diffrender.refinement import Adam
-
     requested = settings.systematics
     if requested is None:
-        real = observation.is_nircam and not isinstance(settings.fit, Adam)
-        return "auto" if real else "off"
+        return "auto" if observation.is_nircam else "off"
     if requested == "references" and not references:
         raise IncompatibleSetupError(
             "systematics='references' needs frames of reference stars: give them to JWSTData as "
@@ -251,45 +244,36 @@ def _requested_pattern(
     return requested
 
 
-def _together(pointings: int, adam: bool) -> list[tuple[int, ...]]:
-    """Return which pointings are fitted together; the Adam recipe takes one at a time."""
-    everything = tuple(range(pointings))
-    return [(k,) for k in everything] if adam else [everything]
-
-
 def _refined(
     choice: PatternChoice,
     model: OpticalSystem,
     opd: OPDMap,
     settings: DiffrenderSettings,
     tell: Callable[[str], None],
-) -> list[Refinement]:
-    """Fit all pointings with a pattern."""
-    from pyklip_diffrender.refinement import Adam, refine
+) -> Refinement:
+    """Fit all pointings together with a pattern."""
+    from pyklip_diffrender.refinement import refine
 
-    science, adam = choice.science, isinstance(settings.fit, Adam)
+    science = choice.science
     tell(
         f"fitting {_counted(sum(map(len, science)), 'frame')} of "
         f"{_counted(len(science), 'pointing')}"
-        f"{'' if adam or len(science) == 1 else ' together'}, {model.detector.shape[1]} x "
+        f"{'' if len(science) == 1 else ' together'}, {model.detector.shape[1]} x "
         f"{model.detector.shape[0]} pixels, flat-field pattern: {choice.label}"
     )
-    results: list[Refinement] = []
-    for chosen in _together(len(science), adam):
-        result = refine(
-            model,
-            [science[k] for k in chosen],
-            opd,
-            settings=choice.settings,
-            start=settings.start,
-            systematics=choice.systematics,
-            plan="auto" if settings.plan is None else settings.plan,
-            seed=_seed_of(settings),
-        )
-        require_plausible(science[chosen[0]].name, result, settings.max_chi2)
-        tell(f"{_described(result)}, {result.seconds:.0f} s")
-        results.append(result)
-    return results
+    result = refine(
+        model,
+        science,
+        opd,
+        settings=choice.settings,
+        start=settings.start,
+        systematics=choice.systematics,
+        plan="auto" if settings.plan is None else settings.plan,
+        seed=_seed_of(settings),
+    )
+    require_plausible(science[0].name, result, settings.max_chi2)
+    tell(f"{_described(result)}, {result.seconds:.0f} s")
+    return result
 
 
 def _seed_of(settings: DiffrenderSettings) -> int:
@@ -306,27 +290,27 @@ def _counted(number: int, noun: str) -> str:
 
 
 def _with_companions(
-    results: list[Refinement], tell: Callable[[str], None]
-) -> tuple[list[Refinement], ErrorFactor]:
-    """Refine again with the companions that are detected in all fits together.
+    result: Refinement, tell: Callable[[str], None]
+) -> tuple[Refinement, ErrorFactor]:
+    """Refine again with the companions that are detected.
 
-    Also by how much the errors of the search are too small.
+    The second value is the factor by which the errors of the search are too small.
     """
     from pyklip_diffrender.detection import detect
     from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
 
-    # No relinearisation: the fits are refined again below.
+    # No relinearisation: the star is refined again below.
     tell("searching for companions")
-    detection = detect(results, relinearise=math.inf)
+    detection = detect(result, relinearise=math.inf)
     logger.info("companions kept out of the star: %s", detection.table)
     number = _counted(len(detection.candidates), "companion")
-    if not lacks_candidates(results, detection.candidates):
+    if not lacks_candidates([result], detection.candidates):
         tell(f"{number} detected, as many as the fit has")
-        return results, detection.error_factor
-    tell(f"{number} detected, {len(results[0].companions)} in the fit: the star is fitted again")
-    results = with_companions(results, detection.candidates)
-    tell(_described(results[0]))
-    return results, detection.error_factor
+        return result, detection.error_factor
+    tell(f"{number} detected, {len(result.companions)} in the fit: the star is fitted again")
+    (result,) = with_companions([result], detection.candidates)
+    tell(_described(result))
+    return result, detection.error_factor
 
 
 def model_of(observation: Observation, settings: DiffrenderSettings) -> OpticalSystem:

@@ -87,7 +87,6 @@ def _at(
     fit: Refinement, templates: Templates, rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """The throughput of sources at pixels of the first frame."""
-    assert fit.linear is not None
     star = np.array([unknown.name != "companions" for unknown in fit.linear.unknowns])
     left = np.empty(len(rows))
     for start in range(0, len(rows), _BATCH):

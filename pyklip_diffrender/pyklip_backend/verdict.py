@@ -30,7 +30,6 @@ _ADVICE = {
         "the best iterate was subtracted. Raise max_iterations, for example "
         "fit=GaussNewton.nircam(max_iterations=80)"
     ),
-    "COMPLETED": "this method has no test of convergence; compare chi-squared per pixel with 1",
 }
 
 

@@ -169,12 +169,12 @@ class _Run:
 
     def result(self) -> Reduction:
         options, whole = self.given.options, self.given.whole.science
-        choice, (fit,) = fit_with_pattern(
+        choice, fit = fit_with_pattern(
             self.given.sequence.science,
             self.given.sequence.references,
             self.given.model,
             self.given.wavefront,
-            self._first_fits,
+            self._first_fit,
             systematics=options.systematics,
             settings=options.settings,
             memory=options.memory,
@@ -211,10 +211,10 @@ class _Run:
             injections,
         )
 
-    def _first_fits(self, choice: PatternChoice, again: bool) -> list[Refinement]:
+    def _first_fit(self, choice: PatternChoice, again: bool) -> Refinement:
         without = ", without the library's flat-field pattern" if again else ""
         with stage(f"wavefront{without}"):
-            return [self._fit(choice.science, choice)]
+            return self._fit(choice.science, choice)
 
     def _fit(self, science: Iterable[Observation], choice: PatternChoice) -> Refinement:
         options = self.given.options

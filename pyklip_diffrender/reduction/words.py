@@ -42,9 +42,6 @@ _ADVICE = {
         "Look at the history of the fit. If chi-squared was still falling, repeat the fit with a "
         "larger max_iterations; if it hardly changed, try a wavefront map nearer in time."
     ),
-    Status.COMPLETED: (
-        "This method has no test of convergence: compare chi-squared per pixel with 1."
-    ),
     Status.DIVERGED: (
         "Do not use this result. Check the unit and orientation of the wavefront map, the position "
         "of the star and the pixel mask."

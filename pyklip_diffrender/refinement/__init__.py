@@ -6,7 +6,7 @@ from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
+from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.refinement.star_flux import (
     jansky_per_unit,
     require_calibrated,
@@ -17,7 +17,6 @@ from pyklip_diffrender.refinement.star_flux import (
 from pyklip_diffrender.refinement.status import Status
 
 __all__ = [
-    "Adam",
     "FrameFit",
     "GaussNewton",
     "Refinement",

@@ -355,7 +355,7 @@ class Annealing:
             prior_ratios=ratios,
             effective_parameters=update.effective,
             log_evidence=update.log_evidence,
-            linear=linear,
+            stored_linear=linear,
             systematics=self.problems[0].systematics,
             history=self.history,
             seconds=seconds,

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.problem import Problem
@@ -48,13 +47,9 @@ def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Un
     Raises
     ------
     IncompatibleSetupError
-        If the fit is by another method.
+        If the fit was read from a file without its linear model.
     """
     settings = fit.settings
-    if fit.linear is None or not isinstance(settings, GaussNewton) or fit.basis is None:
-        raise IncompatibleSetupError(
-            f"only a fit by Gauss-Newton can be continued, this one is by {fit.method!r}"
-        )
     reached = {
         "prior": _with_scales(settings.prior, fit.scales, "{}"),
         "drift": settings.drift and _with_scales(settings.drift, fit.scales, "{} drift"),

@@ -16,12 +16,11 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.planning import Plan
-from pyklip_diffrender.refinement.adam import adam
 from pyklip_diffrender.refinement.breakdown import breakdown_explained
 from pyklip_diffrender.refinement.planned import choose_plan, fit_problems
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.refinement.settings import Adam, GaussNewton, settings_for
+from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import as_opd_map
@@ -36,7 +35,7 @@ def refine(
     observation: Observation | Sequence[Observation],
     opd: Any,
     *,
-    settings: GaussNewton | Adam | None = None,
+    settings: GaussNewton | None = None,
     start: Start | Sequence[Start] | None = None,
     systematics: Systematics | None = None,
     plan: Plan | str = "auto",
@@ -58,7 +57,7 @@ def refine(
     opd : path, OPDMap, Quantity, array or "flat"
         The wavefront to start from, entrance-pupil orientation; bare arrays in metres. It is
         resampled to the model's pupil. "flat" stands for a flat wavefront.
-    settings : GaussNewton or Adam, optional
+    settings : GaussNewton, optional
         Default `GaussNewton.nircam()` for frames whose header says NIRCam, else `GaussNewton()`.
     start : dict or sequence of dict, optional
         Starting values by parameter name, for all observations or one by one. "detector_shift"
@@ -116,34 +115,19 @@ def refine(
     if not observations:
         raise NoValidPixelsError("observation: got an empty sequence, expected at least one")
     adapted = settings_for(observations[0]) if settings is None else settings
-    if isinstance(adapted, GaussNewton) and adapted.free == GaussNewton().free:
+    if not isinstance(adapted, GaussNewton):
+        raise IncompatibleSetupError(
+            f"settings: got a {type(adapted).__name__}, expected GaussNewton"
+        )
+    if adapted.free == GaussNewton().free:
         # A system without a Lyot stop has no parameters of one.
         available = (*model.parameters, "flux", "background")
         adapted = replace(adapted, free=tuple(name for name in adapted.free if name in available))
-    if not isinstance(adapted, GaussNewton | Adam):
-        raise IncompatibleSetupError(
-            f"settings: got a {type(adapted).__name__}, expected GaussNewton or Adam"
-        )
     wavefront = as_opd_map(opd)
     problems = [
         Problem(model, each, wavefront, _with_position(model, each, begin), systematics)
         for each, begin in zip(observations, _one_by_one(start, len(observations)), strict=True)
     ]
-    if isinstance(adapted, Adam):
-        if len(problems) > 1:
-            raise IncompatibleSetupError(
-                f"settings: Adam takes one observation, got {len(problems)}; several are fitted "
-                "together by GaussNewton"
-            )
-        if isinstance(plan, Plan):
-            raise IncompatibleSetupError(
-                'plan: the Adam recipe uses the full model; pass plan="off"'
-            )
-        if systematics is not None:
-            raise IncompatibleSetupError(
-                "systematics: the Adam recipe does not support them; use GaussNewton"
-            )
-        return adam(problems[0], adapted, seed=seed, progress=progress)
     with breakdown_explained(observations[0].name):
         planned = choose_plan(plan, problems, adapted, seed)
         return fit_problems(problems, adapted, planned, seed=seed, progress=progress)

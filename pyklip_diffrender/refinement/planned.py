@@ -167,7 +167,6 @@ def _on_full_model(
     frame, model = fit.frames[k], problem.model
     opd = frame.opd
     if frame.model.npix != model.npix:
-        assert fit.basis is not None
         grid = PupilGrid.full(model.npix, model.diameter)
         coefficients = torch.from_numpy(frame.coefficients)
         change = fit.basis.opd(coefficients * NANOMETRE, grid)
@@ -205,7 +204,7 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
     Raises
     ------
     IncompatibleSetupError
-        If the fit is by another method than Gauss-Newton.
+        If the fit was read from a file without its linear model.
     """
     settings, warm = continue_from(fit, **changes)
     problems = [

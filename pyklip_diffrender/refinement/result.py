@@ -27,7 +27,7 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.planning import Plan
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.settings import Adam, GaussNewton
+from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.refinement.storage import (
     linear_hdus,
@@ -75,8 +75,8 @@ class Refinement:
         One for each observation, in the same order.
     initial : OPDMap
         Starting wavefront.
-    settings : GaussNewton or Adam
-    basis : Basis or None
+    settings : GaussNewton
+    basis : Basis
         Wavefront modes that were fitted.
     status : Status
     chi2_per_pixel : float
@@ -98,10 +98,10 @@ class Refinement:
     log_evidence : float
         Logarithm of the evidence of the linearised model, up to a constant of the data. Differences
         compare priors.
-    linear : LinearModel or None
-        Jacobian and covariance of all unknowns, for `detect`; None for the Adam recipe.
     systematics : Systematics or None
         Assumed pattern of the model's error.
+    stored_linear : LinearModel or None
+        The linear model; None if the fit was read from a file without it.
     plan : Plan or None
         The chosen model fidelity; None if the fit used the full model.
     history : list of dict
@@ -129,10 +129,11 @@ class Refinement:
 
     frames: tuple[FrameFit, ...]
     initial: OPDMap
-    settings: GaussNewton | Adam
+    settings: GaussNewton
     status: Status
     chi2_per_pixel: float
-    basis: Basis | None = None
+    basis: Basis
+    stored_linear: LinearModel | None
     model_error: float = math.nan
     companions: Image = field(default_factory=lambda: np.zeros((0, 3)))
     companion_errors: Image = field(default_factory=lambda: np.zeros((0, 3)))
@@ -140,7 +141,6 @@ class Refinement:
     prior_ratios: dict[str, float] = field(default_factory=dict)
     effective_parameters: float = math.nan
     log_evidence: float = math.nan
-    linear: LinearModel | None = None
     systematics: Systematics | None = None
     plan: Plan | None = None
     history: list[dict[str, Any]] = field(default_factory=list)
@@ -186,7 +186,7 @@ class Refinement:
     @property
     def method(self) -> str:
         """Name of the method."""
-        return "adam" if isinstance(self.settings, Adam) else "gauss-newton"
+        return "gauss-newton"
 
     @property
     def planets(self) -> tuple[Planet, ...]:
@@ -194,10 +194,30 @@ class Refinement:
         return tuple(Planet.from_offset(max(c, 0.0), x, y) for c, x, y in self.companions.tolist())
 
     @property
+    def linear(self) -> LinearModel:
+        """Jacobian and covariance of all unknowns, which `detect` uses.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If the fit was read from a file without them.
+        """
+        if self.stored_linear is None:
+            raise IncompatibleSetupError(
+                "this fit was read from a file without its linear model, which write(linear=False) "
+                "leaves out. Fit the frames again, or write the fit with linear=True"
+            )
+        return self.stored_linear
+
+    @property
     def reduced_chi2(self) -> float:
-        """Chi-squared per degree of freedom; NaN if the method has no linear model."""
-        if self.linear is None:
-            return math.nan
+        """Chi-squared per degree of freedom.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            As `linear`.
+        """
         pixels = sum(int((frame.weight > 0).sum()) for frame in self.linear.frames)
         return self.chi2_per_pixel / max(1 - self.effective_parameters / pixels, 1e-3)
 
@@ -208,14 +228,8 @@ class Refinement:
         Raises
         ------
         IncompatibleSetupError
-            If the method has no linear model.
+            As `linear`.
         """
-        if self.linear is None:
-            raise IncompatibleSetupError(
-                f"this fit (method {self.method!r}) has no linear model of its unknowns. Use "
-                "refine(settings=GaussNewton()), the default, and do not write the fit with "
-                "linear=False"
-            )
         if not len(self.companions):
             return self.linear
         light: dict[int, NDArray[np.float64] | Tensor | float] = {
@@ -284,8 +298,8 @@ class Refinement:
         hdus["INITIAL_OPD"].header["BUNIT"] = "m"
         if self.systematics is not None:
             hdus.extend(self.systematics.to_hdus())
-        if linear and self.linear is not None:
-            hdus.extend(linear_hdus(self.linear))
+        if linear and self.stored_linear is not None:
+            hdus.extend(linear_hdus(self.stored_linear))
         date = self.initial.date
         facts = {
             "model": model_facts(self.model),
@@ -337,7 +351,7 @@ class Refinement:
                     sha256,
                 ),
                 status=Status[facts["status"]],
-                linear=linear_of(hdus, len(frames), name) if "UNKNOWNS" in hdus else None,
+                stored_linear=linear_of(hdus, len(frames), name) if "UNKNOWNS" in hdus else None,
                 systematics=Systematics.from_hdus(hdus) if "PATTERN" in hdus else None,
                 **plain,
             )

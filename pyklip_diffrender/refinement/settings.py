@@ -9,10 +9,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from astropy import units as u
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import ARCSEC, set_numbers, to_bytes, to_unit
+from pyklip_diffrender.io.units import ARCSEC, to_bytes, to_unit
 from pyklip_diffrender.optics.grid import JWST_DIAMETER
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 from pyklip_diffrender.scene.objects import Planet
@@ -20,7 +19,7 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["Adam", "GaussNewton", "settings_for"]
+__all__ = ["GaussNewton", "settings_for"]
 
 _REACH = 40
 """Pixels from the star to the edge of the square that `reduce` fits."""
@@ -330,35 +329,7 @@ class GaussNewton:
         return replace(preset, **{"deviations": deviations, **changes})
 
 
-@dataclass(frozen=True)
-class Adam:
-    """The recipe of Feng et al. 2025, section IV: mean absolute error, every OPD pixel free.
-
-    Star offset and alignment are held at their starting values.
-
-    Attributes
-    ----------
-    iterations : int
-    learning_rate : float or Quantity
-        m.
-
-    Examples
-    --------
-    >>> from astropy import units as u
-    >>> from pyklip_diffrender import Adam
-    >>> Adam(iterations=200, learning_rate=20 * u.pm)
-    Adam(iterations=200, learning_rate=2e-11)
-    """
-
-    iterations: int = 1000
-    learning_rate: float = 1e-11
-
-    def __post_init__(self) -> None:
-        set_numbers(self, learning_rate=(u.m, "positive"))
-        _require_positive(self, "iterations")
-
-
-def _require_positive(settings: GaussNewton | Adam, *names: str) -> None:
+def _require_positive(settings: GaussNewton, *names: str) -> None:
     """Refuse fields that are not positive numbers."""
     for name in names:
         if not getattr(settings, name) > 0:

@@ -12,7 +12,6 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.planned import refine_again
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
@@ -129,12 +128,8 @@ def with_star_flux(
     Raises
     ------
     IncompatibleSetupError
-        If the frames have no photometric calibration, or for the Adam recipe.
+        If the frames have no photometric calibration.
     """
-    if not isinstance(fit.settings, GaussNewton):
-        raise IncompatibleSetupError(
-            f"star_flux: got a fit by {fit.method!r}, expected GaussNewton"
-        )
     frames = []
     for frame in fit.frames:
         require_calibrated(frame.observation)
@@ -151,7 +146,7 @@ def star_flux_error(fit: Refinement) -> float:
     That of its settings; by default 10 % for real frames (40 % without a wavefront map), and 0 for
     others.
     """
-    known = fit.settings.star_flux_error if isinstance(fit.settings, GaussNewton) else None
+    known = fit.settings.star_flux_error
     if known is not None:
         return known
     if not fit.frames[0].observation.is_nircam:

@@ -28,7 +28,6 @@ class Status(Enum):
         "errors are too small; let the prior's scales be fitted (fit_scales=True), or widen them"
     )
     ITERATION_LIMIT = "stopped at the limit of iterations before it converged"
-    COMPLETED = "all iterations of a fixed recipe were done"
     DIVERGED = "failed: the fitted star has no light, or the loss is not a number"
 
     @property

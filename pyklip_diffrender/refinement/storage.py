@@ -25,7 +25,7 @@ from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.frames import LinearFrame, Unknown
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement.settings import Adam, GaussNewton
+from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
@@ -44,7 +44,7 @@ __all__ = [
     "text_hdu",
 ]
 
-_DATACLASSES = {each.__name__: each for each in (GaussNewton, Adam, WavefrontPrior, Planet)}
+_DATACLASSES = {each.__name__: each for each in (GaussNewton, WavefrontPrior, Planet)}
 _DTYPES = {"torch.float64": torch.float64, "torch.float32": torch.float32}
 
 
@@ -252,7 +252,7 @@ def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Obs
     )
 
 
-_FRAME_ARRAYS = ("residual", "weight", "jacobian", "rows", "drift", "common")
+_FRAME_ARRAYS = ("residual", "weight", "jacobian", "rows", "drift", "common", "light")
 
 
 def linear_hdus(linear: LinearModel) -> list[Any]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement import Adam, GaussNewton, Refinement, Status, refine
+from pyklip_diffrender.refinement import GaussNewton, Refinement, Status, refine
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import FourierModes, JointBasis, SegmentMotions
@@ -28,7 +28,7 @@ from pyklip_diffrender.wavefront.opd import random_opd
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = [
-    "FITS", "PRIOR", "SUCCESS", "FitRow", "Pistons", "adam_on_pixels", "drift_rms", "error_of",
+    "FITS", "PRIOR", "SUCCESS", "FitRow", "Pistons", "drift_rms", "error_of",
     "fitted", "model", "noise", "observed", "old", "piston_of_segments", "star",
 ]  # fmt: skip
 
@@ -145,7 +145,6 @@ def piston_of_segments() -> Pistons:
     """18 pistons are free; what they have in common is invisible."""
     prior = WavefrontPrior({"segment": PRIOR, "texture": 3.0}, fit_scales=False)
     fit = fitted(observed(star()), basis=MORE, prior=prior)
-    assert fit.linear is not None
     found = fit.frames[0].coefficients
     assert found is not None
     covariance = fit.linear.covariance.numpy()[-len(MORE) :, -len(MORE) :]
@@ -155,13 +154,6 @@ def piston_of_segments() -> Pistons:
         fit, float(mean @ found), float(np.sqrt(mean @ covariance @ mean)), found[:54],
         np.sqrt(np.diag(covariance))[:54],
     )  # fmt: skip
-
-
-def adam_on_pixels() -> tuple[Refinement, Array]:
-    """60 steps of Adam, and where it started."""
-    settings = Adam(iterations=60, learning_rate=1e-10)
-    start = {"star_offset": OFFSET}
-    return refine(model(), observed(star()), old(), settings=settings, start=start), old()
 
 
 # -- what is done to the frame -----------------------------------------------------------------
