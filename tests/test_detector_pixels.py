@@ -158,6 +158,82 @@ def test_plain_calints_know_their_pixels(tmp_path: Path) -> None:
     assert dr.Observation.from_fits(path).first_pixel is None
 
 
+def test_a_gap_does_not_spread_when_a_shift_is_undone(tmp_path: Path) -> None:
+    """A hole at the star's peak in SCI or ERR: neighbours keep values and errors, or are masked."""
+    y, x = np.indices((SIDE, SIDE))
+    star = 3000 * np.exp(-((x - 150) ** 2 + (y - 174) ** 2) / (2 * 1.1**2))
+    star += 200 * np.exp(-np.hypot(x - 150, y - 174) / 8)
+    frames = np.stack([star, star]) + np.random.default_rng(3).normal(size=(2, SIDE, SIDE))
+    paths = {}
+    for name in ("twin", "SCI", "ERR"):
+        paths[name] = aligned_file(tmp_path / f"{name}.fits")
+        with fits.open(paths[name], mode="update") as hdus:
+            hdus["SCI"].data = frames.copy()
+            hdus["DQ"].data = np.zeros(frames.shape, dtype=np.int32)
+            if name != "twin":
+                hdus[name].data[0, 174, 150] = np.nan
+            if name == "ERR":
+                hdus["ERR"].data[0, 60, 60:64] = (0.0, -1.0, np.nan, 0.0)
+    twin = dr.Observation.from_fits(paths["twin"])
+    assert twin.valid.all()
+    for name in ("SCI", "ERR"):
+        got = dr.Observation.from_fits(paths[name])
+        # The pixels that the gap is mixed with, and little else.
+        lost = ~got.valid[0]
+        near = np.hypot(x - 150, y - 175) < 1.6
+        assert lost[near].any()
+        assert lost[np.abs(y - 61) > 3].sum() < 300
+        assert got.valid[1].all()
+        away = np.where(got.valid, got.data - twin.data, 0.0) / twin.error
+        assert np.abs(away).max() < 1.5
+        ratio = got.error[got.valid] / twin.error[got.valid]
+        assert ratio.min() > 0.95
+        assert ratio.max() < 1.2
+
+
+@pytest.mark.parametrize(
+    ("cards", "place"),
+    [
+        ({"APERNAME": None}, True),
+        ({"APERNAME": "NRCA5_FULL_MASK335R"}, True),
+        ({"CORONMSK": "UNKNOWN"}, True),
+        ({"SUBSTRT1": None, "SUBSTRT2": None}, True),
+        ({"SUBSTRT1": 1, "SUBSTRT2": 1}, True),
+        ({"DETECTOR": None, "APERNAME": None}, False),
+        ({"FILTER": "F277W"}, False),
+        ({"CORONMSK": None, "APERNAME": None}, False),
+    ],
+)
+def test_the_place_of_shifted_frames_is_known_or_left_to_the_search(
+    tmp_path: Path, cards: dict[str, object], place: bool
+) -> None:
+    path = aligned_file(tmp_path / "a.fits")
+    expected = dr.Observation.from_fits(path)
+    with fits.open(path, mode="update") as hdus:
+        for key, value in cards.items():
+            if value is None:
+                del hdus[0].header[key]
+            else:
+                hdus[0].header[key] = value
+    got = dr.Observation.from_fits(path)
+    if not place:
+        assert got.first_pixel is None
+        return
+    assert got.first_pixel is not None
+    assert expected.first_pixel is not None
+    # The star is on the same place of the detector.
+    np.testing.assert_allclose(
+        got.center + got.first_pixel, expected.center + expected.first_pixel, atol=1e-6
+    )
+
+
+def test_a_subarray_that_begins_elsewhere_is_not_believed(tmp_path: Path) -> None:
+    path = aligned_file(tmp_path / "plain.fits", SUBSTRT1=1, SUBSTRT2=1, SUBARRAY="FULL")
+    with fits.open(path, mode="update") as hdus:
+        del hdus["IMSHIFTS"]
+    assert dr.Observation.from_fits(path).first_pixel is None
+
+
 def measured(star: str, first: tuple[int, int] = (600, 1630), **changes: object) -> MeasuredPattern:
     rng = np.random.default_rng(5)
     truth = 0.05 * rng.normal(size=(60, 60))

@@ -195,12 +195,19 @@ def test_a_missing_pixel_area_is_an_error(tmp_path: Path, frames: np.ndarray) ->
         Observation.from_fits(calints(tmp_path / "area.fits", frames, PIXAR_A2=None))
 
 
-def test_a_frame_without_a_good_pixel_is_named(tmp_path: Path, frames: np.ndarray) -> None:
+def test_an_integration_without_a_good_pixel_is_left_out_and_named(
+    tmp_path: Path, frames: np.ndarray
+) -> None:
     quality = np.zeros(frames.shape, dtype=np.uint32)
     quality[1] = 1
-    path = calints(tmp_path / "blind.fits", frames, quality=quality)
-    with pytest.raises(NoValidPixelsError, match=r"blind\.fits: all 80 pixels of frame 1"):
+    got = Observation.from_fits(calints(tmp_path / "half.fits", frames, quality=quality))
+    assert len(got) == 1
+    assert "integration 2 of 2 is left out: all of its pixels are flagged" in got.remarks[0]
+    path = calints(tmp_path / "blind.fits", frames, quality=quality + 1)
+    with pytest.raises(NoValidPixelsError, match=r"blind\.fits: integration 1 of 2 .*flagged"):
         Observation.from_fits(path)
+    with pytest.raises(NoValidPixelsError, match=r"all 80 pixels of frame 0"):
+        Observation.from_fits(path, every_integration=True)
 
 
 def test_a_file_without_frames_is_an_error(tmp_path: Path, frames: np.ndarray) -> None:

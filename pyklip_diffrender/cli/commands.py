@@ -138,7 +138,8 @@ def reduce_frames(
 ) -> None:
     """Subtract the star from all rolls of a target and search for planets.
 
-    FRAMES are calints files, or one folder of them. With --program they come from MAST.
+    FRAMES are calints files, or one folder of them. With --program they come from MAST. Epochs more
+    than 5 days apart are reduced one by one, into a folder for each, and compared on one page.
     """
     if not frames and program is None:
         raise click.UsageError("Missing argument 'FRAMES...', or the option --program.")
@@ -147,7 +148,7 @@ def reduce_frames(
     if program is not None and options["dry_run"] and _is_to_fetch(program, target, filter, cache):
         return
 
-    def read() -> Sequence:
+    def read() -> tuple[Sequence, ...]:
         from pyklip_diffrender.archive import fetch_calints
         from pyklip_diffrender.scene.sequence import Sequence
 
@@ -156,7 +157,7 @@ def reduce_frames(
             files = fetch_calints(
                 program, target, filter=filter, folder=cache, progress=run.progress
             )
-        return Sequence.from_files(files, target=target, filter=filter)
+        return Sequence.by_epoch(files, target=target, filter=filter)
 
     from pyklip_diffrender.cli.reduction import run_reduction
 
@@ -183,16 +184,14 @@ def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
     FRAMES is a calints file.
     """
 
-    def read() -> Sequence:
-        from pyklip_diffrender.scene.observation import Observation
+    def read() -> tuple[Sequence, ...]:
         from pyklip_diffrender.scene.sequence import Sequence
 
         if frames.is_dir():
             raise IncompatibleSetupError(
                 f"{frames} is a folder, expected a file; the command reduce takes folders"
             )
-        observation = Observation.from_fits(frames)
-        return Sequence(observation.target, (observation,))
+        return (Sequence.from_files([frames]),)
 
     from pyklip_diffrender.cli.reduction import run_reduction
 

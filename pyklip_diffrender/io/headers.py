@@ -24,6 +24,9 @@ __all__ = [
 _DATED_NAME = re.compile(r"(?<!\d)(20\d\d)-?([01]\d)-?([0-3]\d)")
 """A date in the name of a file: opd_2022-08-14.fits.gz, R2022081402-NRCA3_FP1-1.fits."""
 
+_UNKNOWN = ("", "UNKNOWN", "NULL", "N/A", "UNDEFINED")
+"""Texts of cards that state nothing."""
+
 
 def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fits.Header:
     """Cards of the primary header, replaced and completed by those of an extension.
@@ -61,7 +64,9 @@ def _value(header: fits.Header, key: str) -> Any:
 
 
 def header_number(header: fits.Header, key: str, name: str) -> float | None:
-    """Finite number of a card, None if there is none; `name` is that of the file.
+    """Finite number of a card; `name` is that of the file.
+
+    None if the card is missing, empty, or says that its value is not known.
 
     Raises
     ------
@@ -69,7 +74,7 @@ def header_number(header: fits.Header, key: str, name: str) -> float | None:
         If the card holds something else.
     """
     value = _value(header, key)
-    if value is None:
+    if value is None or (isinstance(value, str) and value.strip().upper() in _UNKNOWN):
         return None
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise card_error(name, key, value, "a finite number")
@@ -77,7 +82,9 @@ def header_number(header: fits.Header, key: str, name: str) -> float | None:
 
 
 def header_text(header: fits.Header, key: str, name: str) -> str | None:
-    """Text of a card, None if it is missing or empty; `name` is that of the file.
+    """Text of a card without blanks around it; `name` is that of the file.
+
+    None if the card is missing, empty, or says that its value is not known (UNKNOWN, NULL, N/A).
 
     Raises
     ------
@@ -87,7 +94,8 @@ def header_text(header: fits.Header, key: str, name: str) -> str | None:
     value = _value(header, key)
     if value is not None and not isinstance(value, str):
         raise card_error(name, key, value, "text")
-    return value or None
+    text = (value or "").strip()
+    return None if text.upper() in _UNKNOWN else text
 
 
 def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time | None:

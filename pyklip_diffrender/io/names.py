@@ -14,8 +14,20 @@ _SIMBAD = re.compile(r"(V|NAME|\*+)?\*?[\s_-]+", re.IGNORECASE)
 """What SIMBAD, and observers after it, write before names: V* AU Mic, V-AU-MIC, * bet Pic."""
 
 
+_SIGN = re.compile(r"\+(?=\s*\d)")
+"""A plus sign before digits, which belongs to the name: BD+20 1790 is not BD-20 1790."""
+
+
 def same_name(first: str | None, second: str | None) -> bool:
-    """Whether two names differ only in case, separators and SIMBAD's marks before the name."""
+    """Whether two names differ only in case, separators and SIMBAD's marks before the name.
+
+    A plus sign before digits counts. A minus sign cannot be told from a dash.
+
+    Examples
+    --------
+    >>> same_name("V* AU Mic", "au-mic"), same_name("BD+20-1790", "BD-20-1790")
+    (True, False)
+    """
     names = [str(each) for each in (first, second)]
     return _plain(names[0]) == _plain(names[1]) or _bare(names[0]) == _bare(names[1])
 
@@ -32,7 +44,8 @@ def unknown_name(key: str, choice: str, names: Iterable[str | None]) -> Incompat
 
 
 def _plain(name: str) -> str:
-    return "".join(c for c in name.upper() if c.isalnum())
+    signed = _SIGN.sub("\x01", name.upper())
+    return "".join(c for c in signed if c.isalnum() or c == "\x01")
 
 
 def _bare(name: str) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 from astropy.io import fits
 
 from pyklip_diffrender.io.files import open_fits, write_fits
+from pyklip_diffrender.io.names import same_name
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
@@ -22,6 +23,7 @@ from pyklip_diffrender.pattern.measure import (
     measure_patterns,
 )
 from pyklip_diffrender.refinement.result import Refinement
+from pyklip_diffrender.scene.exposure import star_of
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 
@@ -69,15 +71,13 @@ def known_systematics(
     known = _library_for(observation) if library else []
     pedestal = known[0].pedestal if known else None
     patterns = measure_patterns(references, pedestal)
-    stars = {_plain(pattern.star) for pattern in patterns} | {_plain(observation.target)}
+    target = star_of(observation.header, observation.name).names or (observation.target,)
+    stars = [pattern.star for pattern in patterns] + list(target)
     if all(pattern.first_pixel is not None for pattern in patterns):
-        patterns += [each for each in known if _plain(each.star) not in stars]
+        patterns += [
+            each for each in known if not any(same_name(each.star, star) for star in stars)
+        ]
     return combine_patterns(patterns) if len(patterns) > 1 else None
-
-
-def _plain(name: str) -> str:
-    """A star's name without what spellings differ in."""
-    return "".join(c for c in name.upper() if c.isalnum())
 
 
 def _library_for(observation: Observation) -> list[MeasuredPattern]:

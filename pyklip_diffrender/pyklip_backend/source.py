@@ -200,7 +200,7 @@ def _read(path: str, dataset: Any) -> _File:
     as_read, usable = data[0], (flags & BAD_PIXEL_BITS) == 0
     if not aligned:
         moved = "STARCENX" in header
-        origin = None if moved else first_pixel(header, np.zeros(2, dtype=np.int64), path)
+        origin = None if moved else first_pixel(header, center, data.shape[1:], Path(path).name)
         if error is not None and header.get("INSTRUME") == "NIRCAM":
             # As `Observation.from_fits` does.
             scale = float(np.sqrt(science["PIXAR_A2"]))

@@ -94,6 +94,7 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
             ),
             *(_frame(each, "reference") for each in sequence.references),
         ],
+        "admission": _rows(sequence.table),
         "left_out": [
             *({"name": name, "reason": reason} for name, reason in sequence.excluded),
             *({"name": f"reference star {n}", "reason": why} for n, why in reduction.failed),

@@ -21,6 +21,7 @@ from pyklip_diffrender.refinement.planned import choose_plan, fit_problems
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
+from pyklip_diffrender.scene.agreement import require_agreement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import as_opd_map
@@ -114,6 +115,7 @@ def refine(
     observations = [observation] if isinstance(observation, Observation) else list(observation)
     if not observations:
         raise NoValidPixelsError("observation: got an empty sequence, expected at least one")
+    require_agreement(observations)
     adapted = settings_for(observations[0]) if settings is None else settings
     if not isinstance(adapted, GaussNewton):
         raise IncompatibleSetupError(

@@ -14,25 +14,31 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, UnitError
 from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.io.headers import header_date, header_number, header_text, merged_header
+from pyklip_diffrender.io.headers import header_number, header_text, merged_header
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.scene.detector_pixels import (
     SHIFTS,
     first_pixel,
+    mask_place,
     net_shifts,
+    on_detector,
     recorded_shifts,
-    shift_frames,
+    undo_shifts,
 )
+from pyklip_diffrender.scene.exposure import beginning, position_angle
 
-__all__ = ["BAD_PIXEL_BITS", "dither", "on_detector_pixels", "read_calints"]
+__all__ = ["BAD_PIXEL_BITS", "BEHIND_THE_MASK", "dither", "on_detector_pixels", "read_calints"]
 
 BAD_PIXEL_BITS = 1 | 2 | 512 | 1024
 """JWST data-quality bits that take a pixel out of the fit: DO_NOT_USE, SATURATED, NON_SCIENCE,
 DEAD. A jump (4) that the ramp fit has repaired, or a hot pixel (2048) that was dark-subtracted,
 may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
 
-_BEHIND_THE_MASK = 0.1
+BEHIND_THE_MASK = 0.1
 """Largest dither, arcsec, that leaves a star behind the mask; small-grid dithers are of 0.02."""
+
+_CROPPED = 32
+"""Whole pixels beyond which frames were cropped, and not only aligned."""
 
 
 def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[Any] | None]:
@@ -89,8 +95,6 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
         "valid": (quality.astype(np.uint32) & BAD_PIXEL_BITS) == 0,
         **details,
     }
-    if shifts is None and not moved:
-        arguments["first_pixel"] = first_pixel(header, np.zeros(2, dtype=np.int64), path.name)
     if mask is not None:
         # spaceKLIP records the star's position minus the mask's, in pixels, for every integration.
         offset = native_float64(mask).reshape(-1, 2).mean(axis=0) * arguments["pixelscale"]
@@ -101,11 +105,17 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
             arguments["star_offset"] = offset
             if arguments["center"] is not None:
                 arguments["center"] += np.divide(offset, arguments["pixelscale"])
+    if shifts is None and not moved:
+        ny, nx = data.shape[-2:]
+        star = arguments["center"]
+        if star is None:
+            star = np.array([nx - 1, ny - 1]) / 2
+        arguments["first_pixel"] = first_pixel(header, star, (ny, nx), path.name)
     return arguments, shifts
 
 
 def dither(header: fits.Header, name: str) -> tuple[float, float] | None:
-    """Position of a dithered star relative to the mask.
+    """Read the position of a dithered star relative to the mask.
 
     Dithers on a small grid (XOFFSET, YOFFSET) move the star behind the mask, and on the detector,
     from the position that CRPIX states.
@@ -122,7 +132,7 @@ def dither(header: fits.Header, name: str) -> tuple[float, float] | None:
         x, y, arcsec; None without a dither, or with one that takes the star off the mask.
     """
     x, y = (header_number(header, key, name) or 0.0 for key in ("XOFFSET", "YOFFSET"))
-    return (x, y) if 0 < np.hypot(x, y) < _BEHIND_THE_MASK else None
+    return (x, y) if 0 < np.hypot(x, y) < BEHIND_THE_MASK else None
 
 
 def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
@@ -139,7 +149,7 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
         number(key, number(fallback, np.nan)) for key, fallback in
         (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
     ]  # fmt: skip
-    angle = number("ROLL_REF", np.nan) - number("V3I_YANG", 0.0) * number("VPARITY", -1)
+    angle = position_angle(header, name)
     middle = header_number(header, "EXPMID", name)
     area = number("PIXAR_A2", 0.0)
     if area == 0:
@@ -154,9 +164,9 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
         "pixelscale": area**0.5,
         "center": None if np.isnan(star).any() else np.array(star) - 1,
         "filter": header_text(header, "FILTER", name),
-        "date": header_date(header, ("DATE-BEG", "DATE-OBS"), name),
+        "date": beginning(header, name),
         "mid_date": None if middle is None else Time(middle, format="mjd", scale="utc"),
-        "position_angles": None if np.isnan(angle) else np.full(frames, angle),
+        "position_angles": None if angle is None else np.full(frames, angle),
         "name": name,
         "header": header,
     }
@@ -170,7 +180,7 @@ def on_detector_pixels(
     Parameters
     ----------
     arguments : dict
-        See `read_calints`. The alignment leaves DQ unchanged.
+        See `read_calints`.
     center : ndarray, (frames, 2)
         x, y of the star, 0-indexed.
     shifts : ndarray, (frames, 2)
@@ -182,19 +192,33 @@ def on_detector_pixels(
         The attributes of the observation that change.
     """
     name, header, frames = arguments["name"], arguments["header"], len(center)
-    net = net_shifts(shifts, center, header, name)
-    pixels = np.round(net.mean(axis=0)).astype(np.int64)
     data, error, usable = (
         arguments[key].reshape(frames, *arguments[key].shape[-2:])
         for key in ("data", "error", "valid")
     )
-    shifted = [shift_frames(np.nan_to_num(each), pixels - net) for each in (data, error)]
-    usable = np.roll(usable, (pixels[1], pixels[0]), axis=(1, 2))
-    good = np.isfinite(data) & np.isfinite(error) & usable & (shifted[1] > 0)
+    mask = None if arguments["center"] is None else mask_place(header, name)
+    begin = np.zeros(2)
+    if mask is not None:
+        stated = [header_number(header, key, name) for key in ("SUBSTRT1", "SUBSTRT2")]
+        if None in stated:
+            # As if nothing had been cut; the place on the detector does not depend on it.
+            begin = np.round((mask - center + shifts).mean(axis=0))
+        else:
+            begin = np.array([float(each or 0) - 1 for each in stated])
+        mask = mask - begin
+    net = net_shifts(shifts, center, mask)
+    pixels = np.round(net.mean(axis=0))
+    shifted, sigma, good = undo_shifts(data, error, pixels - net)
+    # The alignment leaves the flags where they were; a crop takes them along.
+    cropped = np.abs(pixels).max() > _CROPPED
+    right, up = (int(each) for each in (np.round(shifts.mean(axis=0)) if cropped else pixels))
+    good &= np.roll(usable, (up, right), axis=(1, 2))
+    column, row = (int(each) for each in begin - pixels)
+    sure = mask is not None and on_detector((column, row), data.shape[1:])
     return {
-        "data": np.where(good, shifted[0], 0.0),
-        "error": np.where(good, shifted[1], 1.0),
+        "data": np.where(good, shifted, 0.0),
+        "error": np.where(good, sigma, 1.0),
         "valid": good,
         "center": center + pixels - net,
-        "first_pixel": first_pixel(header, pixels, name),
+        "first_pixel": (column, row) if sure else None,
     }

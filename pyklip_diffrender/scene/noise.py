@@ -8,13 +8,14 @@ the frame itself, far from the star.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve
 from scipy.stats import median_abs_deviation
 
-__all__ = ["calibrated_errors"]
+__all__ = ["calibrated_errors", "calibration", "why_odd_noise"]
 
 _log = logging.getLogger(__name__)
 
@@ -26,6 +27,10 @@ still shows in differences of neighbouring pixels."""
 
 _ENOUGH = 2000
 """Number of far pixels below which the errors are left as they are."""
+
+_PLAUSIBLE = (0.1, 5.0)
+"""Ratio of scatter and errors beyond which the errors are not those of these pixels. It was 0.4 to
+1.2 in the real frames at hand."""
 
 _NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
 
@@ -77,7 +82,67 @@ def calibrated_errors(
     >>> bool(abs(error.mean() - 0.5) < 0.01)
     True
     """
-    corrected = error.copy()
+    return calibration(data, error, valid, center, pixelscale, name)[0]
+
+
+def calibration(
+    data: Image,
+    error: Image,
+    valid: NDArray[np.bool_],
+    center: Image,
+    pixelscale: tuple[float, float],
+    name: str = "frames",
+) -> tuple[Image, tuple[float, ...]]:
+    """Corrected errors, and the scatter far from the star over the errors that were stated.
+
+    The arguments are those of `calibrated_errors`.
+
+    Returns
+    -------
+    errors : ndarray, (frames, ny, nx)
+    ratios : tuple of float
+        For every frame; NaN where there are too few pixels.
+    """
+    corrected, ratios = error.copy(), []
+    for k, (ratio, floor) in enumerate(_measured(data, error, valid, center, pixelscale)):
+        ratios.append(ratio)
+        if not ratio > 0:
+            continue
+        sigma = error[k]
+        least = min(ratio, 1.0) * sigma
+        variance = np.maximum(sigma**2 + (ratio**2 - 1) * floor**2, least**2)
+        corrected[k] = np.where(valid[k], np.sqrt(variance), sigma)
+        _log.info("%s, frame %d: the noise far from the star is %.2f of ERR", name, k, ratio)
+    return corrected, tuple(ratios)
+
+
+def why_odd_noise(ratios: Iterable[float]) -> str:
+    """Why errors cannot be those of the pixels; empty if they can.
+
+    Parameters
+    ----------
+    ratios : iterable of float
+        See `calibration`.
+    """
+    low, high = _PLAUSIBLE
+    for ratio in ratios:
+        if np.isfinite(ratio) and not low < ratio < high:
+            return (
+                f"far from the star its pixels scatter {ratio:.2g} times as much as ERR says, "
+                f"expected {low:g} to {high:g} times. ERR is probably in another unit than SCI, a "
+                "variance, or of other frames"
+            )
+    return ""
+
+
+def _measured(
+    data: Image,
+    error: Image,
+    valid: NDArray[np.bool_],
+    center: Image,
+    pixelscale: tuple[float, float],
+) -> Iterator[tuple[float, float]]:
+    """Ratio and median of the errors far from the star, for every frame; NaN if not known."""
     y, x = np.indices(data.shape[1:])
     for k, (frame, sigma, usable) in enumerate(zip(data, error, valid, strict=True)):
         away = np.hypot((x - center[k, 0]) * pixelscale[0], (y - center[k, 1]) * pixelscale[1])
@@ -85,15 +150,9 @@ def calibrated_errors(
         complete = convolve(usable.astype(float), _NEIGHBOURS, mode="constant") > 0.99
         far = usable & complete & (away > _FAR)
         if far.sum() < _ENOUGH:
+            yield np.nan, np.nan
             continue
         difference = frame - convolve(frame, _NEIGHBOURS, mode="nearest")
         predicted = np.sqrt(sigma**2 + convolve(sigma**2, _NEIGHBOURS, mode="nearest") / 4)
         ratio = float(median_abs_deviation((difference / predicted)[far], scale="normal"))
-        if not ratio > 0:
-            continue
-        floor = float(np.median(sigma[far]))
-        least = min(ratio, 1.0) * sigma
-        variance = np.maximum(sigma**2 + (ratio**2 - 1) * floor**2, least**2)
-        corrected[k] = np.where(usable, np.sqrt(variance), sigma)
-        _log.info("%s, frame %d: the noise far from the star is %.2f of ERR", name, k, ratio)
-    return corrected
+        yield ratio, float(np.median(sigma[far]))

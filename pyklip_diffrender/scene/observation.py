@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -29,10 +30,42 @@ from pyklip_diffrender.io.units import (
     to_pair,
     to_unit,
 )
+from pyklip_diffrender.scene.exposure import star_of
+from pyklip_diffrender.scene.integrations import (
+    empty_integrations,
+    judge_integrations,
+    pointings,
+)
 from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints
-from pyklip_diffrender.scene.noise import calibrated_errors
+from pyklip_diffrender.scene.noise import calibration
 
 __all__ = ["Observation"]
+
+_log = logging.getLogger(__name__)
+
+
+def _without_empty(
+    arguments: dict[str, Any], shifts: NDArray[Any] | None
+) -> tuple[dict[str, Any], NDArray[Any] | None, tuple[str, ...]]:
+    """Leave integrations out that have no usable pixels; see `read_calints` for the arguments."""
+    stacks = [np.asarray(arguments[key]) for key in ("data", "error", "valid")]
+    data, error, valid = (each[None] if each.ndim == 2 else each for each in stacks)
+    if data.ndim != 3 or not data.shape == error.shape == valid.shape:
+        return arguments, shifts, ()
+    usable = valid & np.isfinite(data) & np.isfinite(error) & (error > 0)
+    judgement = empty_integrations(data, usable)
+    if judgement.kept.all():
+        return arguments, shifts, ()
+    name, remarks = arguments["name"], judgement.remarks
+    if not judgement.kept.any():
+        raise NoValidPixelsError(f"{name}: {'; '.join(remarks)}. Look at its SCI, ERR and DQ")
+    for remark in remarks:
+        _log.warning("%s: %s", name, remark)
+    kept = judgement.kept
+    changed = {"data": data[kept], "error": error[kept], "valid": valid[kept]}
+    if arguments["position_angles"] is not None:
+        changed["position_angles"] = arguments["position_angles"][kept]
+    return arguments | changed, None if shifts is None else shifts[kept], remarks
 
 
 def _spread(array: NDArray[np.float64], shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
@@ -77,6 +110,11 @@ class Observation:
     name : str
     header : Header
         Primary and science headers of the file, merged.
+    remarks : tuple of str
+        What was left out of the file when it was read, and why.
+    noise_ratios : tuple of float
+        Scatter of the file's pixels far from the star over their stated errors, for every frame,
+        before the errors were corrected; NaN where it could not be measured.
 
     Examples
     --------
@@ -106,6 +144,8 @@ class Observation:
     star_offset: tuple[float, float] | None = None
     first_pixel: tuple[int, int] | None = None
     header: fits.Header = field(default_factory=fits.Header)
+    remarks: tuple[str, ...] = ()
+    noise_ratios: tuple[float, ...] = ()
 
     @classmethod
     def from_arrays(
@@ -201,17 +241,27 @@ class Observation:
         )
 
     @classmethod
-    def from_fits(cls, path: str | os.PathLike[str]) -> Observation:
+    def from_fits(
+        cls, path: str | os.PathLike[str], *, every_integration: bool = False
+    ) -> Observation:
         """Read a JWST stage-2 coronagraphic file (calints).
 
-        Uses SCI, ERR and DQ, BUNIT, FILTER, DATE-BEG and EXPMID, ROLL_REF and V3I_YANG, the
-        aperture's pixel area, and the star's position from STARCENX/Y, else CRPIX1/2 (1-indexed)
-        with the dither behind the mask, XOFFSET and YOFFSET.
+        Uses SCI, ERR and DQ, BUNIT, FILTER, DATE-BEG (or DATE-OBS with TIME-OBS, or EXPSTART) and
+        EXPMID, ROLL_REF and V3I_YANG, the aperture's pixel area, and the star's position from
+        STARCENX/Y, else CRPIX1/2 (1-indexed) with the dither behind the mask, XOFFSET and YOFFSET.
         Of spaceKLIP's files also MASKOFFS, the position of the star from the mask, and the shifts
         of aligned frames (IMSHIFTS, or CENTER_SHIFT and ALIGN_SHIFT): they are undone, so that the
         pixels are those of the detector, whose flat-field errors then stay in their pixels.
         Errors of NIRCam frames are corrected for the noise that is measured far from the star, see
-        `pyklip_diffrender.scene.noise.calibrated_errors`.
+        `pyklip_diffrender.scene.noise.calibrated_errors`. Integrations that are empty are left out,
+        and three or more are compared with each other, see
+        `pyklip_diffrender.scene.integrations.judge_integrations`; `remarks` says what was left out.
+
+        Parameters
+        ----------
+        path : path
+        every_integration : bool
+            Keep all integrations and pixels, as the file has them.
 
         Raises
         ------
@@ -224,21 +274,77 @@ class Observation:
             As `from_arrays`.
         """
         arguments, shifts = read_calints(path)
+        remarks: tuple[str, ...] = ()
+        if not every_integration:
+            arguments, shifts, remarks = _without_empty(arguments, shifts)
         observation = cls.from_arrays(**arguments)
         if shifts is not None:
             changes = on_detector_pixels(arguments, observation.center, shifts)
             observation = replace(observation, **changes)
-        if not observation.is_nircam:
-            return observation
-        errors = calibrated_errors(
-            observation.data,
-            observation.error,
-            observation.valid,
-            observation.center,
-            observation.pixelscale,
-            observation.name,
+        if observation.is_nircam:
+            error, ratios = calibration(
+                observation.data,
+                observation.error,
+                observation.valid,
+                observation.center,
+                observation.pixelscale,
+                observation.name,
+            )
+            observation = replace(observation, error=error, noise_ratios=ratios)
+        observation = replace(observation, remarks=remarks)
+        return observation if every_integration else observation.judged()
+
+    def judged(self) -> Observation:
+        """Leave out what deviates from the median of the integrations of one pointing."""
+        kept, valid = np.ones(len(self), dtype=bool), self.valid.copy()
+        remarks = list(self.remarks)
+        for group in pointings(self.center, self.position_angles):
+            judgement = judge_integrations(
+                self.data[group], self.error[group], self.valid[group], self.center[group],
+                self.pixelscale,
+            )  # fmt: skip
+            kept[group], valid[group] = judgement.kept, judgement.valid
+            remarks += judgement.remarks
+        if kept.all() and (valid == self.valid).all():
+            return self
+        for remark in remarks[len(self.remarks) :]:
+            _log.warning("%s: %s", self.name, remark)
+        cleaned = replace(
+            self,
+            data=np.where(valid, self.data, 0.0),
+            error=np.where(valid, self.error, 1.0),
+            valid=valid,
+            remarks=tuple(remarks),
         )
-        return replace(observation, error=errors)
+        return cleaned.part(np.flatnonzero(kept))
+
+    def part(self, which: NDArray[np.intp]) -> Observation:
+        """Some of the frames, by their indices."""
+        angles, ratios = self.position_angles, self.noise_ratios
+        return replace(
+            self,
+            data=self.data[which],
+            error=self.error[which],
+            valid=self.valid[which],
+            center=self.center[which],
+            position_angles=None if angles is None else angles[which],
+            noise_ratios=tuple(ratios[k] for k in which) if ratios else (),
+        )
+
+    def pointings(self) -> tuple[Observation, ...]:
+        """Split frames that show the star at different places or orientations.
+
+        Frames of one observation are averaged for a fit. Those whose stars are more than 0.3
+        pixels apart, or whose position angles differ by more than 0.05 degrees, are not of one
+        pointing.
+        """
+        groups = list(pointings(self.center, self.position_angles))
+        if len(groups) == 1:
+            return (self,)
+        return tuple(
+            replace(self.part(group), name=f"{self.name} (pointing {k})")
+            for k, group in enumerate(groups, 1)
+        )
 
     def __len__(self) -> int:
         return len(self.data)
@@ -274,13 +380,14 @@ class Observation:
 
     @property
     def target(self) -> str:
-        """Name of the star: TARGPROP of the header, else the name of the observation."""
-        return str(self.header.get("TARGPROP", self.name)).strip()
+        """Name of the star: TARGPROP or TARGNAME, else the name of the observation."""
+        names = star_of(self.header, self.name).names
+        return names[0] if names else self.name
 
     @property
     def is_nircam(self) -> bool:
         """Whether the header says that these are real frames of NIRCam."""
-        return bool(self.header.get("INSTRUME") == "NIRCAM")
+        return str(self.header.get("INSTRUME", "")).strip().upper() == "NIRCAM"
 
     @property
     def position_angle(self) -> float:

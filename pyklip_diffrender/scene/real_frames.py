@@ -6,11 +6,13 @@ from functools import lru_cache
 from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.masks import ROUND_MASKS, mask_of_header
+from pyklip_diffrender.instrument.masks import ROUND_MASKS
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_throughput
+from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.optics.grid import samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.scene.exposure import image_mask
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["model_for"]
@@ -69,8 +71,8 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
             f"{observation.name}: the filter of these frames is not known. Give the observation a "
             "filter, such as 'F444W', or make the model with nircam_coronagraph"
         )
-    instrument = str(observation.header.get("INSTRUME", "NIRCAM")).strip()
-    if instrument.upper() != "NIRCAM":
+    instrument = header_text(observation.header, "INSTRUME", observation.name)
+    if instrument is not None and instrument.upper() != "NIRCAM":
         raise IncompatibleSetupError(
             f"{observation.name}: these frames are of {instrument}, and only NIRCam's coronagraph "
             "is built in. Make the model of another one with from_poppy, and fit with refine"
@@ -80,8 +82,13 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
         "pixelscale": observation.pixelscale,
     }
     if observation.is_nircam:
-        mask_name = str(observation.header.get("CORONMSK", "MASK335R")).strip().upper()
-        name = overrides.get("image_mask") or mask_of_header(mask_name)
+        mask_name = image_mask(observation.header, observation.name)
+        name = overrides.get("image_mask") or mask_name
+        if name is None:
+            raise IncompatibleSetupError(
+                f"{observation.name}: the header does not say behind which mask the star is. Add "
+                "CORONMSK, such as MASKA335R, or give image_mask"
+            )
         if name not in ROUND_MASKS:
             raise IncompatibleSetupError(
                 f"{observation.name}: these frames have image mask {mask_name}, expected one of "

@@ -3,24 +3,35 @@
 from __future__ import annotations
 
 import os
-from collections import Counter, abc
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from astropy import units as u
 from astropy.table import QTable
 from astropy.time import Time
 
-from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.io.names import same_name, unknown_name
+from pyklip_diffrender.scene.admission import (
+    EPOCH,
+    Candidate,
+    choose_filter,
+    choose_target,
+    epochs_of,
+    exclude_copies,
+    exclude_other_setups,
+    exclude_unoriented,
+    exclude_unusable,
+    exposures_in,
+    judge_frames,
+    require_some,
+)
+from pyklip_diffrender.scene.admission_table import SHORT, Row, rows_table
+from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["Sequence"]
-
-_SUFFIXES = (".fits", ".fits.gz")
 
 _NEARLY_THE_SAME = 2
 """Pixels by which the stars of two rolls may be apart for one window on the detector."""
@@ -40,6 +51,9 @@ class Sequence:
         Frames of other stars through the same coronagraph, in order of time.
     excluded : tuple of (str, str)
         Names of the files that were left out, and why.
+    rows : tuple of Row
+        What every file is, and what it is used for; see `table`. Empty for a sequence that was not
+        made from files.
 
     Examples
     --------
@@ -59,6 +73,7 @@ class Sequence:
     science: tuple[Observation, ...]
     references: tuple[Observation, ...] = ()
     excluded: tuple[tuple[str, str], ...] = ()
+    rows: tuple[Row, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.science:
@@ -72,8 +87,7 @@ class Sequence:
 
     def _repr_html_(self) -> str:
         facts = {"Filter": self.filter, "Left out": len(self.excluded) or None}
-        table = self.table
-        return html_summary(f"Sequence of {self.target}", facts, table, table.colnames)
+        return html_summary(f"Sequence of {self.target}", facts, self.table, SHORT)
 
     @property
     def filter(self) -> str | None:
@@ -87,69 +101,139 @@ class Sequence:
         *,
         target: str | None = None,
         filter: str | None = None,
+        epoch: str | Time | None = None,
     ) -> Sequence:
-        """Sort JWST coronagraphic files into target and reference stars by their headers.
+        """Sort JWST coronagraphic files into target and reference stars.
+
+        Every file is judged by its header and its pixels. What is not a frame of a star behind a
+        mask, is there twice, was taken with another set-up than most of the target's frames, or
+        contradicts the other frames is excluded with the reason.
 
         Parameters
         ----------
         files : path or sequence of path
             Stage-2 files (calints), spaceKLIP's aligned files, or a folder with either.
         target : str, optional
-            Name of the target (TARGPROP), in which case, spaces and dashes do not matter. Default
-            the star that is not marked as a reference (IS_PSF), if there is just one.
+            Name of the target (TARGPROP or TARGNAME), in which case, spaces and dashes do not
+            matter. Default the star that is not marked as a reference (IS_PSF), if there is just
+            one.
         filter : str, optional
             Filter to use. Default the one of all files, if there is just one.
+        epoch : str or Time, optional
+            Date in the epoch to use, such as "2022-10-03", if the target was observed in several.
+            Frames of one epoch are at most 5 days apart, and share a wavefront.
 
         Returns
         -------
         Sequence
-            Files that cannot be used are listed in `excluded` with the reason.
+            `table` lists all files, what they are used for and why.
 
         Raises
         ------
         IncompatibleSetupError
-            If target or filter cannot be decided, with the choices.
+            If target, filter or epoch cannot be decided, with the choices; if frames of the target
+            contradict each other, and nothing says which are right.
         NoValidPixelsError
             If no frame of the target is left.
         """
-        paths = _paths(files)
-        observations: list[Observation] = []
-        excluded: list[tuple[str, str]] = []
-        for path in paths:
-            try:
-                observations.append(Observation.from_fits(path))
-            except DiffrenderError as error:
-                excluded.append((path.name, str(error)))
-        if not observations:
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in excluded)
-            raise NoValidPixelsError(f"none of {len(paths)} files can be used: {reasons}")
-        filter = _the_only("filter", filter, [each.filter for each in observations])
-        through = [each for each in observations if same_name(each.filter, filter)]
-        excluded += [
-            (each.name, f"taken through {each.filter}, not {filter}")
-            for each in observations
-            if not same_name(each.filter, filter)
-        ]
-        if target is None:
-            unmarked = [each.target for each in through if not each.header.get("IS_PSF")]
-            target = _the_only("target", None, unmarked or [each.target for each in through])
-        science = [each for each in through if same_name(each.target, target)]
-        if not science:
-            raise unknown_name("target", target, [each.target for each in through])
-        setup = _setup(science[0])
-        references = []
-        for each in through:
-            if same_name(each.target, target):
+        sequences = cls.by_epoch(files, target=target, filter=filter)
+        if epoch is not None:
+            date = Time(epoch)
+            near = [
+                (abs(each.date.mjd - date.mjd), k)
+                for k, each in enumerate(sequences)
+                if each.date is not None and abs(each.date.mjd - date.mjd) <= EPOCH + 1
+            ]
+            if not near:
+                raise IncompatibleSetupError(
+                    f"epoch: got {date.isot[:10]}, expected one of {_days(sequences)}"
+                )
+            return sequences[min(near)[1]]
+        if len(sequences) > 1:
+            raise IncompatibleSetupError(
+                f"{sequences[0].target}: the frames are of {len(sequences)} epochs, whose "
+                f"wavefronts differ: {_days(sequences)}. Reduce each of them alone: choose one "
+                "with epoch=..., or take all with Sequence.by_epoch. The command reduce does so"
+            )
+        return sequences[0]
+
+    @classmethod
+    def by_epoch(
+        cls,
+        files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+        *,
+        target: str | None = None,
+        filter: str | None = None,
+    ) -> tuple[Sequence, ...]:
+        """Sort files as `from_files` does, into one sequence for each epoch.
+
+        Frames of the target more than 5 days apart belong to different epochs. A reference star
+        belongs to the epochs of the target that it was observed within 5 days of.
+
+        Returns
+        -------
+        tuple of Sequence
+            In order of time.
+        """
+        candidates = exposures_in(files)
+        exclude_unusable(candidates)
+        require_some(candidates)
+        choose_filter(candidates, filter)
+        science, references = choose_target(candidates, target)
+        exclude_other_setups(science, references)
+        star = science[0].star
+        frames = {
+            id(each): each.read() for each in (*science, *references) if not each.reason
+        }  # fmt: skip
+        for group in (science, *_by_star(references)):
+            judge_frames([each for each in group if not each.reason], frames)
+        exclude_copies([*science, *references], frames)
+        exclude_unoriented(science)
+        if all(each.reason for each in science):
+            reasons = "; ".join(f"{each.name}: {each.reason}" for each in science)
+            raise NoValidPixelsError(f"{star}: no frames of the target can be used: {reasons}")
+        kept = [each for each in science if not each.reason]
+        epochs = epochs_of([each.exposure.date for each in kept])
+        return tuple(
+            cls._of_epoch(star, [kept[k] for k in epoch], candidates, science, frames)
+            for epoch in epochs
+        )
+
+    @classmethod
+    def _of_epoch(
+        cls,
+        star: str,
+        chosen: list[Candidate],
+        candidates: list[Candidate],
+        science: list[Candidate],
+        frames: Mapping[int, Observation | None],
+    ) -> Sequence:
+        """Make the sequence of one epoch, of which `chosen` are the target's frames."""
+        dates = [each.exposure.date for each in chosen if each.exposure.date is not None]
+        rows, excluded = [], []
+        used: dict[str, list[Observation]] = {"target": [], "reference": []}
+        for each in candidates:
+            reason = each.reason
+            if not reason and each not in chosen and (each in science or not _near(each, dates)):
+                day = min(dates).isot[:10]
+                reason = f"of another epoch than the frames of {day}, which have another wavefront"
+            if reason:
+                excluded.append((each.name, reason))
+                rows.append(Row("excluded", each.star, each.exposure, None, reason))
                 continue
-            if _setup(each) == setup:
-                references.append(replace(each, reference=True))
-            else:
-                excluded.append((each.name, f"set-up {_setup(each)} differs from {setup}"))
+            use: Literal["target", "reference"] = "target" if each in chosen else "reference"
+            observation = frames[id(each)]
+            for part in () if observation is None else observation.pointings():
+                part = replace(part, reference=use == "reference")
+                used[use].append(part)
+                rows.append(Row(use, each.star, each.exposure, part, "; ".join(part.remarks)))
+        rows.sort(key=lambda row: (("target", "reference", "excluded").index(row.use), row.time))
         return cls(
-            science[0].target,
-            tuple(sorted(science, key=_time)),
-            tuple(sorted(references, key=_time)),
+            star,
+            tuple(sorted(used["target"], key=_time)),
+            tuple(sorted(used["reference"], key=_time)),
             tuple(excluded),
+            tuple(rows),
         )
 
     @property
@@ -160,21 +244,13 @@ class Sequence:
 
     @property
     def table(self) -> QTable:
-        """One row for each observation: what it is used for, star, date, roll and exposure."""
-        rows = [("target", each) for each in self.science]
-        rows += [("reference", each) for each in self.references]
-        table = QTable(
-            {
-                "use": [use for use, _ in rows],
-                "star": [each.target for _, each in rows],
-                "date": ["" if e.date is None else e.date.isot[:16] for _, e in rows],
-                "position_angle": [each.position_angle for _, each in rows] * u.deg,
-                "integrations": [len(each) for _, each in rows],
-                "file": [each.name for _, each in rows],
-            }
-        )
-        table["position_angle"].info.format = ".2f"
-        return table
+        """One row for each file: what it is used for and why, and what it is.
+
+        Positions of the star behind the mask, `offset_x` and `offset_y`, are NaN where the file
+        does not state them.
+        """
+        rows = self.rows or (*_rows("target", self.science), *_rows("reference", self.references))
+        return rows_table(rows)
 
     def cutout(self, size: int) -> Sequence:
         """Cut the `size` x `size` pixels about the star out of every frame.
@@ -196,40 +272,34 @@ class Sequence:
         )
 
 
-def _paths(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
-    entries = [files] if isinstance(files, str | os.PathLike) else list(files)
-    paths: list[Path] = []
-    for each in map(Path, entries):
-        if each.is_dir():
-            inside = sorted(p for p in each.iterdir() if p.name.endswith(_SUFFIXES))
-            if not inside:
-                raise NoValidPixelsError(f"{each}: the folder has no FITS files")
-            paths += inside
-        else:
-            paths.append(each)
-    if not paths:
-        raise NoValidPixelsError("files: got none, expected at least one")
-    return paths
+def _rows(
+    use: Literal["target", "reference"], observations: Iterable[Observation]
+) -> Iterable[Row]:
+    for each in observations:
+        exposure = Exposure.of(each.header, each.name, each.data.shape)
+        yield Row(use, each.target, exposure, each)
 
 
-def _the_only(key: str, choice: str | None, values: abc.Sequence[str | None]) -> str:
-    """Return the requested value, or the only one in the files."""
-    counts = Counter(str(value) for value in values)
-    if choice is not None:
-        if not any(same_name(choice, value) for value in counts):
-            raise unknown_name(key, choice, counts)
-        return choice
-    if len(counts) > 1:
-        raise IncompatibleSetupError(
-            f"{key}: the files have {', '.join(f'{n} ({c})' for n, c in counts.items())}; choose "
-            f"one with {key}=..."
-        )
-    return next(iter(counts))
+def _by_star(candidates: Iterable[Candidate]) -> Iterable[list[Candidate]]:
+    stars: dict[str, list[Candidate]] = {}
+    for each in candidates:
+        stars.setdefault(each.star, []).append(each)
+    return stars.values()
 
 
-def _setup(observation: Observation) -> tuple[str, ...]:
-    keys = ("CORONMSK", "PUPIL", "SUBARRAY", "DETECTOR")
-    return tuple(str(observation.header.get(key, "")) for key in keys)
+def _near(candidate: Candidate, dates: list[Time]) -> bool:
+    """Whether a frame was taken in the epoch of these dates, as far as is known."""
+    date = candidate.exposure.date
+    return date is None or not dates or min(abs(date.mjd - each.mjd) for each in dates) <= EPOCH
+
+
+def _days(sequences: Iterable[Sequence]) -> str:
+    """The epochs of sequences with their files, for messages."""
+    return "; ".join(
+        f"{'no date' if each.date is None else each.date.isot[:10]} "
+        f"({', '.join(dict.fromkeys(frame.name for frame in each.science))})"
+        for each in sequences
+    )
 
 
 def _time(observation: Observation) -> float:

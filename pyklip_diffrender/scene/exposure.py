@@ -1,0 +1,407 @@
+"""What the header of a file says about its exposure.
+
+No card has a default here: a value that is not stated is None, and whoever needs it has to say so.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.time import Time
+
+from pyklip_diffrender.errors import CorruptFileError
+from pyklip_diffrender.io.headers import card_error, header_date, header_number, header_text
+from pyklip_diffrender.io.names import same_name
+
+__all__ = [
+    "Exposure",
+    "Star",
+    "beginning",
+    "detector_of",
+    "image_mask",
+    "is_reference",
+    "position_angle",
+    "proper_motion",
+    "star_of",
+]
+
+_LEVEL = re.compile(r"_([a-z0-9]+)\.fits(\.gz)?$", re.IGNORECASE)
+_LEVELS = (
+    "calints", "crfints", "cal", "crf", "rateints", "rate", "uncal", "ramp", "jump", "dark",
+    "trapsfilled", "i2d", "s2d", "psfsub", "psfalign", "psfstack", "x1d", "segm", "cat",
+)  # fmt: skip
+"""Products of the pipeline: those that can be used come first, the best of them in front."""
+
+_STEPS = {"S_KLIP": "psfsub", "S_PSFALI": "psfalign", "S_PSFSTK": "psfstack", "S_RESAMP": "i2d"}
+"""Steps of the pipeline after which frames are no longer those of a detector."""
+
+_NAME = re.compile(
+    r"jw(\d{5})(\d{3})(\d{3})_(\d{2})(\d)(\w{2})_(\d{5})(?:-seg(\d{3}))?_([a-z0-9]+)", re.IGNORECASE
+)
+"""Programme, observation, visit, visit group, parallel sequence, activity, exposure, segment and
+detector in the name that the archive gives to a file."""
+
+_IDENTITY = ("PROGRAM", "OBSERVTN", "VISIT", "VISITGRP", "SEQ_ID", "ACT_ID", "EXPOSURE")
+
+_MASK = re.compile(r"(?<![A-Z0-9])(?:SUB\d+|MASK)?[AB]?(?:MASK)?(\d{3}R|LWB|SWB)(?![A-Z0-9])")
+"""A mask in CORONMSK (MASKA335R), APERNAME (NRCA5_MASK335R) or SUBARRAY (SUB320A335R)."""
+
+_DETECTORS = {"NRCA5": "NRCALONG", "NRCB5": "NRCBLONG"}
+"""Detectors whose apertures (APERNAME) have another name."""
+
+_COORDINATES: tuple[tuple[str, str], ...] = (("TARG_RA", "TARG_DEC"), ("RA_REF", "DEC_REF"))
+"""Cards of the star's coordinates, and of where the telescope pointed."""
+
+_SAME_PLACE = 5.0
+"""arcsec between the coordinates of one star in two headers. They may be those of a catalogue's
+epoch in one, and of the exposure in the other."""
+
+_SAME_POINTING = 60.0
+"""arcsec between the coordinates of one star if its names agree, or if one of the two is where the
+telescope pointed."""
+
+
+@dataclass(frozen=True)
+class Star:
+    """A star as a header describes it.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The proposer's (TARGPROP) and the catalogue's (TARGNAME), where stated.
+    coordinates : tuple of float or None
+        Right ascension and declination, degrees.
+    pointing : bool
+        Whether these are the coordinates at which the telescope pointed, for want of the star's.
+    """
+
+    names: tuple[str, ...] = ()
+    coordinates: tuple[float, float] | None = None
+    pointing: bool = False
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the header says which star it is."""
+        return bool(self.names or self.coordinates)
+
+    def is_called(self, name: str) -> bool:
+        """Whether one of the names is this one, in any spelling."""
+        return any(same_name(name, each) for each in self.names)
+
+    def separation(self, other: Star) -> float | None:
+        """Arcsec between the coordinates of two headers; None if one has none."""
+        if self.coordinates is None or other.coordinates is None:
+            return None
+        (a, d), (b, e) = np.deg2rad([self.coordinates, other.coordinates])
+        # The haversine formula, which keeps its digits at small angles.
+        half = np.sin((e - d) / 2) ** 2 + np.cos(d) * np.cos(e) * np.sin((b - a) / 2) ** 2
+        return float(np.rad2deg(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1)))) * 3600)
+
+    def is_same(self, other: Star) -> bool:
+        """Whether two headers describe one star: coordinates decide, names where there are none."""
+        alike = any(other.is_called(name) for name in self.names)
+        apart = self.separation(other)
+        if apart is None:
+            return alike
+        coarse = alike or self.pointing or other.pointing
+        return apart < (_SAME_POINTING if coarse else _SAME_PLACE)
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """The facts about a file by which it is admitted to a sequence, or not.
+
+    Attributes
+    ----------
+    name : str
+        Name of the file.
+    level : str or None
+        Product of the pipeline, such as "calints".
+    exposure_type : str or None
+        EXP_TYPE.
+    identity : str or None
+        Programme, observation, visit, activity, exposure, detector and segment, as in the archive's
+        names of files.
+    instrument, detector, mask, stop, subarray, filter : str or None
+        The set-up; the mask without its module (MASK335R).
+    unit : str or None
+        BUNIT.
+    star : Star
+    reference : bool or None
+        IS_PSF.
+    background : bool
+        Whether the exposure is of the background (BKGDTARG).
+    position_angle : float or None
+        Of the +y axis, degrees east of north.
+    date : Time or None
+        Beginning, UTC.
+    offset : tuple of float
+        XOFFSET and YOFFSET, dithers from the star's position; 0 where not stated.
+    integrations : int or None
+    """
+
+    name: str
+    level: str | None = None
+    exposure_type: str | None = None
+    identity: str | None = None
+    instrument: str | None = None
+    detector: str | None = None
+    mask: str | None = None
+    stop: str | None = None
+    subarray: str | None = None
+    filter: str | None = None
+    unit: str | None = None
+    star: Star = Star()
+    reference: bool | None = None
+    background: bool = False
+    position_angle: float | None = None
+    date: Time | None = None
+    offset: tuple[float, float] = (0.0, 0.0)
+    integrations: int | None = None
+
+    @classmethod
+    def of(cls, header: fits.Header, name: str, shape: tuple[int, ...] = ()) -> Exposure:
+        """Read the facts from a merged header.
+
+        Parameters
+        ----------
+        header : Header
+            Primary and science headers of the file, merged.
+        name : str
+            Name of the file.
+        shape : tuple of int
+            Of the science data.
+
+        Raises
+        ------
+        CorruptFileError
+            If a card holds something else than it should, or two cards contradict each other.
+        """
+
+        def text(key: str) -> str | None:
+            value = header_text(header, key, name)
+            return None if value is None else value.upper()
+
+        mask = image_mask(header, name)
+        stop = text("PUPIL")
+        if stop is None and mask is not None:
+            stop = "MASKRND" if mask.endswith("R") else "MASKBAR"
+        x, y = (header_number(header, key, name) or 0.0 for key in ("XOFFSET", "YOFFSET"))
+        return cls(
+            name=name,
+            level=_level(header, name, len(shape)),
+            exposure_type=text("EXP_TYPE"),
+            identity=_identity(header, name),
+            instrument=text("INSTRUME"),
+            detector=detector_of(header, name),
+            mask=mask,
+            stop=stop,
+            subarray=text("SUBARRAY"),
+            filter=text("FILTER"),
+            unit=header_text(header, "BUNIT", name),
+            star=star_of(header, name),
+            reference=is_reference(header),
+            background=_flag(header, "BKGDTARG") is True,
+            position_angle=position_angle(header, name),
+            date=beginning(header, name),
+            offset=(x, y),
+            integrations=shape[0] if len(shape) == 3 else 1 if len(shape) == 2 else None,
+        )
+
+    @property
+    def setup(self) -> tuple[str | None, ...]:
+        """What frames that are reduced together have in common."""
+        return (self.instrument, self.detector, self.mask, self.stop, self.filter, self.unit)
+
+
+def image_mask(header: fits.Header, name: str) -> str | None:
+    """Image mask of a coronagraph, from CORONMSK, APERNAME or SUBARRAY.
+
+    Parameters
+    ----------
+    header : Header
+    name : str
+        The file's, for messages.
+
+    Returns
+    -------
+    str or None
+        Without the module, such as "MASK335R"; "NONE" where the header says that there is none, and
+        None where it does not say.
+
+    Raises
+    ------
+    CorruptFileError
+        If two of the cards name different masks.
+
+    Examples
+    --------
+    >>> from astropy.io import fits
+    >>> image_mask(fits.Header({"CORONMSK": "MASKA335R"}), "a.fits")
+    'MASK335R'
+    >>> image_mask(fits.Header({"SUBARRAY": "SUB320A430R"}), "a.fits")
+    'MASK430R'
+    """
+    stated: dict[str, str] = {}
+    for key in ("CORONMSK", "APERNAME", "SUBARRAY"):
+        text = (header_text(header, key, name) or "").upper()
+        match = next(filter(None, map(_MASK.search, text.split("_"))), None)
+        if match is not None:
+            stated[key] = f"MASK{match[1]}"
+        elif key == "CORONMSK" and text:
+            # Of other instruments, or none.
+            stated[key] = text
+    if len(set(stated.values())) > 1:
+        listed = ", ".join(f"{key} {header[key]}" for key in stated)
+        raise CorruptFileError(
+            f"{name}: {listed}: the cards name different masks. Correct the header, or fetch the "
+            "file again"
+        )
+    return next(iter(stated.values()), None)
+
+
+def star_of(header: fits.Header, name: str) -> Star:
+    """Read which star a header names, and where it is."""
+    names = [header_text(header, key, name) for key in ("TARGPROP", "TARGNAME")]
+    for keys in _COORDINATES:
+        place = [header_number(header, key, name) for key in keys]
+        # Files without a target have zeros.
+        if None not in place and any(place):
+            ra, dec = (float(each or 0.0) for each in place)
+            if not -90 <= dec <= 90:
+                raise card_error(name, keys[1], dec, "a declination in degrees")
+            return Star(tuple(filter(None, names)), (ra, dec), keys != _COORDINATES[0])
+    return Star(tuple(filter(None, names)))
+
+
+def _flag(header: fits.Header, key: str) -> bool | None:
+    """Logical value of a card, which may be written as text or a number."""
+    value = header.get(key)
+    if isinstance(value, bool | int):
+        return bool(value)
+    return {"T": True, "TRUE": True, "F": False, "FALSE": False}.get(str(value).strip().upper())
+
+
+def proper_motion(header: fits.Header, name: str) -> tuple[float, float] | None:
+    """Proper motion of the star, arcsec per year (MU_RA, which includes cos Dec, and MU_DEC)."""
+    east, north = (header_number(header, key, name) for key in ("MU_RA", "MU_DEC"))
+    return None if east is None or north is None else (east, north)
+
+
+def is_reference(header: fits.Header) -> bool | None:
+    """Whether a header marks a reference star (IS_PSF); None if it does not say."""
+    return _flag(header, "IS_PSF")
+
+
+def position_angle(header: fits.Header, name: str) -> float | None:
+    """Position angle of the +y axis of a JWST image, degrees east of north.
+
+    It is ROLL_REF with V3I_YANG, the angle from V3 to +y. Where the latter is missing, PA_APER
+    states the sum.
+
+    Returns
+    -------
+    float or None
+        None if the cards do not say.
+    """
+    roll, angle, parity, total = (
+        header_number(header, key, name) for key in ("ROLL_REF", "V3I_YANG", "VPARITY", "PA_APER")
+    )
+    if roll is None:
+        return None
+    if angle is None:
+        return total
+    # -1 for every detector of JWST, in which x goes opposite to V2.
+    return roll - angle * (-1.0 if parity is None else parity)
+
+
+def beginning(header: fits.Header, name: str) -> Time | None:
+    """Beginning of an exposure, UTC.
+
+    It is DATE-BEG, DATE-OBS with TIME-OBS, EXPSTART, or the day of DATE-OBS alone.
+
+    Returns
+    -------
+    Time or None
+        None if the header does not say.
+
+    Raises
+    ------
+    CorruptFileError
+        If a card does not hold a date.
+    """
+    whole = header_date(header, ("DATE-BEG",), name)
+    if whole is not None:
+        return whole
+    day, hour = (header_text(header, key, name) for key in ("DATE-OBS", "TIME-OBS"))
+    if day and hour and "T" not in day:
+        try:
+            return Time(f"{day}T{hour}", scale="utc")
+        except ValueError as error:
+            raise card_error(
+                name, "DATE-OBS with TIME-OBS", f"{day}T{hour}", "a date such as "
+                "'2022-08-11T01:02:03'",
+            ) from error  # fmt: skip
+    start = header_number(header, "EXPSTART", name)
+    if start:
+        return Time(start, format="mjd", scale="utc")
+    return header_date(header, ("DATE-OBS",), name)
+
+
+def _level(header: fits.Header, name: str, dimensions: int) -> str | None:
+    """Product of the pipeline, from its steps, the unit, and the names of the file."""
+    for key, level in _STEPS.items():
+        if str(header.get(key, "")).strip().upper() == "COMPLETE":
+            return level
+    texts = (Path(name).name, header_text(header, "FILENAME", name) or "")
+    named = [match[1].lower() for match in map(_LEVEL.search, texts) if match]
+    known = [each for each in named if each in _LEVELS]
+    # If the names disagree, the frames are what they are least useful as.
+    stated = max(known, key=_LEVELS.index, default=None)
+    unit = (header_text(header, "BUNIT", name) or "").upper().replace(" ", "")
+    if unit in ("DN/S", "ADU/S", "COUNT/S") and stated in (None, "calints", "cal"):
+        return "rateints" if dimensions == 3 else "rate"
+    if stated == "calints" and dimensions == 2:
+        return "cal"
+    return stated
+
+
+def detector_of(header: fits.Header, name: str) -> str | None:
+    """Detector, from DETECTOR, APERNAME or the archive's name of the file; None if not stated."""
+    stated = header_text(header, "DETECTOR", name)
+    if stated is not None:
+        return stated.upper()
+    aperture = (header_text(header, "APERNAME", name) or "").upper().partition("_")[0]
+    if re.fullmatch(r"NRC[AB]\d", aperture):
+        return _DETECTORS.get(aperture, aperture)
+    match = _NAME.search(Path(name).name)
+    return match[9].upper() if match else None
+
+
+def _identity(header: fits.Header, name: str) -> str | None:
+    """Name of the exposure, as the archive makes it; None if the header does not say."""
+    detector = detector_of(header, name)
+    parts = [str(header.get(key, "")).strip() for key in _IDENTITY]
+    if detector is not None and all(each and each.upper() != "UNKNOWN" for each in parts):
+        digits = [part.zfill(n) for part, n in zip(parts, (5, 3, 3, 2, 1, 2, 5), strict=True)]
+        segment = header_number(header, "EXSEGNUM", name) or 1
+        return _identified(digits, f"{segment:03.0f}", detector)
+    for text in (header_text(header, "FILENAME", name) or "", Path(name).name):
+        match = _NAME.search(text)
+        if match:
+            *digits, part, chip = match.groups()
+            return _identified(digits, part or "001", chip)
+    return None
+
+
+def _identified(digits: list[str], segment: str, detector: str) -> str:
+    program, observation, visit, group, sequence, activity, exposure = digits
+    part = "" if segment == "001" else f"-seg{segment}"
+    return (
+        f"jw{program}{observation}{visit}_{group}{sequence}{activity}_{exposure}{part}_"
+        f"{detector.lower()}"
+    )

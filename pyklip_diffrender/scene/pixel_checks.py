@@ -1,0 +1,201 @@
+"""Judge frames by their pixels: a star behind the mask, as bright as in the other frames.
+
+Headers may be wrong, or say too little. What is tested here takes a tenth of a second, and decides
+nothing that a fit could decide better: only what is wrong by a factor, or by much more than the
+pointing of the telescope.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import convolve
+
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["brightness", "copies", "why_no_star", "why_other_brightness"]
+
+Image = NDArray[np.float64]
+
+_FIELD = 2.5
+"""Radius, arcsec, of the square in which the star is looked for."""
+
+_LEAST_FIELD = 1.2
+"""Radius below which a frame is too small to judge."""
+
+_CORE = 1.0
+"""Radius, arcsec, in which the light of a star behind a mask is summed."""
+
+_BEHIND = 0.5
+"""Largest distance, arcsec, of the pattern's centre of symmetry from where the star should be. It
+is measured to half a pixel; stars are put behind the mask to .02 arcsec, and headers may be wrong
+by a few pixels. Half of a star's light passes a mask at 0.4 to 0.8 arcsec from its centre."""
+
+_POSITIVE = 0.5
+"""Least share of light that is positive: 1 for a star, 0 where it was subtracted."""
+
+_FACTOR = 1.5
+"""Ratio of brightness between frames of one star that has another cause than the star's position
+behind the mask. The ratio of rolls was at most 1.05 for the real stars at hand."""
+
+_COPY = 0.95
+"""Correlation of the noise of two frames above which they are one. Flat-field errors correlate the
+frames of different stars by up to 0.6."""
+
+_ENOUGH = 2000
+"""Least number of pixels for a correlation or a scatter."""
+
+_FAR = 3.0
+"""arcsec from the star beyond which pixels show mostly noise."""
+
+_NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
+
+
+def why_no_star(observation: Observation) -> str:
+    """Why these cannot be frames of a star behind the mask; empty if they can.
+
+    The diffraction pattern of a star is nearly symmetric about the star. The centre of symmetry is
+    where the convolution of the image with itself is largest.
+
+    Parameters
+    ----------
+    observation : Observation
+        Frames that are too small (1.2 arcsec about the star) are not judged.
+    """
+    stamp = _stamp(observation)
+    if stamp is None:
+        return ""
+    image, distance, noise = stamp
+    core = distance < _CORE
+    bright = np.abs(image) > 3 * noise
+    if np.count_nonzero(bright & core) < 10:
+        return (
+            f"no light of a star within {_CORE:g} arcsec of where the header has the star (CRPIX "
+            "or STARCEN). Look at the frames, and correct the position"
+        )
+    light = np.where(bright, image, 0.0)
+    share = float(light[core].sum() / np.abs(light[core]).sum())
+    if share < _POSITIVE:
+        return (
+            f"the light around the star's position is as much negative as positive ({share:.0%} "
+            "remain): the star was subtracted. Use frames before the subtraction (calints)"
+        )
+    # Zeros around the stamp, so that the convolution is not periodic.
+    size = 2 * len(image)
+    transform = np.fft.rfft2(np.where(light > 0, light, 0.0), (size, size))
+    own = np.fft.irfft2(transform**2, (size, size))
+    row, column = np.unravel_index(int(own.argmax()), own.shape)
+    away = np.array([column, row]) / 2 - len(image) // 2
+    x, y = away * observation.pixelscale
+    if np.hypot(x, y) > _BEHIND:
+        return (
+            f"its light is centred {np.hypot(x, y):.1f} arcsec from the star's position ({x:+.1f} "
+            f"in x, {y:+.1f} in y), expected less than {_BEHIND:g}: the star is not behind the "
+            "mask, or the position (CRPIX or STARCEN) is wrong"
+        )
+    return ""
+
+
+def brightness(observation: Observation) -> float:
+    """Light within 1 arcsec of the star, in the frames' unit; NaN for frames that are too small."""
+    stamp = _stamp(observation)
+    return np.nan if stamp is None else float(stamp[0][stamp[1] < _CORE].sum())
+
+
+def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
+    """Find frames of a star that are much brighter or fainter than the others.
+
+    Parameters
+    ----------
+    observations : sequence of Observation
+        Of one star and set-up.
+
+    Returns
+    -------
+    dict of int to str
+        Reason by index. Where half of the frames or more have one, nothing says which are right.
+    """
+    light = np.array([brightness(each) for each in observations])
+    known = np.flatnonzero(np.isfinite(light) & (light > 0))
+    reasons: dict[int, str] = {}
+    if len(known) < 2:
+        return reasons
+    middle = float(np.median(light[known]))
+    for k in known:
+        # Of two, each is compared with the other.
+        other = middle if len(known) > 2 else float(light[known].sum() - light[k])
+        ratio = float(light[k]) / other
+        if not 1 / _FACTOR < ratio < _FACTOR:
+            reasons[int(k)] = (
+                f"its star is {ratio:.3g} times as bright as in the other frames of the star. A "
+                "unit (BUNIT) or a factor is probably wrong, or the star is not behind the mask"
+            )
+    return reasons
+
+
+def copies(observations: Sequence[Observation]) -> dict[int, int]:
+    """Find observations that show the same pixels as an earlier one, whatever their headers say.
+
+    Noise far from the star is compared, so that copies in another unit, or with a few other pixels,
+    are seen as such. Frames with fewer than 2000 pixels of noise are not compared.
+
+    Returns
+    -------
+    dict of int to int
+        Index of the copy, and of what it is a copy of.
+    """
+    noise = [_noise(each) for each in observations]
+    result: dict[int, int] = {}
+    for k, (values, usable) in enumerate(noise):
+        for j in range(k):
+            others, too = noise[j]
+            if j in result or others.shape != values.shape:
+                continue
+            both = usable & too
+            if both.sum() < _ENOUGH:
+                continue
+            if np.corrcoef(values[both], others[both])[0, 1] > _COPY:
+                result[k] = j
+                break
+    return result
+
+
+def _mean(observation: Observation) -> tuple[Image, Image, NDArray[np.bool_]]:
+    combined = observation if len(observation) == 1 else observation.combined()
+    return combined.data[0], combined.error[0], combined.valid[0]
+
+
+def _stamp(observation: Observation) -> tuple[Image, Image, Image] | None:
+    """Image about the star, distances from it (arcsec), and noise; None for small frames."""
+    data, error, valid = _mean(observation)
+    scale = float(np.mean(observation.pixelscale))
+    x, y = np.round(observation.center.mean(axis=0)).astype(int)
+    ny, nx = data.shape
+    room = min(x, y, nx - 1 - x, ny - 1 - y)
+    reach = min(int(_FIELD / scale), room)
+    if reach * scale < _LEAST_FIELD:
+        return None
+    window = np.s_[y - reach : y + reach + 1, x - reach : x + reach + 1]
+    rows, columns = np.indices((2 * reach + 1, 2 * reach + 1)) - reach
+    distance = np.hypot(rows, columns) * scale
+    y0, x0 = np.indices(data.shape)
+    outside = valid & (np.hypot(x0 - x, y0 - y) * scale > _FAR)
+    sky = data[outside] if outside.sum() > _ENOUGH else np.sort(data[valid])[: valid.sum() // 5 + 1]
+    image = np.where(valid[window], data[window] - float(np.median(sky)), 0.0)
+    return image, distance, error[window]
+
+
+def _noise(observation: Observation) -> tuple[Image, NDArray[np.bool_]]:
+    """Differences from neighbouring pixels, clipped, and which of them are far from the star."""
+    data, _, valid = _mean(observation)
+    difference = data - convolve(data, _NEIGHBOURS, mode="nearest")
+    rows, columns = np.indices(data.shape)
+    x, y = observation.center.mean(axis=0)
+    far = np.hypot(columns - x, rows - y) * float(np.mean(observation.pixelscale)) > _FAR
+    usable = valid & far
+    typical = float(np.median(np.abs(difference[usable]))) if usable.any() else 0.0
+    if typical > 0:
+        difference = np.clip(difference / typical, -6, 6)
+    return difference, usable

@@ -1,0 +1,503 @@
+"""Admission: what real folders contain, what is used of it, and why the rest is not."""
+
+from __future__ import annotations
+
+import gzip
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.time import Time
+from calints_files import SIDE, calints, starlight
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender.scene.exposure import Exposure, Star, beginning, image_mask
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two rolls of HD 1 and one of HD 2, a reference star."""
+    calints(tmp_path / "jw01184001001_03106_00001_nrcalong_calints.fits")
+    calints(
+        tmp_path / "jw01184002001_03106_00001_nrcalong_calints.fits",
+        observation=2, roll=80.0, date="2022-10-03T09:00:00",
+    )  # fmt: skip
+    calints(
+        tmp_path / "jw01184003001_03106_00001_nrcalong_calints.fits", "HD 2",
+        observation=3, roll=20.0, date="2022-10-03T12:00:00", cards={"IS_PSF": True},
+        light=0.3 * starlight(),
+    )  # fmt: skip
+    return tmp_path
+
+
+FIRST = "jw01184001001_03106_00001_nrcalong_calints.fits"
+SECOND = "jw01184002001_03106_00001_nrcalong_calints.fits"
+
+
+def reasons(sequence: dr.Sequence) -> dict[str, str]:
+    return dict(sequence.excluded)
+
+
+def uses(sequence: dr.Sequence) -> dict[str, str]:
+    return {row["file"]: str(row["use"]) for row in sequence.table}
+
+
+def as_before(sequence: dr.Sequence, folder: Path) -> bool:
+    """Whether the frames are those of the two rolls and the reference star, and no others."""
+    names = [each.name for each in (*sequence.science, *sequence.references)]
+    return names == sorted(p.name for p in folder.glob("jw*nrcalong_calints.fits"))[:3]
+
+
+def test_the_table_says_what_every_file_is(folder: Path) -> None:
+    sequence = dr.Sequence.from_files(folder)
+    assert as_before(sequence, folder)
+    assert sequence.excluded == ()
+    table = sequence.table
+    assert list(table["use"]) == ["target", "target", "reference"]
+    first = table[0]
+    assert first["exposure"] == "jw01184001001_03106_00001_nrcalong"
+    assert (first["mask"], first["filter"], first["stop"]) == ("MASK335R", "F444W", "MASKRND")
+    assert (first["level"], first["exp_type"], first["unit"]) == ("calints", "NRC_CORON", "MJy/sr")
+    assert first["ra"].to_value("deg") == 100.0
+    assert first["position_angle"].to_value("deg") == pytest.approx(70.05)
+    assert len(table.colnames) >= 18
+
+
+# -- products and duplicates -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "cards", "words"),
+    [
+        ("jw01184001001_03106_00001_nrcalong_a3001_crfints.fits", {}, "same exposure as .*calints"),
+        ("jw01184001001_03106_00001_nrcalong_rateints.fits", {"BUNIT": "DN/s"}, "same exposure"),
+        ("jw01184-c1001_t001_nircam_f444w-maskrnd_i2d.fits", {"OBSERVTN": "009"}, "resampled"),
+        ("jw01184-c1001_t001_nircam_f444w-maskrnd_psfsub.fits", {"OBSERVTN": "009"}, "subtracted"),
+        ("star.fits", {"S_RESAMP": "COMPLETE", "OBSERVTN": "009"}, "resampled"),
+        ("star.fits", {"FILENAME": "jw01184_psfstack.fits", "OBSERVTN": "009"}, "psfstack"),
+        ("ta.fits", {"EXP_TYPE": "NRC_TACQ", "OBSERVTN": "009"}, "NRC_TACQ.*acquiring"),
+        ("conf.fits", {"EXP_TYPE": "NRC_TACONFIRM", "OBSERVTN": "009"}, "NRC_TACONFIRM"),
+        ("sky.fits", {"BKGDTARG": True, "OBSERVTN": "009"}, "background"),
+        ("open.fits", {"CORONMSK": "NONE", "APERNAME": None, "SUBARRAY": "SUB320",
+                       "OBSERVTN": "009"}, "not behind a mask"),
+        ("dn.fits", {"BUNIT": "DN/s", "OBSERVTN": "009"}, "BUNIT is DN/s, not MJy/sr"),
+        ("bar.fits", {"CORONMSK": "MASKALWB", "APERNAME": None, "SUBARRAY": "SUB320ALWB",
+                      "PUPIL": "MASKBAR", "OBSERVTN": "009"}, "mask is MASKLWB"),
+        ("b.fits", {"DETECTOR": "NRCBLONG", "OBSERVTN": "009"}, "DETECTOR is NRCBLONG"),
+        ("mas.fits", {"XOFFSET": 15.0, "YOFFSET": -10.0, "OBSERVTN": "009"}, "milliarcseconds"),
+        ("pup.fits", {"PUPIL": "CLEAR", "OBSERVTN": "009"}, "PUPIL is CLEAR"),
+        ("two.fits", {"CORONMSK": "MASKA430R", "OBSERVTN": "009"}, "name different masks"),
+    ],
+)  # fmt: skip
+def test_what_is_no_frame_of_this_setup_is_excluded(
+    folder: Path, name: str, cards: dict[str, Any], words: str
+) -> None:
+    observation = int(cards.get("OBSERVTN", "001"))
+    calints(folder / name, observation=observation, cards=cards)
+    sequence = dr.Sequence.from_files(folder)
+    assert as_before(sequence, folder)
+    assert list(reasons(sequence)) == [name]
+    assert re.search(words, reasons(sequence)[name])
+    assert uses(sequence)[name] == "excluded"
+
+
+def test_one_exposure_is_used_once(folder: Path) -> None:
+    first = folder / FIRST
+    (folder / f"{FIRST}.gz").write_bytes(gzip.compress(first.read_bytes()))
+    (folder / "link.fits").symlink_to(first)
+    with fits.open(first) as hdus:
+        hdus["SCI"].data = hdus["SCI"].data.mean(axis=0)
+        hdus["ERR"].data, hdus["DQ"].data = hdus["ERR"].data[0], hdus["DQ"].data[0]
+        hdus.writeto(folder / FIRST.replace("calints", "cal"))
+    files = [*sorted(folder.iterdir()), first]
+    sequence = dr.Sequence.from_files(files)
+    assert as_before(sequence, folder)
+    assert len(sequence.excluded) == 4
+    assert {reason.split(" as ")[0] for _, reason in sequence.excluded} <= {
+        "the same file", "the same exposure",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e-3])
+def test_a_copy_is_seen_whatever_its_header_says(folder: Path, factor: float) -> None:
+    with fits.open(folder / SECOND) as hdus:
+        for key, value in {"OBSERVTN": "012", "DATE-BEG": "2022-10-03T10:00:00"}.items():
+            hdus[0].header[key] = value
+        hdus["SCI"].header["ROLL_REF"] = 85.0
+        hdus["SCI"].data[0, 90, 80] += 3.0
+        hdus["SCI"].data *= factor
+        hdus["ERR"].data *= factor
+        hdus.writeto(folder / "z.fits")
+    sequence = dr.Sequence.from_files(folder)
+    assert as_before(sequence, folder)
+    assert "z.fits" in reasons(sequence)
+
+
+def test_the_setup_of_most_of_the_targets_frames_is_reduced(folder: Path) -> None:
+    other = {"CORONMSK": "MASKA430R", "SUBARRAY": "SUB320A430R", "APERNAME": "NRCA5_MASK430R"}
+    for k in (4, 5, 6):
+        calints(
+            folder / f"r{k}.fits", observation=k, roll=60.0 + k, cards=other,
+            date=f"2022-10-03T0{k}:30:00",
+        )  # fmt: skip
+    sequence = dr.Sequence.from_files(folder)
+    assert [each.name for each in sequence.science] == ["r4.fits", "r5.fits", "r6.fits"]
+    assert all("mask is MASK335R, not MASK430R" in reason for _, reason in sequence.excluded)
+    assert len(sequence.excluded) == 3
+
+
+# -- stars -----------------------------------------------------------------------------------------
+
+
+def test_stars_are_told_apart_by_coordinates_and_signs() -> None:
+    plus, minus = Star(("BD+20-1790",), (110.0, 20.2)), Star(("BD-20-1790",), (110.0, -20.2))
+    assert not plus.is_same(minus)
+    assert not Star(plus.names).is_same(Star(minus.names))
+    assert plus.is_same(Star(("HD 5",), (110.0, 20.2 + 3 / 3600)))
+    assert not plus.is_same(Star(("HD 5",), (110.0, 20.2 + 20 / 3600)))
+    # One star, whose coordinates are those of another epoch.
+    assert plus.is_same(Star(("BD +20 1790",), (110.0, 20.2 + 20 / 3600)))
+    assert not plus.is_same(Star(plus.names, (111.0, 20.2)))
+    assert plus.separation(Star((), (110.0 + 1e-3 / np.cos(np.deg2rad(20.2)), 20.2))) == (
+        pytest.approx(3.6, rel=1e-6)
+    )
+
+
+def test_namesakes_with_another_sign_are_two_stars(tmp_path: Path) -> None:
+    calints(tmp_path / "a.fits", "BD+20-1790")
+    calints(tmp_path / "b.fits", "BD-20-1790", observation=2, roll=80.0, date="2022-10-03T09:00:00")
+    with pytest.raises(IncompatibleSetupError, match=r"BD\+20-1790 \(1\), BD-20-1790 \(1\)"):
+        dr.Sequence.from_files(tmp_path)
+    sequence = dr.Sequence.from_files(tmp_path, target="BD+20 1790")
+    assert uses(sequence) == {"a.fits": "target", "b.fits": "reference"}
+
+
+@pytest.mark.parametrize("name", [None, "", "UNKNOWN"])
+@pytest.mark.parametrize(
+    "kept", [("TARGNAME",), ("TARG_RA", "TARG_DEC"), ("IS_PSF",)], ids=lambda kept: kept[0]
+)
+def test_a_star_without_a_name_is_known_by_other_cards(
+    folder: Path, name: str | None, kept: tuple[str, ...]
+) -> None:
+    cards = {
+        "TARGPROP": name, "TARGNAME": name, "TARG_RA": None, "TARG_DEC": None, "IS_PSF": None,
+    }  # fmt: skip
+    values = {"TARGNAME": "HD 2", "TARG_RA": 101.5, "TARG_DEC": 19.0, "IS_PSF": True}
+    path = next(folder.glob("jw01184003*"))
+    path.unlink()
+    calints(
+        path, "HD 2", observation=3, roll=20.0, date="2022-10-03T12:00:00",
+        cards=cards | {key: values[key] for key in kept},
+    )  # fmt: skip
+    sequence = dr.Sequence.from_files(folder, target="HD 1")
+    assert uses(sequence)[path.name] == "reference"
+    assert as_before(sequence, folder)
+
+
+def test_a_frame_of_an_unknown_star_is_excluded(folder: Path) -> None:
+    cards = dict.fromkeys(("TARGPROP", "TARGNAME", "TARG_RA", "TARG_DEC", "IS_PSF"))
+    calints(folder / "x.fits", observation=8, date="2022-10-03T13:00:00", cards=cards)
+    sequence = dr.Sequence.from_files(folder)
+    assert as_before(sequence, folder)
+    assert "TARGPROP" in reasons(sequence)["x.fits"]
+    for path in folder.glob("jw*"):
+        path.unlink()
+    assert dr.Sequence.from_files(folder).target == "x.fits"
+    calints(folder / "y.fits", observation=9, date="2022-10-03T14:00:00", cards=cards)
+    with pytest.raises(IncompatibleSetupError, match=r"x\.fits, y\.fits do not say"):
+        dr.Sequence.from_files(folder)
+
+
+# -- cards that several frames depend on -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("card", ["ROLL_REF", "V3I_YANG"])
+@pytest.mark.parametrize("value", [None, "UNKNOWN"])
+def test_a_roll_without_its_angle_is_excluded(folder: Path, card: str, value: str | None) -> None:
+    calints(
+        folder / "x.fits", observation=8, date="2022-10-03T13:00:00", cards={card: value}, roll=90.0
+    )
+    sequence = dr.Sequence.from_files(folder)
+    assert as_before(sequence, folder)
+    assert card in reasons(sequence)["x.fits"]
+
+
+def test_rolls_none_of_which_has_an_angle_are_refused(folder: Path) -> None:
+    for path in folder.glob("jw*"):
+        fits.delval(path, "ROLL_REF", extname="SCI")
+    with pytest.raises(IncompatibleSetupError, match=f"{FIRST}, {SECOND}.*ROLL_REF"):
+        dr.Sequence.from_files(folder)
+    # One file needs no orientation.
+    (single,) = dr.Sequence.from_files(folder / FIRST).science
+    assert single.position_angles is None
+
+
+def test_the_sum_of_angles_stands_for_one_of_them() -> None:
+    header = fits.Header({"ROLL_REF": 70.0, "PA_APER": 70.05})
+    assert Exposure.of(header, "a.fits").position_angle == 70.05
+    header["V3I_YANG"] = -0.5
+    assert Exposure.of(header, "a.fits").position_angle == 69.5
+    del header["ROLL_REF"]
+    assert Exposure.of(header, "a.fits").position_angle is None
+
+
+@pytest.mark.parametrize(
+    ("cards", "isot"),
+    [
+        ({"DATE-BEG": "2022-10-03T05:53:34.311"}, "2022-10-03T05:53:34.311"),
+        ({"DATE-OBS": "2022-10-03", "TIME-OBS": "05:53:34.311"}, "2022-10-03T05:53:34.311"),
+        ({"DATE-BEG": "UNKNOWN", "EXPSTART": 59855.25}, "2022-10-03T06:00:00.000"),
+        ({"DATE-OBS": "2022-10-03"}, "2022-10-03T00:00:00.000"),
+        ({"DATE-OBS": ""}, None),
+    ],
+)
+def test_the_beginning_is_what_the_cards_say(cards: dict[str, Any], isot: str | None) -> None:
+    date = beginning(fits.Header(cards), "a.fits")
+    assert (date and date.isot) == isot
+
+
+@pytest.mark.parametrize(
+    ("cards", "mask"),
+    [
+        ({"CORONMSK": "MASKA335R"}, "MASK335R"),
+        ({"CORONMSK": "UNKNOWN", "APERNAME": "NRCA5_FULL_MASK335R"}, "MASK335R"),
+        ({"SUBARRAY": "SUB320A430R"}, "MASK430R"),
+        ({"SUBARRAY": "SUB640A210R", "CORONMSK": ""}, "MASK210R"),
+        ({"APERNAME": "NRCA5_MASKLWB_F444W"}, "MASKLWB"),
+        ({"SUBARRAY": "FULL"}, None),
+        ({"APERNAME": "NRCA5_TAMASK335R"}, None),
+        ({"CORONMSK": "4QPM_1065"}, "4QPM_1065"),
+    ],
+)
+def test_the_mask_is_known_by_any_of_three_cards(cards: dict[str, str], mask: str | None) -> None:
+    assert image_mask(fits.Header(cards), "a.fits") == mask
+
+
+def test_masks_that_contradict_each_other_are_refused() -> None:
+    with pytest.raises(CorruptFileError, match="CORONMSK MASKA335R, SUBARRAY SUB320A430R"):
+        image_mask(fits.Header({"CORONMSK": "MASKA335R", "SUBARRAY": "SUB320A430R"}), "a.fits")
+
+
+def test_without_a_mask_there_is_no_model() -> None:
+    ones = np.ones((24, 24))
+    header = fits.Header({"INSTRUME": "NIRCAM"})
+    frame = dr.Observation.from_arrays(ones, ones, pixelscale=0.06, filter="F444W", header=header)
+    with pytest.raises(IncompatibleSetupError, match="CORONMSK"):
+        dr.model_for(frame)
+
+
+# -- epochs ----------------------------------------------------------------------------------------
+
+
+def test_epochs_are_separate_sequences(folder: Path) -> None:
+    calints(folder / "later.fits", observation=8, date="2023-12-01T13:00:00", roll=90.0)
+    with pytest.raises(IncompatibleSetupError, match=r"2022-10-03 \(jw.*2023-12-01 \(later"):
+        dr.Sequence.from_files(folder)
+    first, second = dr.Sequence.by_epoch(folder)
+    assert as_before(first, folder)
+    assert uses(second) == {
+        "later.fits": "target", FIRST: "excluded", SECOND: "excluded",
+        "jw01184003001_03106_00001_nrcalong_calints.fits": "excluded",
+    }  # fmt: skip
+    assert "another epoch than the frames of 2023-12-01" in reasons(second)[FIRST]
+    chosen = dr.Sequence.from_files(folder, epoch="2023-12-02")
+    assert [each.name for each in chosen.science] == ["later.fits"]
+    with pytest.raises(IncompatibleSetupError, match="epoch: got 2023-02-01, expected one of"):
+        dr.Sequence.from_files(folder, epoch="2023-02-01")
+
+
+def simulated(**details: Any) -> dr.Observation:
+    ones = np.ones((2, 24, 24))
+    return dr.Observation.from_arrays(ones, ones, pixelscale=0.06, filter="F444W", **details)
+
+
+def test_frames_that_cannot_share_a_fit_are_refused() -> None:
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
+    dates = [
+        simulated(date=Time(day), name=day) for day in ("2022-10-01", "2022-10-03", "2022-11-03")
+    ]
+    with pytest.raises(IncompatibleSetupError, match=r"5 days apart.*2022-10-01.*2022-11-03"):
+        dr.refine(model, dates, "flat")
+    angled = simulated(position_angles=np.array([10.0, 10.0]))
+    with pytest.raises(IncompatibleSetupError, match="orientation on the sky is not known"):
+        dr.refine(model, [angled, simulated()], "flat")
+    turned = simulated(position_angles=np.array([10.0, 40.0]))
+    with pytest.raises(IncompatibleSetupError, match="2 places or orientations"):
+        dr.refine(model, turned, "flat")
+    moved = simulated(center=np.array([[11.5, 11.5], [14.5, 11.5]]))
+    with pytest.raises(IncompatibleSetupError, match=r"pointings\(\)"):
+        dr.refine(model, moved, "flat")
+    assert [len(each) for each in turned.pointings()] == [1, 1]
+    assert [each.position_angle for each in turned.pointings()] == [10.0, 40.0]
+    assert [each.center[0, 0] for each in moved.pointings()] == [11.5, 14.5]
+    assert angled.pointings() == (angled,)
+
+
+# -- pixels ----------------------------------------------------------------------------------------
+
+
+def scaled(factor: float) -> Any:
+    def change(arrays: dict[str, np.ndarray]) -> None:
+        arrays["SCI"] *= factor
+        arrays["ERR"] *= factor
+
+    return change
+
+
+def noisy(arrays: dict[str, np.ndarray]) -> None:
+    arrays["ERR"] /= 20
+
+
+def subtracted(arrays: dict[str, np.ndarray]) -> None:
+    y, x = np.indices((SIDE, SIDE))
+    arrays["SCI"] -= starlight() * (1 - 0.3 * np.sin(x) * np.sin(y))
+
+
+@pytest.mark.parametrize(
+    ("light", "change", "words"),
+    [
+        (starlight((24.0, 3.0)), None, "centred 1.5 arcsec .*not behind the mask"),
+        (None, scaled(2.5), "2.5 times as bright .*BUNIT"),
+        (None, scaled(1e-3), "0.001 times as bright"),
+        (None, noisy, "scatter 20 times as much as ERR says"),
+        (None, subtracted, "the star was subtracted"),
+        (0.0 * starlight(), None, "no light of a star"),
+    ],
+    ids=["off the mask", "unit", "factor", "errors", "subtracted", "empty"],
+)
+def test_frames_whose_pixels_contradict_the_others_are_excluded(
+    folder: Path, light: Any, change: Any, words: str
+) -> None:
+    calints(
+        folder / "x.fits", observation=8, roll=90.0, date="2022-10-03T13:00:00", light=light,
+        change=change,
+    )  # fmt: skip
+    sequence = dr.Sequence.from_files(folder)
+    assert re.search(words, reasons(sequence)["x.fits"])
+    assert as_before(sequence, folder)
+
+
+def test_of_two_frames_that_differ_in_brightness_none_is_right(folder: Path) -> None:
+    (folder / SECOND).unlink()
+    calints(
+        folder / SECOND, observation=2, roll=80.0, date="2022-10-03T09:00:00", change=scaled(2.5)
+    )
+    with pytest.raises(IncompatibleSetupError, match=f"{FIRST}, {SECOND} contradict each other"):
+        dr.Sequence.from_files(folder)
+
+
+@pytest.mark.parametrize("x", [-3.0, 0.0, 3.0])
+def test_a_star_a_few_pixels_from_its_stated_place_is_behind_the_mask(
+    folder: Path, x: float
+) -> None:
+    calints(
+        folder / "x.fits", observation=8, roll=90.0, date="2022-10-03T13:00:00",
+        light=starlight((x, 0.0)),
+    )  # fmt: skip
+    assert uses(dr.Sequence.from_files(folder))["x.fits"] == "target"
+
+
+def test_nothing_usable_is_an_error_with_all_reasons(folder: Path) -> None:
+    for path in folder.glob("jw*"):
+        fits.setval(path, "EXP_TYPE", value="NRC_TACQ")
+    with pytest.raises(NoValidPixelsError, match=r"none of 3 files .*NRC_TACQ.*NRC_TACQ"):
+        dr.Sequence.from_files(folder)
+
+
+@pytest.mark.parametrize("name", ["F356W", "F444W"])
+def test_real_frames_are_admitted(shared_data: Path, name: str) -> None:
+    sequence = dr.Sequence.from_files(shared_data / "gto1184", filter=name, target="AU Mic")
+    assert [len(sequence.science), len(sequence.references)] == [2, 4]
+    assert {reason for _, reason in sequence.excluded} == {
+        f"taken through {'F444W' if name == 'F356W' else 'F356W'}, not {name}"
+    }
+    single = dr.Sequence.from_files(shared_data / "hip65426_f444w_calints.fits.gz")
+    assert len(single.science) == 1
+
+
+# -- integrations ----------------------------------------------------------------------------------
+
+
+def cube(path: Path, change: Any, integrations: int = 8) -> dr.Observation:
+    return dr.Observation.from_fits(calints(path, integrations=integrations, change=change))
+
+
+def zero(arrays: dict[str, np.ndarray]) -> None:
+    arrays["SCI"][2] = 0.0
+
+
+def flagged(arrays: dict[str, np.ndarray]) -> None:
+    arrays["DQ"][2] = 1
+
+
+def dim(arrays: dict[str, np.ndarray]) -> None:
+    arrays["SCI"][2] -= 0.4 * starlight()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [(zero, "have the value 0"), (flagged, "flagged"), (dim, "0.60 times as bright")],
+)
+def test_an_integration_that_deviates_is_left_out_and_named(
+    tmp_path: Path, change: Any, words: str
+) -> None:
+    twin = cube(tmp_path / "twin.fits", None)
+    got = cube(tmp_path / "x.fits", change)
+    assert len(twin) == 8
+    assert twin.remarks == ()
+    assert len(got) == 7
+    (remark,) = got.remarks
+    assert remark.startswith("integration 3 of 8 is left out")
+    assert words in remark
+    both = twin.combined().valid & got.combined().valid
+    away = (got.combined().data - twin.combined().data)[both] / twin.combined().error[both]
+    # The mean of seven of the eight.
+    assert away.std() < 0.5
+
+
+def test_an_afterglow_in_one_integration_is_masked(tmp_path: Path) -> None:
+    def change(arrays: dict[str, np.ndarray]) -> None:
+        y, x = np.indices((SIDE, SIDE))
+        arrays["SCI"][4] += 5 * np.exp(-(((x - 105) ** 2 + (y - 80) ** 2) / (2 * 5.0**2)))
+
+    twin, got = cube(tmp_path / "twin.fits", None), cube(tmp_path / "x.fits", change)
+    assert len(got) == 8
+    assert "integration 5 of 8" in got.remarks[0]
+    assert not got.valid[4, 80, 105]
+    assert got.valid[np.arange(8) != 4].all()
+    away = (got.combined().data - twin.combined().data)[0] / twin.combined().error[0]
+    # Without the mask it would be 3 standard deviations of the mean; what is left is its edge.
+    assert np.abs(away).max() < 2.5
+
+
+def test_integrations_of_a_moving_star_are_kept(tmp_path: Path) -> None:
+    """Jitter of a fiftieth of a pixel, and stripes as strong as the noise."""
+
+    def change(arrays: dict[str, np.ndarray]) -> None:
+        rng = np.random.default_rng(4)
+        for k, (x, y) in enumerate(rng.normal(0, 0.02, (8, 2))):
+            arrays["SCI"][k] += starlight((x, y)) - starlight()
+        arrays["SCI"] += 0.5 * rng.normal(size=(8, SIDE, 1))
+
+    got = cube(tmp_path / "x.fits", change)
+    assert len(got) == 8
+    assert got.valid.mean() > 0.9995
+
+
+def test_every_integration_can_be_kept(tmp_path: Path) -> None:
+    path = calints(tmp_path / "x.fits", integrations=4, change=zero)
+    assert len(dr.Observation.from_fits(path, every_integration=True)) == 4
+    assert len(dr.Observation.from_fits(path)) == 3
+
+
+def test_a_cube_of_several_rolls_is_split(tmp_path: Path) -> None:
+    observation = cube(tmp_path / "x.fits", None, 2)
+    turned = replace(observation, position_angles=np.array([10.0, 40.0]))
+    assert [each.name for each in turned.pointings()] == [
+        "x.fits (pointing 1)", "x.fits (pointing 2)",
+    ]  # fmt: skip
