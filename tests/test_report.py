@@ -326,6 +326,24 @@ def test_a_header_cannot_write_into_the_page(tmp_path: Path) -> None:
     assert json.loads(data.read_text(encoding="utf-8"))["target"] == HOSTILE
 
 
+def test_names_beyond_ascii_do_not_end_a_reduction(tmp_path: Path) -> None:
+    """FITS headers have printable ASCII only; the page and the summary keep the names."""
+    whole = reduction()
+    (frame,) = whole.detection.fits[0].frames
+    named = replace(frame.observation, name="Čeče_été\n.fits")
+    fit = replace(
+        whole.detection.fits[0],
+        frames=(replace(frame, observation=named),),
+        initial=replace(whole.fit.initial, name="carte_été.fits"),
+    )
+    detection = replace(whole.detection, fits=(fit,))
+    with fits.open(detection.write(tmp_path)[0]) as hdus:
+        assert hdus[0].header["DROPD"] == "carte_ete.fits"
+        assert "frame Cece_ete?.fits" in str(hdus[0].header["HISTORY"])
+    back = dr.Refinement.read(fit.write(tmp_path / "fit.fits", linear=False))
+    assert back.initial.name == "carte_été.fits"
+
+
 @pytest.fixture
 def _few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw the S/N map and the contrast curve alone."""

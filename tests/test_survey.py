@@ -361,13 +361,54 @@ def test_only_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
         pass
     mine = folders.staging(jobs, "a" * 64)
     left = jobs / mine.name.replace(f"-{os.getpid()}-", f"-{dead.pid}-")
-    elsewhere, old = left.with_name(f"{left.name}x"), left.with_name(f"{left.name}y")
-    for each in (left, elsewhere, old):
+    elsewhere = left.with_name(f"{left.name}x")
+    for each in (left, elsewhere):
         each.mkdir()
         (each / "half").write_text("half")
-    os.utime(old, (0, 0))
+    # Another machine may run this job, whatever its clock or ours says.
+    os.utime(elsewhere, (0, 0))
     folders.clean(jobs)
     assert sorted(jobs.iterdir()) == sorted([mine, elsewhere])
+
+
+def test_containers_with_one_host_name_leave_each_other_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first process of another container has a number that means nothing here."""
+    jobs = folders.prepare(tmp_path)
+    here = os.stat
+    folders._place.cache_clear()
+    monkeypatch.setattr(
+        os, "stat",
+        lambda path, **options: SimpleNamespace(st_ino=1)
+        if path == "/proc/self/ns/pid" else here(path, **options),
+    )  # fmt: skip
+    theirs = folders.staging(jobs, "a" * 64)
+    monkeypatch.undo()
+    folders._place.cache_clear()
+    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
+        pass
+    foreign = theirs.rename(str(theirs).replace(f"-{os.getpid()}-", f"-{dead.pid}-"))
+    folders.clean(jobs)
+    assert list(jobs.iterdir()) == [foreign]
+
+
+def test_a_message_in_another_encoding_stops_nothing(tmp_path: Path) -> None:
+    config, output = inputs(tmp_path / "data", 2), tmp_path / "out"
+
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        if job.name.startswith("star1"):
+            # As Python quotes a Latin-1 name of a file.
+            raise ValueError("no such file: " + os.fsdecode(b"caf\xe9.fits"))
+        return stub(job, folder)
+
+    for _ in range(2):
+        table = run_survey(config, output, work)
+        assert sorted(table["status"]) == ["failed", "finished"]
+    (message,) = table["message"][table["status"] == "failed"]
+    assert message == r"ValueError: no such file: caf\udce9.fits"
+    assert message in Table.read(output / "results.ecsv")["message"]
+    assert list(run_survey(config, output, stub)["status"]) == ["finished"] * 2
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"products": {}}', '{"products": 3}'])

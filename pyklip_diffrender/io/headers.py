@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from numbers import Real
 from typing import Any
 
@@ -14,6 +15,7 @@ from pyklip_diffrender.errors import CorruptFileError
 
 __all__ = [
     "card_error",
+    "fits_text",
     "header_date",
     "header_number",
     "header_text",
@@ -26,6 +28,19 @@ _DATED_NAME = re.compile(r"(?<!\d)(20\d\d)-?([01]\d)-?([0-3]\d)")
 
 _UNKNOWN = ("", "UNKNOWN", "NULL", "N/A", "UNDEFINED")
 """Texts of cards that state nothing."""
+
+
+def fits_text(text: str) -> str:
+    """Text as a FITS header takes it: printable ASCII, the letters without their accents.
+
+    Examples
+    --------
+    >>> fits_text("Čeče_calints.fits")
+    'Cece_calints.fits'
+    """
+    plain = unicodedata.normalize("NFKD", text)
+    letters = (c for c in plain if not unicodedata.combining(c))
+    return "".join(c if " " <= c <= "~" else "?" for c in letters)
 
 
 def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fits.Header:

@@ -16,6 +16,7 @@ from astropy.io import fits
 from astropy.time import Time
 
 from pyklip_diffrender._version import __version__
+from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.pyklip_backend.frames import Frames
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.wavefront.opd import OPDMap
@@ -141,6 +142,7 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
     if days is not None:
         values.append(("DROPDHRS", 24 * days, "[h] from the frames to the map"))
     for key, value, comment in values:
+        value = fits_text(value) if isinstance(value, str) else value
         header[key] = (value, comment) if comment else value
     header.add_history(
         f"Star rendered and subtracted by pyklip_diffrender {__version__}; the "
@@ -149,11 +151,12 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
     header.add_history("DRSHA256 is the SHA-256 of the wavefront map's file, or of its array")
     for record in records:
         frames, subtraction = record.frames, record.subtraction
-        header.add_history(
+        text = (
             f"diffrender: {frames.observation.name}, {frames.observation.filter or 'given model'}, "
             f"opd {record.opd.name}, {subtraction.method}, seed {subtraction.seed}, "
             f"{frames.pixels} pixels, errors {frames.noise}"
         )
+        header.add_history(fits_text(text))
         for fit in subtraction.fits:
             header.add_history(
                 f"diffrender: frames {', '.join(map(str, fit.frames))}: {fit.status}, "
@@ -164,7 +167,7 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
                 facts = ", ".join(f"{k[5:]} {v}" for k, v in plan.summary().items())
                 header.add_history(f"diffrender: planned: {facts}")
         for line in _fitted(subtraction):
-            header.add_history(f"diffrender: {line}")
+            header.add_history(fits_text(f"diffrender: {line}"))
     return header
 
 
