@@ -3,7 +3,15 @@
 The star is bright, so that the first residuals are many times larger than the photon noise, and
 undamped steps would diverge. Therefore the noise is taken as sqrt(sigma^2 + (kappa star)^2). The
 model error kappa, a fraction of the star, begins at the value for which chi-squared per pixel is 1
-and decreases to 0, or to the value that the final residual requires.
+and decreases to 0, or to the value that the final residual requires:
+
+1. `Annealing._align` fits alignment and levels until a step gains little, and adds companions that
+   are significant in the residual.
+2. `Annealing._anneal` fits the wavefront as well, and lowers kappa from step to step. Where the fit
+   stalls because of a bright companion, `Annealing._restart` adds that and goes back to the
+   alignment.
+3. `Annealing._finish` leaves out bad pixels, widens a prior that is too narrow, and fits the size
+   of the error of the model that neighbouring pixels share.
 """
 
 from __future__ import annotations
@@ -12,12 +20,14 @@ import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.companions import bright_companions
-from pyklip_diffrender.refinement.frame_fit import FrameFit
+from pyklip_diffrender.refinement.conclusion import conclude
+from pyklip_diffrender.refinement.correlated_error import fitted_correlated_error
 from pyklip_diffrender.refinement.mode_priors import ModePriors, count_modes_below
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.outliers import isolated_outliers
@@ -28,7 +38,6 @@ from pyklip_diffrender.refinement.solver import Solver
 from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.wavefront.bases import Basis
-from pyklip_diffrender.wavefront.priors import EvidenceUpdate
 
 __all__ = ["Annealing"]
 
@@ -67,19 +76,56 @@ _ALIGNED = 0.05
 _ANNEALING = 0.6
 """Largest ratio of kappa in successive steps."""
 
-_ROUNDS = 6
-"""Largest number of searches for bad pixels at one state, because a bright one hides fainter ones
-beside it, and of states that are searched."""
+_SEARCHES = 6
+"""Largest number of searches for bad pixels at one state: a bright one hides fainter ones beside
+it."""
 
-_IMPROBABLE = 1.5
-"""Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
+_ROUNDS = 6
+"""Largest number of states at which bad pixels are searched."""
 
 _STEPS = 4
-"""Largest number of steps after each, because bad pixels have done little harm with robust weights,
-and of steps that fit a new companion alone."""
+"""Largest number of steps after pixels were left out or the noise has changed, which both do little
+to a fit with robust weights."""
+
+_COMPANION_STEPS = 4
+"""Largest number of steps that fit a new companion alone."""
+
+_NOTHING = (math.inf, math.inf)
+"""Model error and chi-squared of no state."""
 
 _WIDENINGS = 3
 """Largest number of times that a prior is widened. Two rolls of HIP 17695 in F444W needed two."""
+
+
+@dataclass
+class _Course:
+    """Where a fit is in its schedule.
+
+    Attributes
+    ----------
+    state, best, aligned : State
+        The present one, the one of the least model error, and the one that ended the alignment.
+    kappa : float
+        Assumed error of the star model, as a fraction of the star.
+    modes : int
+        Number of leading wavefront modes that are free; 0 for the alignment.
+    remaining : int
+        Number of steps that may follow.
+    error, chi2 : float
+        Model error and chi-squared per pixel of `state`.
+    least : (float, float)
+        Those of `best`.
+    """
+
+    state: State
+    best: State
+    aligned: State
+    kappa: float
+    modes: int
+    remaining: int
+    error: float = math.inf
+    chi2: float = math.inf
+    least: tuple[float, float] = _NOTHING
 
 
 class Annealing:
@@ -115,82 +161,137 @@ class Annealing:
             layout, layout.initial() if warm is None else layout.warm(warm)
         )
         self._is_warm = warm is not None
+        self._first_scales = self.solver.priors.scales
         self.history: list[dict[str, Any]] = []
 
     def run(self, seed: int) -> Refinement:
-        """Fit the alignment, then alignment and wavefront; return the best iterate."""
-        with ProgressBar("wavefront", shown=self.progress) as bar:
-            return self._run(seed, bar)
+        """Fit the alignment, then alignment and wavefront; return the best iterate.
 
-    def _run(self, seed: int, bar: ProgressBar) -> Refinement:
+        Parameters
+        ----------
+        seed : int
+            Recorded with the result.
+        """
         began = time.perf_counter()
-        settings, solver, floor = self.settings, self.solver, self.settings.min_model_error
-        state = aligned = best = self._begin
-        best_error = (math.inf, math.inf)
-        first_scales = solver.priors.scales
-        kappa = max(self.objective.model_error(state), floor)
-        if self._is_warm and floor:
-            kappa = floor  # A larger one would lead away from the solution, and back.
-        modes = 0
-        if settings.wavefront and (not settings.free or self._is_warm):
-            modes = self._modes_for(kappa)
-        status = Status.ITERATION_LIMIT
-        remaining = settings.max_iterations
-        while remaining:
-            remaining -= 1
-            state, gain = solver.step(state, kappa, modes)
-            error, chi2 = self.objective.model_error(state), self.objective.chi2_per_pixel(state)
-            if (error, chi2) < best_error:
-                best, best_error = state, (error, chi2)
-            self._record(kappa, modes, chi2, error, gain)
-            bar.update(chi2=chi2)
-            settled = gain < settings.tolerance
-            if not modes:
-                kappa = max(floor, min(kappa, error))
-                bright = self._new_companions(state, kappa, False) if gain < _ALIGNED else []
-                if bright:
-                    state = self._with_companions(state, bright)
-                elif gain < _ALIGNED and settings.wavefront:
-                    # The damping of the alignment does not apply to the wavefront.
-                    aligned, modes, solver.damping = state, self._modes_for(kappa), 0.0
-                elif settled:
-                    status = _status_of(chi2)
-                    break
-                continue
-            stalled = error > max(kappa, _NEGLIGIBLE)
-            bright = self._new_companions(state, error, True) if stalled else []
-            if bright:
-                # Near the solution the model is linear, so that further steps remove the bias of
-                # the wavefront. Otherwise the fit starts again from the alignment.
-                is_close = error < _NEAR
-                state = self._with_companions(state if is_close else aligned, bright)
-                best_error, remaining = (math.inf, math.inf), settings.max_iterations
-                if is_close:
-                    # Images are less linear in positions than in the wavefront, and steps of these
-                    # few unknowns are cheap.
-                    solver.damping = 0.0
-                    state = self._settled(state, _STEPS, modes=0)
-                else:
-                    solver.priors.scales = first_scales
-                    solver.damping, modes = 0.0, 0
-                    kappa = max(self.objective.model_error(state), floor)
-                best = state
-                continue
-            if settled and kappa <= floor and modes == len(self.basis):
-                status = _status_of(chi2)
-                break
-            kappa = min(_ANNEALING * kappa, error / 2)
-            if kappa < max(_NEGLIGIBLE, floor):
-                kappa = floor
-            modes = self._modes_for(kappa)
+        course, converged = self._beginning(), False
+        with ProgressBar("wavefront", shown=self.progress) as bar:
+            while course.remaining and not converged:
+                gain = self._step(course)
+                bar.update(chi2=course.chi2)
+                converged = (self._anneal if course.modes else self._align)(course, gain)
+        state, status = self._finish(course.best, converged)
+        return conclude(
+            self.solver,
+            self.settings,
+            state,
+            self._unexplained(state),
+            status,
+            history=self.history,
+            seconds=time.perf_counter() - began,
+            seed=seed,
+        )
+
+    def _beginning(self) -> _Course:
+        """Where the schedule begins: a fit that continues another one has all its unknowns."""
+        settings, state = self.settings, self._begin
+        kappa = max(self.objective.model_error(state), settings.min_model_error)
+        if self._is_warm and settings.min_model_error:
+            # A larger one would lead away from the solution, and back.
+            kappa = settings.min_model_error
+        skips_alignment = settings.wavefront and (not settings.free or self._is_warm)
+        modes = self._modes_for(kappa) if skips_alignment else 0
+        return _Course(state, state, state, kappa, modes, settings.max_iterations)
+
+    def _step(self, course: _Course) -> float:
+        """Take a step; return the decrease of the penalised chi-squared per pixel."""
+        course.remaining -= 1
+        course.state, gain = self.solver.step(course.state, course.kappa, course.modes)
+        course.error = self.objective.model_error(course.state)
+        course.chi2 = self.objective.chi2_per_pixel(course.state)
+        if (course.error, course.chi2) < course.least:
+            course.best, course.least = course.state, (course.error, course.chi2)
+        self._record(course.kappa, course.modes, course.chi2, course.error, gain)
+        return gain
+
+    def _align(self, course: _Course, gain: float) -> bool:
+        """Choose what follows a step of the alignment; True if the fit has converged."""
+        floor = self.settings.min_model_error
+        course.kappa = max(floor, min(course.kappa, course.error))
+        bright = self._significant(course) if gain < _ALIGNED else []
+        if bright:
+            course.state = self._with_companions(course.state, bright)
+            return False
+        if gain < _ALIGNED and self.settings.wavefront:
+            course.aligned, course.modes = course.state, self._modes_for(course.kappa)
+            # The damping of the alignment does not apply to the wavefront.
+            self.solver.damping = 0.0
+            return False
+        return gain < self.settings.tolerance
+
+    def _anneal(self, course: _Course, gain: float) -> bool:
+        """Choose what follows a step of the wavefront; True if the fit has converged."""
+        floor = self.settings.min_model_error
+        stalled = course.error > max(course.kappa, _NEGLIGIBLE)
+        bright = self._stalling(course) if stalled else []
+        if bright:
+            self._restart(course, bright)
+            return False
+        is_last = course.kappa <= floor and course.modes == len(self.basis)
+        if gain < self.settings.tolerance and is_last:
+            return True
+        course.kappa = min(_ANNEALING * course.kappa, course.error / 2)
+        if course.kappa < max(_NEGLIGIBLE, floor):
+            course.kappa = floor
+        course.modes = self._modes_for(course.kappa)
+        return False
+
+    def _restart(self, course: _Course, added: Sequence[Planet]) -> None:
+        """Go on with more companions: from here near the solution, else from the alignment.
+
+        Near the solution the model is linear, so that further steps remove the bias of the
+        wavefront.
+        """
+        is_close = course.error < _NEAR
+        course.state = self._with_companions(course.state if is_close else course.aligned, added)
+        course.least, course.remaining = _NOTHING, self.settings.max_iterations
+        self.solver.damping = 0.0
+        if is_close:
+            # Images are less linear in positions than in the wavefront, and steps of these few
+            # unknowns are cheap.
+            course.state = self._settled(course.state, _COMPANION_STEPS, modes=0)
+        else:
+            self.solver.priors.scales = self._first_scales
+            course.modes = 0
+            floor = self.settings.min_model_error
+            course.kappa = max(self.objective.model_error(course.state), floor)
+        course.best = course.state
+
+    def _finish(self, best: State, converged: bool) -> tuple[State, Status]:
+        """Correct what the residual of the best iterate shows to be wrong."""
         best = self._without_outliers(best)
-        if status in (Status.CONVERGED, Status.MODEL_MISMATCH):
-            if settings.widen_prior:
-                best = self._with_wider_prior(best)
-            status = _status_of(self.objective.chi2_per_pixel(best))
+        if converged and self.settings.widen_prior:
+            best = self._with_wider_prior(best)
         if best.flux <= 0:
-            status = Status.DIVERGED
-        return self._conclude(best, status, seed, time.perf_counter() - began)
+            return best, Status.DIVERGED
+        if self.settings.correlated_error and self.problems[0].systematics is not None:
+            best = self._with_correlated_error(best)
+        if not converged:
+            return best, Status.ITERATION_LIMIT
+        explained = self.objective.chi2_per_pixel(best) < _EXPLAINED
+        return best, Status.CONVERGED if explained else Status.MODEL_MISMATCH
+
+    def _with_correlated_error(self, state: State) -> State:
+        """Fit the size of the error that neighbouring pixels share, and go on with it."""
+        kappa = self._unexplained(state)
+        robust = self.objective.robust if kappa else math.inf
+        linear = self.solver.linear_model(state, kappa, self._all_modes, robust)
+        error = fitted_correlated_error(linear)
+        del linear  # The next one is as large.
+        if not error:
+            return state
+        _log.info("error of the model that neighbouring pixels share: %s", error)
+        self.solver.set_correlated_error(error)
+        return self._settled(state, _STEPS)
 
     def _without_outliers(self, state: State) -> State:
         """Leave out bad pixels that stand alone, and go on without them."""
@@ -206,8 +307,8 @@ class Annealing:
             if self.objective.chi2_per_pixel(state) >= _EXPLAINED:
                 break
             self.solver.linear_model(state, 0.0, self._all_modes, math.inf, final=False)
-            ratios = self._prior_ratios(self.solver.posterior(state))
-            if not self._is_improbable(ratios):
+            ratios = self.solver.priors.ratios_if_fixed(self.solver.posterior(state), self.settings)
+            if not self.solver.priors.are_improbable(ratios):
                 break
             _log.info("the wavefront is improbable under its prior, by factors %s", ratios)
             self.settings = self.settings.with_wider_priors(ratios)
@@ -215,16 +316,6 @@ class Annealing:
             self.solver.priors = ModePriors.of(self.settings, self.basis, frames)
             state = self._without_outliers(self._settled(state, self.settings.max_iterations))
         return state
-
-    def _prior_ratios(self, update: EvidenceUpdate) -> dict[str, float]:
-        """Size of the fitted modes relative to their prior, by group; empty with fitted scales."""
-        is_fixed = self.settings.wavefront and not self.settings.prior.fit_scales
-        return self.solver.priors.ratios(update) if is_fixed else {}
-
-    def _is_improbable(self, ratios: Mapping[str, float]) -> bool:
-        """Whether the wavefront is too large for its prior."""
-        of_wavefront = [ratios[name] for name in self.solver.priors.names if ratios]
-        return max(of_wavefront, default=0.0) >= _IMPROBABLE
 
     def _settled(self, state: State, steps: int, modes: int | None = None) -> State:
         """Take steps, by default of all modes, until they gain little."""
@@ -240,7 +331,7 @@ class Annealing:
 
     def _leave_out_outliers(self, state: State) -> bool:
         """Leave out bad pixels that stand alone; False if there are none."""
-        for k in range(_ROUNDS):
+        for k in range(_SEARCHES):
             kappa = self._unexplained(state)
             linear = self.solver.linear_model(state, kappa, self._all_modes, math.inf, final=False)
             outliers = isolated_outliers(self.objective, state, linear)
@@ -284,85 +375,29 @@ class Annealing:
         fine = kappa <= max(_COARSE, self.settings.min_model_error)
         return self._few_modes if coarse and not fine else len(self.basis)
 
-    def _new_companions(self, state: State, kappa: float, stalled: bool) -> list[Planet]:
-        """Companions in the residual of the alignment, or of a wavefront fit that stalled."""
-        room = self.settings.max_companions - len(state.joint.frames[0].companions)
-        threshold = self.settings.companion_threshold
-        if stalled:
-            if not self.settings.companions_if_stalled:
-                return []
-            # One at a time, because the side lobes of a bright companion are peaks as well.
-            room, threshold = min(1, room + _MOST_BRIGHT), _BRIGHT
-        return bright_companions(self.objective, state, kappa, most=room, threshold=threshold)
+    def _room(self, course: _Course) -> int:
+        """Number of companions that may still be added."""
+        return self.settings.max_companions - len(course.state.joint.frames[0].companions)
+
+    def _significant(self, course: _Course) -> list[Planet]:
+        """Companions in the residual of the alignment."""
+        most, threshold = self._room(course), self.settings.companion_threshold
+        return bright_companions(
+            self.objective, course.state, course.kappa, most=most, threshold=threshold
+        )
+
+    def _stalling(self, course: _Course) -> list[Planet]:
+        """A companion in the residual of a fit of the wavefront that stalled.
+
+        One at a time, because the side lobes of a bright companion are peaks as well.
+        """
+        if not self.settings.companions_if_stalled:
+            return []
+        most = min(1, self._room(course) + _MOST_BRIGHT)
+        return bright_companions(
+            self.objective, course.state, course.error, most=most, threshold=_BRIGHT
+        )
 
     def _with_companions(self, state: State, added: Sequence[Planet]) -> State:
         _log.info("companions given parameters of their own: %s", added)
         return self.objective.at(*state.joint.with_companions(added, state.vector))
-
-    def _conclude(self, state: State, status: Status, seed: int, seconds: float) -> Refinement:
-        """Compute errors and make the result."""
-        kappa = self._unexplained(state)
-        # Robust weights take a source that is not in the model for an outlier, and a tenth of the
-        # light of one of S/N 7 with it.
-        robust = self.objective.robust if kappa else math.inf
-        linear = self.solver.linear_model(state, kappa, self._all_modes, robust)
-        update = self.solver.posterior(state)
-        assert update.variance is not None
-        deviation = update.variance.sqrt()
-        priors, ratios = self.solver.priors, self._prior_ratios(update)
-        if status is Status.CONVERGED and self._is_improbable(ratios):
-            status = Status.PRIOR_MISMATCH
-        frames = []
-        for k, (problem, point) in enumerate(zip(self.problems, state.points, strict=True)):
-            layout = point.unknowns
-            own = deviation[state.joint.rows(k)[: len(linear.frames[k].rows)]]
-            values = {n: v.cpu().numpy() for n, v in layout.values(point.vector).items()}
-            levels = ("flux", "background", *(["pedestal"] if problem.systematics else []))
-            for name in levels:
-                values[name] = layout.start[name].numpy()
-            errors = {name: math.nan * value for name, value in values.items()}
-            for name in layout.ordered:
-                values[name] = point.vector[layout.where(name)].numpy()
-                errors[name] = own[layout.where(name)].numpy()
-            frames.append(
-                FrameFit(
-                    model=problem.model,
-                    observation=problem.observation,
-                    start=problem.start,
-                    opd=point.opd.cpu().numpy(),
-                    star=point.star.cpu().numpy(),
-                    companion_image=(point.total - point.star).cpu().numpy(),
-                    values=values,
-                    errors=errors,
-                    gain=problem.gain.cpu().numpy(),
-                    coefficients=point.vector[layout.where("modes")].numpy(),
-                )
-            )
-        first = state.points[0]
-        sources = first.unknowns.where("companions")
-        rows = state.joint.rows(0)[sources]
-        return Refinement(
-            frames=tuple(frames),
-            initial=self.problems[0].initial,
-            settings=self.settings,
-            basis=self.basis,
-            status=status,
-            chi2_per_pixel=self.objective.chi2_per_pixel(state),
-            model_error=kappa,
-            companions=first.unknowns.sources(first.vector).numpy(),
-            companion_errors=deviation[rows].reshape(-1, 3).numpy(),
-            scales=dict(zip(priors.names, priors.scales.tolist(), strict=True)),
-            prior_ratios=ratios,
-            effective_parameters=update.effective,
-            log_evidence=update.log_evidence,
-            stored_linear=linear,
-            systematics=self.problems[0].systematics,
-            history=self.history,
-            seconds=seconds,
-            seed=seed,
-        )
-
-
-def _status_of(chi2: float) -> Status:
-    """Status of a fit that has converged."""
-    return Status.CONVERGED if chi2 < _EXPLAINED else Status.MODEL_MISMATCH

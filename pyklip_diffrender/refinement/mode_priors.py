@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +13,9 @@ from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate, scale_ratios
 
 __all__ = ["ModePriors", "count_modes_below"]
+
+_IMPROBABLE = 1.5
+"""Ratio of the fitted to the fixed scale of modes above which the prior is wrong."""
 
 
 def count_modes_below(basis: Basis, cycles: float) -> int:
@@ -69,6 +73,16 @@ class ModePriors:
     def deviation(self) -> Tensor:
         """Standard deviations of amplitude, wavefront and drift, in this order."""
         return torch.cat([self.amplitude, self.scales[self.group] * self.shape])
+
+    def ratios_if_fixed(self, update: EvidenceUpdate, settings: GaussNewton) -> dict[str, float]:
+        """Size of the fitted modes relative to their priors, by group; empty if they are fitted."""
+        is_fixed = settings.wavefront and not settings.prior.fit_scales
+        return self.ratios(update) if is_fixed else {}
+
+    def are_improbable(self, ratios: Mapping[str, float]) -> bool:
+        """Whether the wavefront is too large for its prior."""
+        of_wavefront = [ratios[name] for name in self.names if ratios]
+        return max(of_wavefront, default=0.0) >= _IMPROBABLE
 
     def ratios(self, update: EvidenceUpdate) -> dict[str, float]:
         """Size of the fitted modes relative to their priors, by group.

@@ -23,6 +23,7 @@ from pyklip_diffrender.io.files import write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.linear.noise import UNCORRELATED, CorrelatedError
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
 from pyklip_diffrender.planning import Plan
@@ -53,6 +54,7 @@ _PLAIN = (
     "basis",
     "chi2_per_pixel",
     "model_error",
+    "correlated_error",
     *_ARRAYS,
     "scales",
     "prior_ratios",
@@ -84,6 +86,9 @@ class Refinement:
     model_error : float
         Assumed error of the star model, as a fraction of the star's light in a pixel, added in
         quadrature to the noise; 0 if chi-squared per pixel is near 1.
+    correlated_error : CorrelatedError
+        Size of the error of the model that neighbouring pixels share, as a fraction of the
+        starlight, see `GaussNewton.correlated_error`. Errors include it, `chi2_per_pixel` does not.
     companions, companion_errors : ndarray, (companions, 3)
         Companions that were part of the fit: contrast, and x and y from the star in the first
         frame, arcsec.
@@ -135,6 +140,7 @@ class Refinement:
     basis: Basis
     stored_linear: LinearModel | None
     model_error: float = math.nan
+    correlated_error: CorrelatedError = UNCORRELATED
     companions: Image = field(default_factory=lambda: np.zeros((0, 3)))
     companion_errors: Image = field(default_factory=lambda: np.zeros((0, 3)))
     scales: dict[str, float] = field(default_factory=dict)
@@ -166,6 +172,11 @@ class Refinement:
                 "Frames": ", ".join(frame.observation.name for frame in self.frames),
                 "Chi-squared per pixel": f"{self.chi2_per_pixel:.3g}",
                 "Model error": f"{100 * self.model_error:.2g} % of the star",
+                "Error shared by neighbouring pixels": (
+                    f"{100 * self.correlated_error.total:.2g} % of the starlight"
+                    if self.correlated_error
+                    else None
+                ),
                 "Wavefront map": self.initial.name,
                 "Systematics": None if self.systematics is None else self.systematics.name,
                 "Companions in the fit": len(self.companions) or None,
@@ -339,7 +350,9 @@ class Refinement:
                 for k, about in enumerate(facts["frames"])
             )
             label, sha256, date = facts["initial"]
-            facts = {"prior_ratios": {}} | facts  # Files of version 0.1 do not have it.
+            # Files of earlier versions do not have them.
+            facts.setdefault("prior_ratios", {})
+            facts.setdefault("correlated_error", UNCORRELATED)
             plain: dict[str, Any] = {key: facts[key] for key in _PLAIN}
             plain |= {key: np.reshape(facts[key], (-1, 3)).astype(float) for key in _ARRAYS}
             return cls(
@@ -403,6 +416,7 @@ class Refinement:
             "frames": len(self.frames),
             "chi2_per_pixel": self.chi2_per_pixel,
             "model_error": self.model_error,
+            "correlated_error": self.correlated_error.total,
             "seconds": self.seconds,
             "seed": self.seed,
             "opd": self.initial.name,

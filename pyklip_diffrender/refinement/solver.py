@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.linear.noise import Noise
+from pyklip_diffrender.linear.noise import CorrelatedError, Noise
 from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.refinement.accurate_step import ModelDerivatives, accurate_step
 from pyklip_diffrender.refinement.forward import Forward
@@ -309,13 +309,21 @@ class Solver:
         vector[: len(step)] += step
         return self.objective.at(state.joint, state.joint.clamped(vector))
 
+    def set_correlated_error(self, error: CorrelatedError) -> None:
+        """Include an error of the model that neighbouring pixels share from now on."""
+        self.objective.correlated = error
+        self._forget_weights()
+
+    def _forget_weights(self) -> None:
+        """Keep the Jacobians of the last equations, but not what follows from their weights."""
+        if self._equations is not None:
+            self._equations = replace(self._equations, kappa=math.nan)
+
     def leave_out(self, pixels: Sequence[Tensor]) -> None:
         """Leave out pixels from now on; a mask, (ny, nx), for every frame."""
         for forward, mask in zip(self.objective.forwards, pixels, strict=True):
             forward.problem.leave_out(mask)
-        if self._equations is not None:
-            # They no longer belong to any weights, but their Jacobians stay.
-            self._equations = replace(self._equations, kappa=math.nan)
+        self._forget_weights()
 
     def linear_model(
         self, state: State, kappa: float, modes: int, robust: float, *, final: bool = True

@@ -17,6 +17,7 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.time import Time
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
@@ -24,6 +25,7 @@ from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.frames import LinearFrame, Unknown
 from pyklip_diffrender.linear.model import LinearModel
+from pyklip_diffrender.linear.noise import CorrelatedError
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.scene.objects import Planet
@@ -44,7 +46,9 @@ __all__ = [
     "text_hdu",
 ]
 
-_DATACLASSES = {each.__name__: each for each in (GaussNewton, WavefrontPrior, Planet)}
+_DATACLASSES = {
+    each.__name__: each for each in (GaussNewton, WavefrontPrior, Planet, CorrelatedError)
+}
 _DTYPES = {"torch.float64": torch.float64, "torch.float32": torch.float32}
 
 
@@ -269,6 +273,8 @@ def linear_hdus(linear: LinearModel) -> list[Any]:
         fits.BinTableHDU.from_columns(columns, name="UNKNOWNS"),
         fits.ImageHDU(linear.curvature.numpy(), name="CURVATURE"),
     ]
+    hdus[1].header["SHARED"] = (linear.correlated.shared, "correlated error, of the starlight")
+    hdus[1].header["OWN"] = (linear.correlated.own, "that of single frames")
     for k, frame in enumerate(linear.frames):
         for name in _FRAME_ARRAYS:
             array = getattr(frame, name).numpy()
@@ -296,8 +302,12 @@ def linear_of(hdus: fits.HDUList, frames: int, name: str) -> LinearModel:
     )
     parts = []
     for k in range(frames):
-        arrays = {}
+        arrays: dict[str, Tensor] = {}
         for key in _FRAME_ARRAYS:
+            if key == "light" and ("LINEAR_LIGHT", k + 1) not in hdus:
+                # Files of earlier versions have no correlated error.
+                arrays[key] = torch.zeros_like(arrays["residual"])
+                continue
             data = hdus[f"LINEAR_{key}", k + 1].data
             kind = {"jacobian": np.float32, "rows": np.int64, "drift": np.int64}.get(
                 key, np.float64
@@ -310,6 +320,8 @@ def linear_of(hdus: fits.HDUList, frames: int, name: str) -> LinearModel:
         torch.from_numpy(native_float64(table[key])) for key in ("VECTOR", "MEAN", "DEVIATION")
     )
     curvature = torch.from_numpy(native_float64(hdus["CURVATURE"].data))
+    header = hdus["CURVATURE"].header
+    correlated = CorrelatedError(header.get("SHARED", 0.0), header.get("OWN", 0.0))
     count = len(unknowns)
     wrong = curvature.shape != (count, count) or any(
         len(part.jacobian) != len(part.rows)
@@ -322,4 +334,4 @@ def linear_of(hdus: fits.HDUList, frames: int, name: str) -> LinearModel:
             f"curvature {tuple(curvature.shape)}, rows {[len(part.rows) for part in parts]}. "
             "Write the fit again"
         )
-    return LinearModel(unknowns, tuple(parts), vector, mean, deviation, curvature)
+    return LinearModel(unknowns, tuple(parts), vector, mean, deviation, curvature, correlated)

@@ -25,7 +25,7 @@ _SETTINGS = (
     "free", "own", "wavefront", "cycles", "grow_basis", "coarse_first", "deviations",
     "drift_cycles", "max_companions", "companion_threshold", "companions_if_stalled",
     "response_npix", "response_wavelengths", "max_iterations", "tolerance", "min_model_error",
-    "relinearise", "accurate_steps", "robust",
+    "relinearise", "accurate_steps", "correlated_error", "robust",
 )  # fmt: skip
 """Fields of GaussNewton whose values TOML can hold."""
 
