@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.pyklip_backend.klip_curve import klip_curve
+from pyklip_diffrender.pyklip_backend.klip import klip_curve
 from pyklip_diffrender.reduction import summarise
 
 SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])

@@ -6,6 +6,7 @@ Every public name is loaded when it is first used, so that ``import pyklip_diffr
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -142,5 +143,16 @@ def __getattr__(name: str) -> Any:
     return value
 
 
+def _watch_in_spawned_process() -> None:
+    """Load the backend in a process that was spawned in a `backend` block, see its `child`."""
+    if "PYKLIP_DIFFRENDER_TAKES_KLIP" in os.environ:
+        child = import_module(f"{__name__}.pyklip_backend.child")
+        if child.spawned_beside_klip():
+            import_module(f"{__name__}.pyklip_backend.registration")
+
+
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+_watch_in_spawned_process()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,10 @@ from backend_scene import CENTER, OPD, SHAPE, calints, planet, psf, render
 from pyklip import fakes
 from pyklip.instruments import JWST
 from pyklip.instruments.JWST import JWSTData
-from pyklip.klip import align_and_scale
+from pyklip.klip import align_and_scale, high_pass_filter
 from pyklip.parallelized import klip_dataset
 
-from pyklip_diffrender.errors import NoValidPixelsError
+from pyklip_diffrender.errors import DiffrenderWarning, NoValidPixelsError
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     backend,
@@ -249,14 +248,11 @@ def test_a_pixel_masked_by_hand_is_not_fitted(files: list[str], tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("registered")
-def test_a_changed_dataset_is_taken_as_it_is(
-    files: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_changed_dataset_is_taken_as_it_is(files: list[str], tmp_path: Path) -> None:
     dataset = JWSTData(files)
     dataset.pad_input(5)
-    with caplog.at_level(logging.WARNING):
+    with pytest.warns(DiffrenderWarning, match="54 x 58 pixels, and had 44 x 48 when"):
         image, header = reduce(dataset, tmp_path)
-    assert "changed since it was read" in caplog.text
     assert header["DRPIXELS"] == "as given"
     assert header["DRNOISE"] == "estimated"
     assert header["DRFILT"] == "F444W"
@@ -264,22 +260,121 @@ def test_a_changed_dataset_is_taken_as_it_is(
 
     repaired = JWSTData(files)
     repaired.input = np.nan_to_num(repaired.input)
-    assert reduce(repaired, tmp_path)[1]["DRPIXELS"] == "as given"
+    assert reduce(repaired, tmp_path)[1]["DRPIXELS"] == "recorded"
 
 
 def test_a_dataset_read_before_registering_still_works(files: list[str], tmp_path: Path) -> None:
     dataset = JWSTData(files)
-    with backend(opd=OPD, subtractor=render):
-        _, header = reduce(dataset, tmp_path, algo="klip")
+    with (
+        backend(opd=OPD, subtractor=render),
+        pytest.warns(DiffrenderWarning, match=r"made before register\(\).*files="),
+    ):
+        _, header = reduce(dataset, tmp_path / "out", algo="klip")
     assert header["DRPIXELS"] == "as given"
     # The wavelength is one of the table that pyKLIP looked it up in.
     assert header["DRFILT"] == "F444W"
+    # The files are found in a folder, and are read as if the backend had been there.
+    with backend(opd=OPD, subtractor=render, files=tmp_path):
+        late, header = reduce(JWSTData(files), tmp_path / "out", algo="klip")
+        early, _ = reduce(JWSTData(files), tmp_path / "out", algo="klip")
+    assert (header["DRPIXELS"], header["DRNOISE"]) == ("recorded", "ERR")
+    # The frames are shifted again, and rounded to single precision at another place.
+    np.testing.assert_allclose(late, early, atol=1e-3)
 
 
 @pytest.mark.usefixtures("registered")
-def test_files_without_errors_or_flags(
-    tmp_path: Path, rng: np.random.Generator, caplog: pytest.LogCaptureFixture
+def test_pixels_in_double_precision(files: list[str], tmp_path: Path) -> None:
+    """pyKLIP then shifts in double precision, too."""
+    expected, _ = reduce(JWSTData(files), tmp_path / "out")
+    for path in files:
+        with fits.open(path, mode="update") as hdus:
+            hdus["SCI"].data = hdus["SCI"].data.astype(np.float64)
+    image, header = reduce(JWSTData(files), tmp_path / "out")
+    assert (header["DRPIXELS"], header["DRNOISE"]) == ("recorded", "ERR")
+    np.testing.assert_allclose(image, expected, atol=1e-4)
+
+
+@pytest.mark.usefixtures("registered")
+@pytest.mark.parametrize("factor", [1e-3, 1e3, "each"])
+def test_frames_that_were_multiplied_after_reading(
+    factor: Any, files: list[str], tmp_path: Path
 ) -> None:
+    """The fit has the unit of the files, and the products that of the dataset."""
+    expected, _ = reduce(JWSTData(files), tmp_path / "out", time_collapse="mean")
+    dataset = JWSTData(files)
+    fitted = observation_from_dataset(dataset)
+    common = np.array([2.0, 3.0, 2.5, 3.5])
+    dataset.input *= common[:, None, None] if factor == "each" else factor
+    again = observation_from_dataset(dataset)
+    # The factor is known to the rounding of single precision.
+    np.testing.assert_allclose(again.data, fitted.data, rtol=1e-5)
+    np.testing.assert_array_equal(again.error, fitted.error)
+    image, header = reduce(dataset, tmp_path / "out", time_collapse="mean")
+    assert header["DRPIXELS"] == "recorded"
+    if factor != "each":
+        np.testing.assert_allclose(image, factor * expected, atol=2e-3 * factor)
+
+
+@pytest.mark.usefixtures("registered")
+def test_frames_that_were_left_out_or_moved_after_reading(files: list[str]) -> None:
+    dataset = JWSTData(files)
+    whole = observation_from_dataset(dataset)
+    kept = [2, 0]
+    for name in ("input", "centers", "filenames", "PAs", "wvs", "wcs", "filenums"):
+        setattr(dataset, name, np.asarray(getattr(dataset, name))[kept])
+    dataset.centers = dataset.centers + 0.25
+    part = observation_from_dataset(dataset)
+    np.testing.assert_array_equal(part.data, whole.data[kept])
+    np.testing.assert_array_equal(part.error, whole.error[kept])
+    # Whoever moves the star's position knows better where it is.
+    np.testing.assert_allclose(part.center, whole.center[kept] + 0.25)
+    dataset.filenames = np.array(["other_INT1", "other_INT2"])
+    with pytest.warns(DiffrenderWarning, match="not those that were read, by their names"):
+        observation_from_dataset(dataset)
+
+
+@pytest.mark.usefixtures("registered")
+def test_filtered_frames_are_not_taken_for_recorded_ones(files: list[str]) -> None:
+    dataset = JWSTData(files)
+    dataset.input = np.array([high_pass_filter(each, 10) for each in dataset.input])
+    with pytest.warns(DiffrenderWarning, match="changed by more than their noise"):
+        observation_from_dataset(dataset)
+
+
+@pytest.mark.usefixtures("registered")
+def test_names_that_headers_cannot_hold(files: list[str], tmp_path: Path) -> None:
+    """Frames and wavefront map are called with letters that FITS does not have."""
+    named = []
+    for k, path in enumerate(files):
+        named.append(str(Path(path).rename(tmp_path / f"β Pic größe {k}_calints.fits")))
+    wavefront = tmp_path / "карта.fits"
+    fits.PrimaryHDU(OPD.data, fits.Header({"BUNIT": "m"})).writeto(wavefront)
+    dataset = JWSTData(named)
+    dataset.diffrender = DiffrenderSettings(opd=wavefront)
+    _, header = reduce(dataset, tmp_path / "out")
+    assert header["FILE_0"] == "? Pic gro?e 0_calints.fits_INT1.fits"
+    assert header["DROPD"] == "?????.fits"
+    assert header["DRPIXELS"] == "recorded"
+    assert dataset.filenames[0].startswith("β Pic größe 0")
+
+
+@pytest.mark.usefixtures("registered")
+def test_folders_in_the_prefix(files: list[str], tmp_path: Path) -> None:
+    (tmp_path / "out" / "sub").mkdir(parents=True)
+    dataset = JWSTData(files)
+    options: dict[str, Any] = {
+        "outputdir": str(tmp_path / "out"), "mode": "ADI", "annuli": 1, "subsections": 1,
+        "numbasis": [1], "numthreads": 1, "verbose": False, "algo": "diffrender",
+    }  # fmt: skip
+    klip_dataset(dataset, fileprefix="sub/star", **options)
+    assert (tmp_path / "out" / "sub" / "star-KLmodes-all.fits").is_file()
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["sub"]
+    with pytest.raises(FileNotFoundError, match=r"fileprefix: .*none is not a folder"):
+        klip_dataset(dataset, fileprefix="none/star", **options)
+
+
+@pytest.mark.usefixtures("registered")
+def test_files_without_errors_or_flags(tmp_path: Path, rng: np.random.Generator) -> None:
     path = tmp_path / "a_calints.fits"
     calints(path, rng)
     with fits.open(path) as hdus:
@@ -310,7 +405,7 @@ def test_no_files(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("registered")
 def test_a_reader_that_shifts_otherwise_is_not_believed(
-    files: list[str], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    files: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def other(img: np.ndarray, new_center: Any, old_center: Any = None, **kw: Any) -> np.ndarray:
         return align_and_scale(img, new_center, np.asarray(old_center) + 0.5, **kw)
@@ -322,10 +417,10 @@ def test_a_reader_that_shifts_otherwise_is_not_believed(
         return (other if len(calls) <= 4 else align_and_scale)(*args, **kw)
 
     monkeypatch.setattr("pyklip.klip.align_and_scale", alternate)
-    with caplog.at_level(logging.WARNING):
-        dataset = JWSTData(files)
-    assert "shifted these frames in a way not known here" in caplog.text
+    dataset = JWSTData(files)
     assert not hasattr(dataset, "_diffrender_source")
+    with pytest.warns(DiffrenderWarning, match="shifted these frames in a way not known here"):
+        observation_from_dataset(dataset)
     assert np.isfinite(psf(*CENTER)).all()
     assert planet(*CENTER).max() > 0.8
 

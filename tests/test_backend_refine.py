@@ -37,12 +37,12 @@ from pyklip_diffrender.pyklip_backend import (
     throughput,
 )
 from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
-from pyklip_diffrender.pyklip_backend.windows import Window, extent
 from pyklip_diffrender.refinement import GaussNewton, Status, refine
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.opd import random_drift, random_opd
 
@@ -211,9 +211,10 @@ def test_a_companion_in_the_model_keeps_its_light(
     small: OpticalSystem, frames: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(throughput, "_INNER", 2)
-    cut = Window.about(np.array([19.5, 21.5]), (32, 32)).of(
-        Observation.from_arrays(frames[0], np.sqrt(frames[0]), pixelscale=small.detector.pixelscale)
+    whole = Observation.from_arrays(
+        frames[0], np.sqrt(frames[0]), pixelscale=small.detector.pixelscale
     )
+    cut = whole.within(Window.about(np.array([19.5, 21.5]), (32, 32)))
     x, y = planet_pixels(0.0)
     known = GaussNewton(
         basis=default_basis(3.0), response_npix=128,
@@ -491,7 +492,7 @@ def test_windows_that_stick_out_of_the_frame(rng: np.random.Generator) -> None:
     cube = rng.normal(size=(2, 10, 12))
     observation = Observation.from_arrays(cube, np.ones_like(cube), pixelscale=0.06, center=(1, 8))
     window = Window.about(observation.center[0], (5, 7))
-    part = window.of(observation)
+    part = observation.within(window)
     assert part.shape == (5, 7)
     np.testing.assert_array_equal(part.center, [[3, 2]] * 2)
     assert part.valid.sum() == 2 * 4 * 5
@@ -500,8 +501,8 @@ def test_windows_that_stick_out_of_the_frame(rng: np.random.Generator) -> None:
     assert kept.sum() == 4 * 5
     np.testing.assert_array_equal(back[kept], cube[0][kept])
     with pytest.raises(NoValidPixelsError, match="Check the star centre"):
-        Window.about(np.array([-40.0, 5.0]), (5, 7)).of(observation)
+        observation.within(Window.about(np.array([-40.0, 5.0]), (5, 7)))
 
     observation.valid[:] = False
     observation.valid[1, 2:5, 3:9] = True
-    assert extent(observation) == Window(2, 3, (3, 6))
+    assert Window.holding(observation.valid) == Window(2, 3, (3, 6))

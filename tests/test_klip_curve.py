@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from astropy import units as u
+from astropy.table import QTable
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -19,7 +20,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.pyklip_backend.klip_curve import klip_curve, small_sample_factor
+from pyklip_diffrender.pyklip_backend.klip import klip_curve, small_sample_factor
 from pyklip_diffrender.refinement import FrameFit
 
 NPIX, SIZE = 64, 32
@@ -74,15 +75,17 @@ def frame(
     )  # fmt: skip
 
 
-def searched(
-    science: list[FrameFit], references: list[FrameFit] | tuple[FrameFit, ...] = ()
-) -> tuple[Any, Any]:
-    """Arguments of `klip_curve`: as much of a detection as it uses, and references."""
+def curve_of(
+    science: list[FrameFit],
+    references: list[FrameFit] | tuple[FrameFit, ...] = (),
+    separations: Any = None,
+) -> QTable:
+    """KLIP's curve for fitted frames, as if they had been searched."""
     curve = SimpleNamespace(meta={"resolution_arcsec": RESOLUTION})
-    detection = SimpleNamespace(
+    searched: Any = SimpleNamespace(
         fits=(SimpleNamespace(frames=tuple(science)),), contrast_curve=curve
     )
-    return detection, tuple(each.observation for each in references)
+    return klip_curve(searched, [each.observation for each in references], separations)
 
 
 def rolls(speckles: float = 0.0) -> list[FrameFit]:
@@ -96,7 +99,7 @@ def frames() -> tuple[list[FrameFit], list[FrameFit]]:
 
 @cache
 def quiet() -> NDArray[np.float64]:
-    return np.asarray(klip_curve(*searched(*frames()), SEPARATIONS)["contrast"])
+    return np.asarray(curve_of(*frames(), SEPARATIONS)["contrast"])
 
 
 def photon_limits(science: list[FrameFit]) -> NDArray[np.float64]:
@@ -117,7 +120,7 @@ def test_limits_are_near_the_photon_limit_and_not_below() -> None:
 
 
 def test_light_that_no_reference_has_makes_the_limits_worse() -> None:
-    worse = klip_curve(*searched(rolls(0.5), frames()[1]), SEPARATIONS)["contrast"]
+    worse = curve_of(rolls(0.5), frames()[1], SEPARATIONS)["contrast"]
     assert (worse > 2 * quiet()).all()
 
 
@@ -128,7 +131,7 @@ def test_stars_are_aligned() -> None:
         replace(each, observation=replace(each.observation, center=each.observation.center + off))
         for each, off in zip(references, (0.5, -0.5), strict=True)
     ]
-    assert (klip_curve(*searched(science, wrong), SEPARATIONS)["contrast"] > 1.2 * quiet()).any()
+    assert (curve_of(science, wrong, SEPARATIONS)["contrast"] > 1.2 * quiet()).any()
 
 
 def test_companions_of_the_fit_are_not_noise() -> None:
@@ -140,7 +143,7 @@ def test_companions_of_the_fit_are_not_noise() -> None:
         planet = 1e-2 * light[k][0].numpy()
         observation = replace(each.observation, data=each.observation.data + planet)
         known.append(replace(each, observation=observation, companion_image=planet))
-    curve = klip_curve(*searched(known, references), SEPARATIONS)
+    curve = curve_of(known, references, SEPARATIONS)
     assert curve["contrast"] == pytest.approx(quiet(), rel=1e-6)
 
 
@@ -156,7 +159,7 @@ def test_two_rolls_alone_and_masked_pixels() -> None:
             data=np.where(valid, science[0].observation.data, 0.0),
         ),
     )
-    curve = klip_curve(*searched([hole, science[1]]), [500, 800, 5000] * u.mas)
+    curve = curve_of([hole, science[1]], (), [500, 800, 5000] * u.mas)
     assert curve["separation"].to_value(u.arcsec) == pytest.approx(SEPARATIONS)
     assert list(curve["modes"]) == [1, 1]
     assert np.isfinite(curve["contrast"]).all()
@@ -168,9 +171,9 @@ def test_without_references_there_is_no_curve() -> None:
     science, references = frames()
     same = replace(science[1], observation=replace(science[1].observation, position_angles=None))
     with pytest.raises(IncompatibleSetupError, match="roll without references"):
-        klip_curve(*searched([science[0], same]))
+        curve_of([science[0], same])
     with pytest.raises(IncompatibleSetupError, match="rings are complete"):
-        klip_curve(*searched(science, references), 3.0)
+        curve_of(science, references, 3.0)
 
 
 def test_small_samples_need_higher_thresholds() -> None:

@@ -400,10 +400,10 @@ def test_injected_planets_have_a_section(tmp_path: Path, count: int) -> None:
 def test_a_failure_of_klip_does_not_break_the_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def broken(*_: Any) -> QTable:
+    def broken(*_: object) -> QTable:
         raise ValueError("singular")
 
-    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.klip_curve.klip_curve", broken)
+    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.klip.klip_curve", broken)
     monkeypatch.setattr("pyklip_diffrender.reduction.products.search_pictures", lambda *_: [])
     whole = reduction()
     sequence = replace(whole.sequence, references=whole.sequence.science)

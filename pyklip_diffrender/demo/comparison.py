@@ -22,7 +22,7 @@ from pyklip_diffrender.detection.metrics import annulus_snr, star_model_error, t
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import replacing, write_fits
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.pyklip_backend.comparison import klip_rdi
+from pyklip_diffrender.pyklip_backend.klip import klip_rdi
 from pyklip_diffrender.refinement import Refinement, refine
 from pyklip_diffrender.scene.objects import (
     ALPHA_PICTORIS_W2,

@@ -30,19 +30,6 @@ _UNKNOWN = ("", "UNKNOWN", "NULL", "N/A", "UNDEFINED")
 """Texts of cards that state nothing."""
 
 
-def fits_text(text: str) -> str:
-    """Text as a FITS header takes it: printable ASCII, the letters without their accents.
-
-    Examples
-    --------
-    >>> fits_text("Čeče_calints.fits")
-    'Cece_calints.fits'
-    """
-    plain = unicodedata.normalize("NFKD", text)
-    letters = (c for c in plain if not unicodedata.combining(c))
-    return "".join(c if " " <= c <= "~" else "?" for c in letters)
-
-
 def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fits.Header:
     """Cards of the primary header, replaced and completed by those of an extension.
 
@@ -62,6 +49,21 @@ def merged_header(primary: fits.Header, extension: fits.Header, name: str) -> fi
             "file again"
         ) from error
     return merged
+
+
+def fits_text(text: object) -> str:
+    """Return a text as FITS headers can hold it, in printable ASCII.
+
+    Accents are left out, and other characters become question marks.
+
+    Examples
+    --------
+    >>> fits_text("Übersicht β Pic.fits")
+    'Ubersicht ? Pic.fits'
+    """
+    plain = unicodedata.normalize("NFKD", str(text))
+    letters = (c for c in plain if not unicodedata.combining(c))
+    return "".join(c if " " <= c <= "~" else "?" for c in letters)
 
 
 def card_error(name: str, card: str, value: Any, expected: str) -> CorruptFileError:

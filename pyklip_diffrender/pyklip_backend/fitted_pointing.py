@@ -15,8 +15,8 @@ from torch import Tensor
 
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.pyklip_backend.pointings import Pointing
-from pyklip_diffrender.pyklip_backend.windows import Window, extent
 from pyklip_diffrender.scene.detector_pixels import shift_frames
+from pyklip_diffrender.scene.window import Window
 
 if TYPE_CHECKING:
     from pyklip_diffrender.refinement import FrameFit, Refinement
@@ -62,7 +62,7 @@ class FittedPointing:
         The fitted wavefront is rendered on a larger detector if the model's field of view can be
         changed.
         """
-        box = extent(self.pointing.observation)
+        box = Window.holding(self.pointing.observation.valid)
         adjustable = "fov_pixels" in self.result.model.adjustable
         return box if box not in self.window and adjustable else self.window
 
@@ -85,12 +85,13 @@ class FittedPointing:
                 origin = self.frame.observation.first_pixel
                 if origin is not None:
                     origin = (origin[0] - window.x, origin[1] - window.y)
-                pixels = box.of(
-                    dataclasses.replace(group, center=group.center + self.away, first_pixel=origin)
+                moved = dataclasses.replace(
+                    group, center=group.center + self.away, first_pixel=origin
                 )
+                pixels = moved.within(box)
                 star = star * (1 + self.result.systematics.at(pixels)[0])
             return self.paste(star + float(self.frame.values["background"][0]), box)
-        if extent(group) not in window:
+        if Window.holding(group.valid) not in window:
             logger.warning(
                 "%s: the model's field of view cannot be changed; pixels outside its %d x %d are "
                 "NaN", group.name, window.shape[1], window.shape[0],

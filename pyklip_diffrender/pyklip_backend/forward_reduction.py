@@ -7,6 +7,7 @@ Its `klip_parallelized` of `pyklip.fm` also turns the frames to north.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ class ForwardReduction(Reduction):
     def _verbose(self) -> bool:
         return not self.arguments["mute_progression"]
 
-    def _write_extras(self, stage: Path, cards: fits.Header) -> None:
+    def _write_extras(self, stage: Path, prefix: str, cards: fits.Header) -> None:
         """Add what the fit says of the planet; the forward model says how much is left of it."""
         cards.extend(self._planet_cards)
 
@@ -130,7 +131,7 @@ class ForwardReduction(Reduction):
                 k = int(first.pointing.frames[0])
                 self._planet_cards = planet_cards(
                     first,
-                    planets[k],
+                    replace(planets[k], contrast=planets[k].contrast / record.frames.factor[k]),
                     parangs[frames[k]],
                     flipx,
                     record.subtraction.error_factor,

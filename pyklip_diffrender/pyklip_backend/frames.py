@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import logging
 import warnings
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from astropy import units as u
@@ -36,12 +36,20 @@ from pyklip_diffrender.pyklip_backend.pointings import (
     reference_frames,
 )
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, settings_of
-from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE, SourceFrames
+from pyklip_diffrender.pyklip_backend.source import (
+    ATTRIBUTE,
+    SourceFrames,
+    attach_source,
+    why_without_source,
+)
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["Frames", "date_of_frames", "frames_of", "observation_from_dataset", "require_frames"]
 
 logger = logging.getLogger(__name__)
+
+_ROUNDING = 1e-5
+"""Relative difference of pixels that single precision explains."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +72,9 @@ class Frames:
         The same frames, sorted by where they show the star.
     references : tuple of Observation
         Frames of reference stars in the dataset, by pointing.
+    factor : ndarray, (m,)
+        By which the frames of ``dataset.input`` were multiplied since they were read; `data` and
+        `observation` have the unit of the files.
     """
 
     observation: Observation
@@ -73,6 +84,7 @@ class Frames:
     noise: str
     pointings: tuple[Pointing, ...] = ()
     references: tuple[Observation, ...] = ()
+    factor: NDArray[np.float64] = field(default_factory=lambda: np.ones(1))
 
 
 def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> Observation:
@@ -99,6 +111,11 @@ def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> O
     IncompatibleSetupError
         If the dataset has several wavelengths and none was chosen.
 
+    Warns
+    -----
+    DiffrenderWarning
+        If the errors and original pixels of the files cannot be used, with the reason.
+
     Examples
     --------
     >>> import numpy as np
@@ -123,8 +140,9 @@ def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> O
     index = np.flatnonzero(np.asarray(dataset.wvs) == wavelength)
     if index.size == 0:
         raise IncompatibleSetupError(f"wavelength: got {wavelength}, the dataset has {wavelengths}")
-    imgs = np.asarray(dataset.input)[index]
-    return _gather(dataset, index, imgs, settings_of(dataset)).observation
+    imgs, settings = np.asarray(dataset.input)[index], settings_of(dataset)
+    attach_source(dataset, settings.files)
+    return _gather(dataset, index, imgs, settings).observation
 
 
 def date_of_frames(dataset: Any) -> Time | None:
@@ -170,17 +188,18 @@ def frames_of(
     every = _gather(dataset, index, imgs, settings)
     observation, chosen = every.observation, index[every.usable]
     source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
-    if source is None or not source.lists(dataset):
+    places = None if source is None else source.places(dataset)
+    if source is None or places is None:
         return replace(every, pointings=tuple(pointings_of(observation)))
     recorded = every.pixels == "recorded"
     details = [
         FrameDetails(
-            str(dataset.filenames[i]),
+            source.filenames[i],
             source.headers[i],
             source.first_pixels[i] if recorded else None,
             source.star_offsets[i],
         )
-        for i in chosen
+        for i in places[chosen]
     ]
     others = reference_frames([each.header for each in details])
     if not others.any():
@@ -208,34 +227,49 @@ def frames_of(
         every.noise,
         tuple(target),
         tuple(replace(each.observation, reference=True) for each in rest),
+        every.factor[~others],
     )
 
 
 def _gather(
     dataset: Any, index: NDArray[np.intp], imgs: NDArray[Any], settings: DiffrenderSettings
 ) -> Frames:
-    """Gather all frames of one wavelength, of whatever star."""
+    """Gather all frames of one wavelength, of whatever star.
+
+    Warns
+    -----
+    DiffrenderWarning
+        If the files' pixels, errors, flags or headers cannot be used.
+    """
     imgs = native_float64(imgs)
     source: SourceFrames | None = getattr(dataset, ATTRIBUTE, None)
     data, valid, error = imgs, np.isfinite(imgs), None
     centers, pixels, noise = native_float64(dataset.centers)[index], "as given", "ERR"
     header, unit, pixelscale = fits.Header(), settings.unit, settings.pixelscale
+    factor, lost = np.ones(len(imgs)), why_without_source(dataset)
     if source is not None:
-        recorded = None
-        header = source.headers[0]
-        if source.belongs_to(dataset):
-            header = source.headers[index[0]]
-            recorded = _recorded(source, index, imgs)
-        if recorded is None:
-            logger.warning("the dataset was changed since it was read: its pixels are used as is")
+        places = source.places(dataset)
+        header = source.headers[0 if places is None else places[index[0]]]
+        try:
+            recorded = _recorded(source, places, dataset, index, imgs)
+        except _NotRecordedError as reason:
+            lost = str(reason)
         else:
-            (data, valid), centers, pixels = recorded, source.centers[index], "recorded"
-            error = None if source.error is None else native_float64(source.error[index])
+            data, valid, error, centers, factor = recorded
+            pixels = "recorded"
         if unit is None:
-            unit = u.Unit(source.headers[0].get("BUNIT", ""), parse_strict="silent")
+            unit = u.Unit(header.get("BUNIT", ""), parse_strict="silent")
         pixelscale = source.pixelscale if pixelscale is None else pixelscale
+    if lost is not None:
+        warnings.warn(
+            f"the errors and original pixels of the files cannot be used: {lost}. The shifted "
+            "pixels of dataset.input are fitted instead, which is slower and less deep",
+            DiffrenderWarning,
+            stacklevel=2,
+        )
     if settings.error is not None:
-        noise, error = "given", _broadcast(settings.error, index, dataset.input.shape)
+        error = _broadcast(settings.error, index, dataset.input.shape) / factor[:, None, None]
+        noise = "given"
     elif error is None:
         noise, error = "estimated", _estimate(data)
     with np.errstate(invalid="ignore"):
@@ -258,38 +292,117 @@ def _gather(
         name=name,
         header=header,
     )
-    return Frames(observation, data[usable], usable, pixels, noise)
+    return Frames(observation, data[usable], usable, pixels, noise, factor=factor[usable])
+
+
+class _NotRecordedError(Exception):
+    """Why the recorded pixels are not those of the dataset."""
+
+
+class _Recorded(NamedTuple):
+    """Recorded pixels with what was added to the dataset since, (n, ny, nx), and their star."""
+
+    data: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    error: NDArray[np.float64] | None
+    centers: NDArray[np.float64]
+    factor: NDArray[np.float64]
 
 
 def _recorded(
-    source: SourceFrames, index: NDArray[np.intp], imgs: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
-    """Recorded pixels plus what was added to `imgs` since reading, and which pixels are valid.
+    source: SourceFrames,
+    places: NDArray[np.intp] | None,
+    dataset: Any,
+    index: NDArray[np.intp],
+    imgs: NDArray[np.float64],
+) -> _Recorded:
+    """Recorded pixels plus what was added to `imgs` since reading, in the unit of the files.
 
-    None if pixels that were NaN have a value now, because no recorded pixel corresponds to them.
+    Raises
+    ------
+    _NotRecordedError
+        If no recorded pixels correspond to those of the dataset.
     """
     from pyklip.klip import align_and_scale
 
-    before = native_float64(source.aligned[index])
-    if np.any(np.isnan(before) & np.isfinite(imgs)):
-        return None
-    data = native_float64(source.data[index])
-    valid = source.usable[index] & np.isfinite(data)
-    for i, frame in enumerate(index):
-        shift = {
-            "new_center": source.centers[frame],
-            "old_center": source.aligned_centers[frame],
-        }
-        added = imgs[i] - before[i]
+    if places is None:
+        raise _NotRecordedError("its frames are not those that were read, by their names")
+    if imgs.shape[1:] != source.aligned.shape[1:]:
+        ny, nx = source.aligned.shape[1:]
+        raise _NotRecordedError(
+            f"its frames have {imgs.shape[2]} x {imgs.shape[1]} pixels, and had {nx} x {ny} when "
+            "they were read"
+        )
+    rows = places[index]
+    before = native_float64(source.aligned[rows])
+    factor = np.array([_factor(one, other) for one, other in zip(imgs, before, strict=True)])
+    # Pixels that were NaN when they were read belong to flagged ones, whatever was filled in.
+    change = np.where(np.isfinite(before), imgs / factor[:, None, None] - before, 0.0)
+    data = native_float64(source.data[rows])
+    error = None if source.error is None else native_float64(source.error[rows])
+    if error is not None:
+        _require_same(change, error, source.usable[rows])
+    valid = source.usable[rows] & np.isfinite(data)
+    centers = native_float64(dataset.centers)[index]
+    moved = centers - source.aligned_centers[rows]
+    for i, frame in enumerate(rows):
+        shift = {"new_center": source.centers[frame], "old_center": source.aligned_centers[frame]}
         masked = np.isnan(imgs[i]) & np.isfinite(before[i])
-        added[~np.isfinite(added)] = 0.0
-        if added.any():
+        added = np.where(np.isfinite(change[i]), change[i], 0.0)
+        # A changed factor is known to the rounding of single precision.
+        if np.abs(added).max() > _ROUNDING * np.nanmax(np.abs(before[i])):
             # Nothing is known beyond the edge of the shifted frame; assume nothing was added.
             data[i] += np.nan_to_num(align_and_scale(added, **shift))
         if masked.any():
             # A pixel masked by hand invalidates every recorded pixel that contributed to it.
             valid[i] &= np.nan_to_num(align_and_scale(masked.astype(float), **shift)) < 0.1
-    return data, valid
+    return _Recorded(data, valid, error, source.centers[rows] + moved, factor)
+
+
+def _factor(now: NDArray[np.float64], before: NDArray[np.float64]) -> float:
+    """Factor by which a frame was multiplied since it was read; 1 if it was not.
+
+    Raises
+    ------
+    _NotRecordedError
+        If it is not positive.
+    """
+    with np.errstate(invalid="ignore"):
+        bright = np.abs(before) > np.nanpercentile(np.abs(before), 90)
+    bright &= np.isfinite(now)
+    if not bright.any():
+        return 1.0
+    ratios = now[bright] / before[bright]
+    factor = float(np.median(ratios))
+    # Sources that were added since change few of the brightest pixels.
+    if abs(factor - 1) < _ROUNDING or np.median(np.abs(ratios - factor)) > _ROUNDING * abs(factor):
+        return 1.0
+    if factor <= 0:
+        raise _NotRecordedError(f"its frames were multiplied by {factor:.3g} after reading")
+    return factor
+
+
+def _require_same(
+    change: NDArray[np.float64], error: NDArray[np.float64], usable: NDArray[np.bool_]
+) -> None:
+    """Refuse frames in which most pixels were changed by more than their noise.
+
+    Faint sources change few pixels, and another background changes all by the same amount.
+
+    Raises
+    ------
+    _NotRecordedError
+    """
+    for frame, sigma, good in zip(change, error, usable, strict=True):
+        known, scale = frame[np.isfinite(frame)], sigma[good & (sigma > 0)]
+        if not known.size or not scale.size:
+            continue
+        spread = float(np.median(np.abs(known - np.median(known))))
+        if spread > float(np.median(scale)):
+            raise _NotRecordedError(
+                "most of its pixels were changed by more than their noise after reading, for "
+                "example by a filter"
+            )
 
 
 def _usable(valid: NDArray[np.bool_], name: str) -> NDArray[np.bool_]:

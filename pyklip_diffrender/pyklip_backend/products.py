@@ -21,7 +21,7 @@ from pyklip_diffrender.pyklip_backend.frames import Frames
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.wavefront.opd import OPDMap
 
-__all__ = ["ReductionRecord", "provenance", "require_folder", "staging", "stamp"]
+__all__ = ["ReductionRecord", "folder_and_prefix", "provenance", "staging", "stamp"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,22 +50,31 @@ class ReductionRecord:
         return self
 
 
-def require_folder(folder: str | os.PathLike[str]) -> Path:
-    """Check the output folder before an hour of fitting, not after.
+def folder_and_prefix(folder: str | os.PathLike[str], prefix: str) -> tuple[Path, str]:
+    """Split where products go into a folder, which is checked before an hour of fitting, and names.
+
+    Parameters
+    ----------
+    folder : path
+        The argument `outputdir`.
+    prefix : str
+        The argument `fileprefix`, which may begin with folders.
 
     Raises
     ------
     FileNotFoundError
-        If there is none; pyKLIP does not make it either.
+        If there is no such folder; pyKLIP does not make it either.
     PermissionError
         If nothing can be written there.
     """
-    path = Path(folder or ".").resolve()
+    inside, name = os.path.split(str(prefix))
+    path = (Path(folder or ".") / inside).resolve()
+    argument = "fileprefix" if inside else "outputdir"
     if not path.is_dir():
-        raise FileNotFoundError(f"outputdir: {path} is not a folder; make it first")
+        raise FileNotFoundError(f"{argument}: {path} is not a folder; make it first")
     if not os.access(path, os.W_OK | os.X_OK):
-        raise PermissionError(f"outputdir: {path} cannot be written to")
-    return path
+        raise PermissionError(f"{argument}: {path} cannot be written to")
+    return path, name
 
 
 @contextmanager
@@ -151,12 +160,12 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
     header.add_history("DRSHA256 is the SHA-256 of the wavefront map's file, or of its array")
     for record in records:
         frames, subtraction = record.frames, record.subtraction
-        text = (
+        line = (
             f"diffrender: {frames.observation.name}, {frames.observation.filter or 'given model'}, "
             f"opd {record.opd.name}, {subtraction.method}, seed {subtraction.seed}, "
             f"{frames.pixels} pixels, errors {frames.noise}"
         )
-        header.add_history(fits_text(text))
+        header.add_history(fits_text(line))
         for fit in subtraction.fits:
             header.add_history(
                 f"diffrender: frames {', '.join(map(str, fit.frames))}: {fit.status}, "
@@ -167,7 +176,7 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
                 facts = ", ".join(f"{k[5:]} {v}" for k, v in plan.summary().items())
                 header.add_history(f"diffrender: planned: {facts}")
         for line in _fitted(subtraction):
-            header.add_history(fits_text(f"diffrender: {line}"))
+            header.add_history(f"diffrender: {line}")
     return header
 
 

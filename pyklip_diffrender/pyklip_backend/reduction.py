@@ -20,6 +20,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError, ShapeError
+from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.pyklip_backend.checks import (
     check_arguments,
     check_dataset,
@@ -37,8 +38,8 @@ from pyklip_diffrender.pyklip_backend.placement import (
 )
 from pyklip_diffrender.pyklip_backend.products import (
     ReductionRecord,
+    folder_and_prefix,
     provenance,
-    require_folder,
     staging,
     stamp,
 )
@@ -52,6 +53,7 @@ from pyklip_diffrender.pyklip_backend.settings import (
     starting_opd,
     thread_limit,
 )
+from pyklip_diffrender.pyklip_backend.source import attach_source
 from pyklip_diffrender.pyklip_backend.subtract import subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.throughput import (
     on_product,
@@ -103,11 +105,16 @@ class Reduction:
         DiffrenderError
             For bad input and failed fits. pyKLIP's own errors pass through.
         """
-        self._check()
-        opd = self._opd()
-        folder = require_folder(self.arguments["outputdir"])
-        before = dict(vars(self.dataset))
+        before, names = dict(vars(self.dataset)), self.dataset.filenames
         try:
+            attach_source(self.dataset, self.settings.files)
+            self._check()
+            opd = self._opd()
+            folder, prefix = folder_and_prefix(
+                self.arguments["outputdir"], self.arguments["fileprefix"]
+            )
+            # FITS headers, to which pyKLIP writes them, hold ASCII only.
+            self.dataset.filenames = np.array([fits_text(n) for n in self.dataset.filenames])
             with staging(folder) as stage, thread_limit(self.settings.threads):
 
                 def subtract(*args: Any, **kwargs: Any) -> tuple[Any, ...]:
@@ -120,15 +127,16 @@ class Reduction:
                     klip_parallelized_lite=subtract,
                     high_pass_filter_imgs=self._high_pass,
                 )
-                reduce(**{**self.arguments, "outputdir": str(stage)})
+                reduce(**{**self.arguments, "outputdir": str(stage), "fileprefix": prefix})
                 cards = provenance(self.records)
-                self._write_extras(stage, cards)
+                self._write_extras(stage, prefix, cards)
                 stamp(stage, cards)
         except BaseException as error:
             vars(self.dataset).clear()
             vars(self.dataset).update(before)
             _say_on_screen(error)
             raise
+        self.dataset.filenames = names
         setattr(self.dataset, RESULTS, tuple(self.records))
         logger.info("products of %r are in %s", self.arguments["fileprefix"], folder)
 
@@ -258,7 +266,7 @@ class Reduction:
             outputs += (aligned_before(imgs, centers, wvs, center, dtype),)
         return outputs
 
-    def _write_extras(self, stage: Path, cards: fits.Header) -> None:
+    def _write_extras(self, stage: Path, prefix: str, cards: fits.Header) -> None:
         """Write what pyKLIP does not: the throughput map, with its median in all products.
 
         Fits without a linear model have none, and copies with added sources that of the original.
@@ -290,7 +298,7 @@ class Reduction:
             "median throughput of faint sources",
         )
         cube = np.where(np.isnan(cube), 1.0, np.where(np.isinf(cube), np.nan, cube))
-        write_throughput(stage / f"{self.arguments['fileprefix']}-throughput.fits", cube, center)
+        write_throughput(stage / f"{prefix}-throughput.fits", cube, center)
 
     def _settings_at(self, wave: float) -> DiffrenderSettings:
         """The settings with the model for this wavelength."""
@@ -310,7 +318,13 @@ class Reduction:
     def _subtract(
         self, frames: Frames, opd: OPDMap, settings: DiffrenderSettings
     ) -> NDArray[np.float64]:
-        """Frames minus their star, (m, ny, nx), high-pass filtered if the call asks for it."""
+        """Subtract the star from frames; high-pass filtered if the call asks for it.
+
+        Returns
+        -------
+        ndarray, (m, ny, nx)
+            In the unit of ``dataset.input``.
+        """
         observation = frames.observation
         before = self._before_injection
         if before:
@@ -345,6 +359,7 @@ class Reduction:
             )
         filled = sum(map(fill, residuals, observation.valid))
         self.records.append(ReductionRecord(frames, opd, subtraction, filled))
+        residuals *= frames.factor[:, np.newaxis, np.newaxis]
         if self._filter is not None:
             residuals = np.array([self._filter(residual) for residual in residuals])
         return residuals

@@ -15,8 +15,8 @@ from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.pyklip_backend.pointings import may_be_one_star
 from pyklip_diffrender.pyklip_backend.source import REFERENCES
-from pyklip_diffrender.pyklip_backend.windows import Window
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.window import Window
 
 __all__ = [
     "References",
@@ -66,7 +66,7 @@ class References:
                 logger.warning("%s is left out: it does not show another star", path.name)
                 continue
             observations.append(replace(frames, reference=True))
-        return [Window.about(each.center[0], shape).of(each) for each in observations]
+        return [each.within(Window.about(each.center[0], shape)) for each in observations]
 
 
 def library_files(dataset: Any, psf_library: Any) -> tuple[Path, ...]:

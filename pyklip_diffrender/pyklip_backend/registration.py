@@ -18,6 +18,7 @@ from contextvars import ContextVar
 from typing import Any
 
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.pyklip_backend.child import announce, spawned_beside_klip
 from pyklip_diffrender.pyklip_backend.forward_reduction import ForwardReduction
 from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
 from pyklip_diffrender.pyklip_backend.products import ReductionRecord
@@ -89,12 +90,23 @@ class _Registry:
         self.patches: _Patches | None = None
         self.registered = False
         self.blocks = 0
+        self.forcing = 0
+        self.watching = False
         self.defaults = DiffrenderSettings()
         self.replace: bool | None = None
 
-    def use(self, registered: bool, blocks: int) -> None:
-        """Set the users; patch pyKLIP for the first and restore it after the last."""
-        in_use = registered or blocks > 0
+    def use(self, registered: bool, blocks: int, forcing: int | None = None) -> None:
+        """Set the users; patch pyKLIP for the first and restore it after the last.
+
+        Parameters
+        ----------
+        registered : bool
+        blocks : int
+            Number of `backend` blocks in all threads.
+        forcing : int, optional
+            Number of those that take over KLIP.
+        """
+        in_use = registered or blocks > 0 or self.watching
         if in_use and self.patches is None:
             patches = _Patches()
             patches.apply()
@@ -103,6 +115,14 @@ class _Registry:
             self.patches.restore()
             self.patches = None
         self.registered, self.blocks = registered, blocks
+        self.forcing = self.forcing if forcing is None else forcing
+        announce(self.forcing > 0 or bool(self.replace))
+
+    def watch(self) -> None:
+        """Patch pyKLIP so that plain KLIP is mentioned, in a spawned process."""
+        with self.lock:
+            self.watching = True
+            self.use(self.registered, self.blocks)
 
 
 _registry = _Registry()
@@ -119,7 +139,7 @@ _warned: weakref.WeakSet[ReductionRecord] = weakref.WeakSet()
 
 def is_registered() -> bool:
     """Whether ``algo="diffrender"`` works at present."""
-    return _registry.patches is not None
+    return _registry.registered or _registry.blocks > 0
 
 
 def register(
@@ -159,9 +179,9 @@ def register(
     """
     settings = DiffrenderSettings(opd=opd, model=model, **options)
     with _registry.lock:
+        _registry.replace = _registry.replace if replace is None else replace
         _registry.use(True, _registry.blocks)
         _registry.defaults = settings.over(_registry.defaults)
-        _registry.replace = _registry.replace if replace is None else replace
 
 
 def unregister() -> None:
@@ -192,6 +212,9 @@ def backend(
 ) -> Iterator[None]:
     """Use this backend within a block, without changing the code that is called there.
 
+    The block holds for the thread that enters it, and for processes that are forked in it. Calls in
+    other threads and in spawned processes run KLIP with a warning.
+
     Parameters
     ----------
     name : str
@@ -219,14 +242,18 @@ def backend(
     outer, _ = _block.get()
     settings = DiffrenderSettings(opd=opd, model=model, **options).over(outer)
     with _registry.lock:
-        _registry.use(_registry.registered, _registry.blocks + 1)
+        _registry.use(
+            _registry.registered, _registry.blocks + 1, _registry.forcing + int(bool(force))
+        )
     token = _block.set((settings, force))
     try:
         yield
     finally:
         _block.reset(token)
         with _registry.lock:
-            _registry.use(_registry.registered, _registry.blocks - 1)
+            _registry.use(
+                _registry.registered, _registry.blocks - 1, _registry.forcing - int(bool(force))
+            )
 
 
 def _takes_klip() -> bool | None:
@@ -246,8 +273,23 @@ def _is_ours(algo: Any) -> bool:
     return name in (ALGORITHM, BOTH) or (name == "klip" and bool(_takes_klip()))
 
 
+def _outside_block() -> bool:
+    """Whether a `backend` block was entered, but in other threads only."""
+    return _registry.blocks > 0 and _block.get() is _NO_BLOCK
+
+
 def _warn_of_klip(dataset: Any, function: str) -> None:
-    """Say once that KLIP runs on a dataset, or a copy of one, that this backend has reduced."""
+    """Warn if KLIP runs where this backend may be expected."""
+    if _takes_klip() is None and (_registry.watching or (_registry.forcing and _outside_block())):
+        place = "spawned process" if _registry.watching else "thread"
+        warnings.warn(
+            f"{function} runs KLIP in this {place}, to which the `with backend():` block or "
+            "register(replace=True) that another one has entered does not extend. Call "
+            f"register(replace=True, ...) or enter a block in the {place} itself",
+            DiffrenderWarning,
+            stacklevel=4,
+        )
+        return
     records = getattr(dataset, RESULTS, ())
     if not records or records[0] in _warned or _takes_klip() is not None:
         return
@@ -270,8 +312,15 @@ def _patches() -> _Patches:
 
 
 def _settings_for(dataset: Any) -> DiffrenderSettings:
-    """The settings of the enclosing blocks, of the dataset and of `register`, merged."""
+    """Return the settings of the enclosing blocks, of the dataset and of `register`, merged."""
     settings, _ = _block.get()
+    if _outside_block():
+        warnings.warn(
+            "settings of a `with backend():` block that another thread has entered do not hold in "
+            "this thread. Enter a block in the thread itself, or give the settings to register()",
+            DiffrenderWarning,
+            stacklevel=4,
+        )
     return settings.over(settings_of(dataset)).over(_registry.defaults)
 
 
@@ -358,3 +407,7 @@ def _fm_klip_dataset(*args, **kwargs):  # type: ignore[no-untyped-def]
     from pyklip_diffrender.pyklip_backend.registration import dispatch_fm
 
     return dispatch_fm(*args, **kwargs)
+
+
+if spawned_beside_klip():
+    _registry.watch()

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -110,6 +110,9 @@ class DiffrenderSettings:
         A dataset that has been reduced. Those of the calls are copies of it to which faint sources
         were added; the star is not fitted to them again, but what it takes of the sources follows
         from the linear model of the fit. For contrast curves by injection.
+    files : path or sequence of path, optional
+        Files, or folders with the files, that a `JWSTData` was read from before `register`. The
+        errors and pixels of files in the current folder are found without it.
     threads : int, optional
         Number of threads of a reduction; PyTorch's choice by default. 1 is best on a busy machine.
     model_options : mapping, optional
@@ -143,6 +146,7 @@ class DiffrenderSettings:
     keep_detected: bool | None = None
     max_chi2: float | None = None
     injected_into: Any = None
+    files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None
     threads: int | None = None
     model_options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     subtractor: Callable[..., Any] | None = None

@@ -3,12 +3,14 @@
 `JWSTData.readdata` keeps the base name of each file and frames that a cubic spline has shifted to
 the centre of the array. A wavefront fit needs the pixels as the detector recorded them, with their
 errors. While the backend is registered, reading a dataset also attaches a `SourceFrames` to it, and
-reading its library of reference stars attaches the paths of their files.
+reading its library of reference stars attaches the paths of their files. A dataset that was read
+before gets its `SourceFrames` from the files, if these can be found.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,20 +20,22 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from pyklip_diffrender.errors import CorruptFileError, NoValidPixelsError
 from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.io.headers import merged_header
-from pyklip_diffrender.scene.detector_pixels import SHIFTS, first_pixel
-from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS, dither
-from pyklip_diffrender.scene.noise import calibrated_errors
+from pyklip_diffrender.io.headers import fits_text, merged_header
+from pyklip_diffrender.scene.detector_pixels import SHIFTS
+from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
     "ATTRIBUTE",
     "REFERENCES",
     "SourceFrames",
+    "attach_source",
     "keeping_references",
     "keeping_source",
     "read_source",
+    "why_without_source",
 ]
 
 logger = logging.getLogger(__name__)
@@ -39,11 +43,18 @@ logger = logging.getLogger(__name__)
 ATTRIBUTE = "_diffrender_source"
 """Attribute of the dataset that holds its `SourceFrames`."""
 
+REASON = "_diffrender_no_source"
+"""Attribute of the dataset that says why it has no `SourceFrames`."""
+
 REFERENCES = "_diffrender_references"
 """Attribute of the dataset with the paths of the files in its library of reference stars."""
 
 NON_SCIENCE = 512
 """The one bit of the JWST data-quality flags that pyKLIP uses: it sets such pixels to NaN."""
+
+_ROUNDING = 1e-4
+"""Difference, relative to the brightest pixel, between two shifts of the same frame, one of them
+in single precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,17 +107,21 @@ class SourceFrames:
         """Arcsec per pixel."""
         return float(np.sqrt(self.headers[0]["PIXAR_A2"]))
 
-    def belongs_to(self, dataset: Any) -> bool:
-        """Whether the dataset still has the frames, shape and centres it was read with."""
-        return (
-            np.shape(dataset.input) == self.aligned.shape
-            and self.lists(dataset)
-            and np.array_equal(dataset.centers, self.aligned_centers)
-        )
+    def places(self, dataset: Any) -> NDArray[np.intp] | None:
+        """Return where the frames of a dataset are among these; None if one is not.
 
-    def lists(self, dataset: Any) -> bool:
-        """Whether the dataset still has the same frames, however they were changed."""
-        return tuple(dataset.filenames) == self.filenames
+        Frames of a dataset may have been left out, or put into another order.
+        """
+        # While products are written, names are as FITS headers can hold them.
+        names, read = (
+            [fits_text(name) for name in each] for each in (dataset.filenames, self.filenames)
+        )
+        if names == read:
+            return np.arange(len(names))
+        where = {name: k for k, name in reversed(list(enumerate(read)))}
+        if len(set(names)) < len(names) or not set(names) <= set(where):
+            return None
+        return np.array([where[name] for name in names])
 
 
 def keeping_source(readdata: Callable[..., None]) -> Callable[..., None]:
@@ -118,17 +133,76 @@ def keeping_source(readdata: Callable[..., None]) -> Callable[..., None]:
             setattr(self, ATTRIBUTE, read_source(self, filepaths))
         except (KeyError, ValueError, OSError) as error:
             # The dataset itself is complete without the source frames.
-            logger.warning(
-                "the files were read, but not their errors and original pixels: %s", error
-            )
+            setattr(self, REASON, str(error))
 
     readdata_and_source.__name__ = readdata.__name__
     readdata_and_source.__doc__ = readdata.__doc__
     return readdata_and_source
 
 
-def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
-    """Read the pixels, errors, flags and headers of a `JWSTData` that was just filled.
+def attach_source(dataset: Any, files: Any = None) -> None:
+    """Attach a `SourceFrames` to a `JWSTData` that was read before `register`, if possible.
+
+    Parameters
+    ----------
+    dataset : pyklip.instruments.Instrument.Data
+    files : path or sequence of path, optional
+        Files or folders in which the dataset's files are looked for by name, beside the current
+        folder.
+    """
+    if hasattr(dataset, ATTRIBUTE) or hasattr(dataset, REASON) or not _reads_files(dataset):
+        return
+    several = [files] if isinstance(files, str | os.PathLike) else list(files or ())
+    known: dict[str, str] = {}
+    for path in [Path(), *map(Path, several)]:
+        inside = path.iterdir() if path.is_dir() else [path]
+        known |= {each.name: str(each) for each in inside}
+    # pyKLIP appends the number of the integration to the name of the file.
+    names = list(dict.fromkeys(str(each).rpartition("_INT")[0] for each in dataset.filenames))
+    missing = [name for name in names if name not in known]
+    if missing:
+        return
+    try:
+        setattr(dataset, ATTRIBUTE, read_source(dataset, [known[n] for n in names], late=True))
+    except (KeyError, ValueError, OSError) as error:
+        setattr(dataset, REASON, str(error))
+    else:
+        logger.info("the files of the dataset were read again: it was made before register()")
+
+
+def why_without_source(dataset: Any) -> str | None:
+    """Return why errors and original pixels of a dataset's files are not known.
+
+    None for a dataset that has them, or was not read from files.
+    """
+    if hasattr(dataset, ATTRIBUTE) or not _reads_files(dataset):
+        return None
+    reason = getattr(dataset, REASON, None)
+    if reason is not None:
+        return str(reason)
+    return (
+        "the dataset was made before register() or the backend block. Make it after that, or say "
+        "where its files are: DiffrenderSettings(files=...)"
+    )
+
+
+def _reads_files(dataset: Any) -> bool:
+    """Whether a dataset is a `JWSTData`, which has read files."""
+    return hasattr(dataset, "center_include_offset") and hasattr(dataset, "center_kw_x")
+
+
+def read_source(
+    dataset: Any, filepaths: str | Iterable[str], *, late: bool = False
+) -> SourceFrames:
+    """Read the pixels, errors, flags and headers of the files of a `JWSTData`.
+
+    Parameters
+    ----------
+    dataset : JWSTData
+    filepaths : str or iterable of str
+    late : bool
+        The dataset was not just filled: its frames may have been changed, left out or reordered
+        since, so that all frames are shifted again.
 
     Raises
     ------
@@ -140,6 +214,23 @@ def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
     paths = [filepaths] if isinstance(filepaths, str) else list(filepaths)
     files = [_read(path, dataset) for path in paths]
     counts = [len(file.data) for file in files]
+    middle = (np.array(files[0].data.shape[:0:-1]) - 1) / 2.0
+
+    def shifted(file: _File, frame: int) -> NDArray[np.float64]:
+        return np.asarray(
+            align_and_scale(file.as_read[frame], new_center=middle, old_center=file.center_read)
+        )
+
+    aligned, centers = np.array(dataset.input), np.array(dataset.centers)
+    names = tuple(str(name) for name in dataset.filenames)
+    if late:
+        aligned = np.array([shifted(f, k) for f in files for k in range(len(f.data))], np.float32)
+        centers = np.tile(middle, (len(aligned), 1))
+        names = tuple(
+            f"{Path(path).name}_INT{k + 1}"
+            for path, n in zip(paths, counts, strict=True)
+            for k in range(n)
+        )
     source = SourceFrames(
         headers=[file.header for file, n in zip(files, counts, strict=True) for _ in range(n)],
         data=np.concatenate([file.data for file in files]),
@@ -148,20 +239,23 @@ def read_source(dataset: Any, filepaths: str | Iterable[str]) -> SourceFrames:
         else np.concatenate([file.error for file in files if file.error is not None]),
         usable=np.concatenate([file.usable for file in files]),
         centers=np.concatenate([file.centers for file in files]),
-        aligned=np.array(dataset.input),
-        aligned_centers=np.array(dataset.centers),
-        filenames=tuple(dataset.filenames),
+        aligned=aligned,
+        aligned_centers=centers,
+        filenames=names,
         first_pixels=[f.first_pixel for f, n in zip(files, counts, strict=True) for _ in range(n)],
         star_offsets=[f.star_offset for f, n in zip(files, counts, strict=True) for _ in range(n)],
     )
-    first = source.aligned[0]
-    shifted = align_and_scale(
-        files[0].as_read, new_center=dataset.centers[0], old_center=files[0].center_read
-    ).astype(first.dtype)
-    same_shape = source.data.shape == source.aligned.shape
-    if not same_shape or not np.array_equal(shifted, first, equal_nan=True):
-        raise ValueError(f"{paths[0]}: pyKLIP shifted these frames in a way not known here")
+    if not late:
+        same_shape = source.data.shape == aligned.shape
+        if not same_shape or not _is_close(shifted(files[0], 0), aligned[0]):
+            raise ValueError(f"{paths[0]}: pyKLIP shifted these frames in a way not known here")
     return source
+
+
+def _is_close(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    """Whether two frames differ by no more than rounding."""
+    scale = np.max(np.abs(other), where=np.isfinite(other), initial=0.0)
+    return np.allclose(one, other, rtol=0.0, atol=_ROUNDING * scale, equal_nan=True)
 
 
 class _File(NamedTuple):
@@ -174,65 +268,56 @@ class _File(NamedTuple):
     centers: NDArray[np.float64]
     first_pixel: tuple[int, int] | None
     star_offset: tuple[float, float] | None
-    as_read: NDArray[np.float32]
-    """The first frame, and its star's x, y, as pyKLIP reads them."""
+    as_read: NDArray[Any]
+    """The frames, and their star's x, y, as pyKLIP reads them."""
     center_read: NDArray[np.float64]
 
 
 def _read(path: str, dataset: Any) -> _File:
-    """Read one file."""
+    """Read one file as `reduce` does, for the star's position that pyKLIP has read."""
     with open_fits(path) as hdus:
         primary, science = hdus[0].header, hdus["SCI"].header
-        data = _cube(hdus["SCI"].data)
-        error = _cube(hdus["ERR"].data) if "ERR" in hdus else None
+        as_read = np.array(hdus["SCI"].data)
         flags = hdus["DQ"].data if "DQ" in hdus else np.uint32(0)
-        header = merged_header(primary, science, path)
         aligned = any(name in hdus for name in SHIFTS)
-    flags = np.broadcast_to(flags, data.shape)
-    data[(flags & NON_SCIENCE) != 0] = np.nan
+        header = merged_header(primary, science, path)
+    as_read = as_read[np.newaxis] if as_read.ndim == 2 else as_read
+    flags = np.broadcast_to(flags, as_read.shape)
+    as_read[(flags & NON_SCIENCE) != 0] = np.nan
     # As pyKLIP finds the centre: the given keywords, else CRPIX, plus the dither if requested.
     keywords = (dataset.center_kw_x, "CRPIX1"), (dataset.center_kw_y, "CRPIX2")
     center = np.array([science.get(key, science.get(other)) - 1 for key, other in keywords], float)
     if dataset.center_include_offset:
         offset = np.array([primary["XOFFSET"], primary["YOFFSET"]])
         center += offset / np.sqrt(science["PIXAR_A2"])
-    centers = np.tile(center, (len(data), 1))
-    as_read, usable = data[0], (flags & BAD_PIXEL_BITS) == 0
-    if not aligned:
-        moved = "STARCENX" in header
-        origin = None if moved else first_pixel(header, center, data.shape[1:], Path(path).name)
-        if error is not None and header.get("INSTRUME") == "NIRCAM":
-            # As `Observation.from_fits` does.
-            scale = float(np.sqrt(science["PIXAR_A2"]))
-            known = usable & np.isfinite(data) & np.isfinite(error) & (error > 0)
-            error = calibrated_errors(
-                np.where(known, data, 0.0), np.where(known, error, 1.0), known, centers,
-                (scale, scale), Path(path).name,
-            ).astype(np.float32)  # fmt: skip
-            error[~known] = 0.0
-        dithered = None if moved else dither(header, Path(path).name)
-        return _File(header, data, error, usable, centers, origin, dithered, as_read, center)
-    # The shift of the alignment is undone, so that flat-field errors are in their pixels again.
-    back = Observation.from_fits(path)
-    stated = [
-        header.get(f"STARCEN{axis}", header.get(f"CRPIX{k}")) for k, axis in ((1, "X"), (2, "Y"))
-    ]
+    centers = np.tile(center, (len(as_read), 1))
+    try:
+        frames = Observation.from_fits(path, every_integration=True)
+    except (CorruptFileError, NoValidPixelsError) as reason:
+        # Such as a file without errors, or a frame of which all pixels are flagged.
+        logger.warning("only the pixels and flags are used: %s", reason)
+        usable = (flags & BAD_PIXEL_BITS) == 0
+        return _File(
+            header, as_read.astype(np.float32), None, usable, centers, None, None, as_read, center
+        )
+    if aligned:
+        # Frames are back on the pixels of the detector, so that flat-field errors are, too.
+        stated = [
+            header.get(f"STARCEN{axis}", header.get(f"CRPIX{k}"))
+            for k, axis in ((1, "X"), (2, "Y"))
+        ]
+        centers += frames.center - (np.array(stated, dtype=float) - 1)
     return _File(
         header,
-        np.where(np.isfinite(data), back.data, np.nan).astype(np.float32),
-        np.where(back.valid, back.error, 0.0).astype(np.float32),
-        back.valid,
-        centers + back.center - (np.array(stated, dtype=float) - 1),
-        back.first_pixel,
-        back.star_offset,
+        np.where(np.isfinite(as_read), frames.data, np.nan).astype(np.float32),
+        np.where(frames.valid, frames.error, 0.0).astype(np.float32),
+        frames.valid,
+        centers,
+        frames.first_pixel,
+        frames.star_offset,
         as_read,
         center,
     )
-
-
-def _cube(pixels: NDArray[Any]) -> NDArray[np.float32]:
-    pixels = np.array(pixels, dtype=np.float32)
-    return pixels[np.newaxis] if pixels.ndim == 2 else pixels
 
 
 def keeping_references(readpsflib: Callable[..., None]) -> Callable[..., None]:

@@ -20,9 +20,9 @@ from pyklip_diffrender.pyklip_backend.verdict import (
     require_plausible,
     warn_of_status,
 )
-from pyklip_diffrender.pyklip_backend.windows import Window, extent
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:
@@ -173,7 +173,7 @@ def subtract_by_refinement(
 
     groups = list(pointings_of(observation) if pointings is None else pointings)
     windows = [Window.about(g.observation.center[0], model.detector.shape) for g in groups]
-    cut = [window.of(group.observation) for window, group in zip(windows, groups, strict=True)]
+    cut = [g.observation.within(w) for g, w in zip(groups, windows, strict=True)]
     references = References() if references is None else references
 
     def frames_of_references() -> list[Observation]:
@@ -332,5 +332,5 @@ def model_of(observation: Observation, settings: DiffrenderSettings) -> OpticalS
     options = dict(settings.model_options)
     if settings.pixelscale is not None:
         options = {"pixelscale": observation.pixelscale, **options}
-    size = settings.fit_pixels or min(FIT_PIXELS, *extent(observation).shape)
+    size = settings.fit_pixels or min(FIT_PIXELS, *Window.holding(observation.valid).shape)
     return model_for(observation, size, **options)

@@ -138,7 +138,7 @@ def _klip_curve(reduction: Reduction) -> QTable | None:
         return None
     try:
         # pyKLIP is loaded only if it is needed.
-        from pyklip_diffrender.pyklip_backend.klip_curve import klip_curve
+        from pyklip_diffrender.pyklip_backend.klip import klip_curve
 
         return klip_curve(reduction.detection, reduction.sequence.references)
     except Exception as error:  # An addition to the report, which is complete without it.

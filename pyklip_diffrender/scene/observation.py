@@ -38,6 +38,7 @@ from pyklip_diffrender.scene.integrations import (
 )
 from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints
 from pyklip_diffrender.scene.noise import calibration
+from pyklip_diffrender.scene.window import Window
 
 __all__ = ["Observation"]
 
@@ -447,21 +448,46 @@ class Observation:
                 f"into {nx} x {ny}. Choose a smaller size"
             )
 
-        def cut(stack: NDArray[Any]) -> NDArray[Any]:
-            return np.stack(
-                [frame[y : y + size, x : x + size] for frame, (x, y) in
-                 zip(stack, corners, strict=True)]
-            )  # fmt: skip
+        return self._cut([Window(int(y), int(x), (size, size)) for x, y in corners])
 
+    def within(self, window: Window) -> Observation:
+        """Return the pixels in a box, which may reach beyond the frames, where it is masked.
+
+        Parameters
+        ----------
+        window : Window
+
+        Raises
+        ------
+        NoValidPixelsError
+            If a frame has no valid pixel there.
+        """
+        part = self._cut([window] * len(self))
+        if not np.any(part.valid, axis=(1, 2)).all():
+            raise NoValidPixelsError(
+                f"{self.name}: no valid pixel within {window.shape[1]} x {window.shape[0]} "
+                "pixels of the star. Check the star centre in the header, or fit a larger field "
+                "with fit_pixels"
+            )
+        return part
+
+    def _cut(self, windows: list[Window]) -> Observation:
+        """Cut one box out of every frame; all boxes have the same shape."""
+
+        def cut(stack: NDArray[Any], fill: Any) -> NDArray[Any]:
+            pairs = zip(windows, stack, strict=True)
+            return np.concatenate([window.cut(frame[None], fill) for window, frame in pairs])
+
+        corners = np.array([(window.x, window.y) for window in windows])
         origin = None
         if self.first_pixel is not None and (corners == corners[0]).all():
             column, row = self.first_pixel
             origin = (column + int(corners[0, 0]), row + int(corners[0, 1]))
         return replace(
             self,
-            data=cut(self.data),
-            error=cut(self.error),
-            valid=cut(self.valid),
+            data=cut(self.data, 0.0),
+            error=cut(self.error, 1.0),
+            valid=cut(self.valid, False),
             center=self.center - corners,
             first_pixel=origin,
         )

@@ -1,18 +1,14 @@
-"""Boxes around the star: the part of a frame that is fitted, and where it belongs in the frame."""
+"""Boxes of pixels about the star: cutting them out of frames and putting them back."""
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import NoValidPixelsError
-from pyklip_diffrender.scene.observation import Observation
-
-__all__ = ["Window", "extent"]
+__all__ = ["Window"]
 
 
 @dataclass(frozen=True)
@@ -33,9 +29,16 @@ class Window:
 
     @classmethod
     def about(cls, center: NDArray[np.float64], shape: tuple[int, int]) -> Window:
-        """The box whose middle is within half a pixel of `center`, [x, y]."""
+        """Return the box whose middle is within half a pixel of `center`, [x, y]."""
         ny, nx = shape
         return cls(round(center[1] - (ny - 1) / 2), round(center[0] - (nx - 1) / 2), shape)
+
+    @classmethod
+    def holding(cls, valid: NDArray[np.bool_]) -> Window:
+        """Return the smallest box that holds all valid pixels of frames, (n, ny, nx)."""
+        _, rows, columns = np.nonzero(valid)
+        shape = (int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1)
+        return cls(int(rows.min()), int(columns.min()), shape)
 
     def __contains__(self, other: Window) -> bool:
         (ny, nx), (other_ny, other_nx) = self.shape, other.shape
@@ -47,7 +50,7 @@ class Window:
         )
 
     def _overlap(self, frame: tuple[int, ...]) -> tuple[Any, Any]:
-        """Slices of the overlap of box and frame, in the frame and in the box."""
+        """Return the slices of the overlap of box and frame, in the frame and in the box."""
         y0, x0 = max(self.y, 0), max(self.x, 0)
         y1 = max(min(self.y + self.shape[0], frame[0]), y0)
         x1 = max(min(self.x + self.shape[1], frame[1]), x0)
@@ -68,36 +71,3 @@ class Window:
         in_frame, in_box = self._overlap(frame)
         out[in_frame] = box[in_box]
         return out
-
-    def of(self, observation: Observation) -> Observation:
-        """The part of an observation inside the box.
-
-        Raises
-        ------
-        NoValidPixelsError
-            If a frame has no valid pixel there.
-        """
-        valid = self.cut(observation.valid, False)
-        if not np.any(valid, axis=(1, 2)).all():
-            raise NoValidPixelsError(
-                f"{observation.name}: no valid pixel within {self.shape[1]} x {self.shape[0]} "
-                "pixels of the star. Check the star centre in the header, or fit a larger field "
-                "with fit_pixels"
-            )
-        origin = observation.first_pixel
-        return dataclasses.replace(
-            observation,
-            data=self.cut(observation.data, 0.0),
-            error=self.cut(observation.error, 1.0),
-            valid=valid,
-            center=observation.center - np.array([self.x, self.y]),
-            first_pixel=None if origin is None else (origin[0] + self.x, origin[1] + self.y),
-        )
-
-
-def extent(observation: Observation) -> Window:
-    """The box that holds all valid pixels; frames may be padded with NaN."""
-    _, rows, columns = np.nonzero(observation.valid)
-    return Window(
-        int(rows.min()), int(columns.min()), (int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1)
-    )

@@ -1,8 +1,7 @@
-"""The contrast curve of KLIP (ADI and RDI) for the frames of a detection.
+"""The contrast curve of KLIP (ADI and RDI) for frames that were searched with a model.
 
-It is what an observer would get without a model of the telescope. The same planets that the fit
-would search for, in units of the same star, are added to the frames to measure how much of them
-KLIP leaves.
+An observer without a model of the telescope would get it. The planets that are added to the frames,
+to measure how much of them KLIP leaves, have the images and the star of the model.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ _CLOSE = 1.5
 def klip_curve(
     detection: Detection, references: Sequence[Observation] = (), separations: Any = None
 ) -> QTable:
-    """Compute the 5-sigma contrast curve of KLIP for the frames that were fitted.
+    """Compute the 5-sigma contrast curve of KLIP for the frames that were searched.
 
     Every roll is projected onto the Karhunen-Loeve modes of the other rolls and all frames of
     reference stars. The residuals are turned to the orientation of the first roll, averaged and
