@@ -22,7 +22,7 @@ import torch
 from astropy.io import fits
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.report import summarise
+from pyklip_diffrender.reduction import summarise
 
 ROLLS = ("jw01184005001_03106", "jw01184006001_03106")
 FLUX = 0.3  # Jy

@@ -20,7 +20,7 @@ import numpy as np
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.pyklip_backend.klip import klip_curve
-from pyklip_diffrender.report import summarise
+from pyklip_diffrender.reduction import summarise
 
 SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])
 SIZE = 80

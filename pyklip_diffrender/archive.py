@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -278,6 +278,12 @@ def _is_calints(row: Any, filter: str | None) -> bool:
 
 def _listing(products: Table, folder: Path) -> QTable:
     names = [str(name) for name in products["productFilename"]]
+    for name in names:
+        if {PurePosixPath(name).name, PureWindowsPath(name).name} != {name.lstrip(".")}:
+            raise ArchiveError(
+                f"MAST lists a product called {name!r}, expected the name of a file without a "
+                "folder. Report it to the archive, and download the files that you need by hand"
+            )
     sizes = np.ma.filled(np.ma.asarray(products["size"]), _UNKNOWN).astype(np.int64)
     complete = [
         (folder / name).is_file() and size in (_UNKNOWN, (folder / name).stat().st_size)

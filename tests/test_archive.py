@@ -32,6 +32,7 @@ class Observations:
                      ("3", "AU-MIC", "F444W;MASKRND")]  # fmt: skip
         self.rights = {name: "PUBLIC" for name in NAMES}
         self.short: set[str] = set()
+        self.renamed = ""
         self.offline: Any = None
         self.asked: dict[str, Any] = {}
         self.fetched: list[str] = []
@@ -46,6 +47,7 @@ class Observations:
         self.asked["obsid"] = list(observations["obsid"])
         files = [f"{name}_{kind}.fits" for name in NAMES for kind in ("calints", "rateints")]
         files += ["jw01184005001_03106_00001_nrcalong_calints.jpg", "jw01184_f356w_calints.fits"]
+        files[0] = self.renamed or files[0]
         return Table(
             {
                 "productFilename": MaskedColumn(files),
@@ -128,6 +130,19 @@ def test_a_listing_fetches_nothing(mast: Observations, tmp_path: Path) -> None:
     assert list(listing["file"]) == FILES
     assert list(listing["complete"]) == [True, False]
     np.testing.assert_allclose(listing["size"].to_value("kbyte"), SIZE / 1e3)
+    assert mast.fetched == []
+
+
+@pytest.mark.parametrize(
+    "name", ["../../x_calints.fits", "/tmp/x_calints.fits", r"..\x_calints.fits", ".x_calints.fits"]
+)
+def test_a_name_that_leaves_the_folder_is_refused(
+    mast: Observations, tmp_path: Path, name: str
+) -> None:
+    mast.renamed = name
+    with pytest.raises(ArchiveError, match="expected the name of a file without a folder"):
+        archive.fetch_calints(1184, "G-7-34", folder=tmp_path / "a" / "b")
+    assert left(tmp_path) == []
     assert mast.fetched == []
 
 

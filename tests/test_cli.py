@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -23,16 +24,16 @@ import torch
 from astropy.io import fits
 from astropy.time import Time
 
-from pyklip_diffrender import __version__, reduction, refinement
+from pyklip_diffrender import __version__, refinement
 from pyklip_diffrender.cli import application, main
 from pyklip_diffrender.cli.estimate import steps_of
 from pyklip_diffrender.cli.options import read_config
 from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.reduction import Preparation, ReduceOptions
 from pyklip_diffrender.refinement import Status
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.wavefront import wss
 from pyklip_diffrender.wavefront.map_choice import RULES
 from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, resample
 
@@ -82,9 +83,15 @@ def test_help_of_a_command_has_sections_and_examples(
         (["fit"], "No such command 'fit'"),
         (["reduce", "-o", "x", "--opd", "y"], "Missing argument 'FRAMES...'"),
         (["detect", "x", "--opd", "y"], "Missing option '-o'"),
-        (["detect", "x", "-o", "y"], "Give either --opd FILE, or --opd-folder"),
-        (["detect", "x", "-o", "y", "--opd", "z", "--opd-date", "before"], "Give either --opd"),
-        (["detect", "x", "-o", "y", "--opd-date", "closest"], "nearest"),
+        (["detect", "x", "-o", "y"], "Missing option '--opd'"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--opd-date", "closest"], "nearest"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--threshold", "-3"], "--threshold: got -3"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--star-flux", "9 parsec"], "--star-flux: got"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--star-flux-error", "20"], "20 % are 0.2"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--memory", "2 lightyears"], "--memory: got"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--disk", "--wide"], "--wide, --disk: got both"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--systematics", "no.fits"], "--systematics"),
+        (["detect", "x", "-o", "y", "--opd", "z", "--opd-folder", "x"], "--opd-folder"),
         (["detect", "x", "-o", "y", "--opd", "z", "--dry-run", "--json"], "--dry-run has no"),
         (["psf", "x.fits", "--threads", "0"], "--threads"),
     ],
@@ -311,8 +318,8 @@ def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(
     tmp_path: Path, frames: Path, maps: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     products = tmp_path / "products"
-    arguments = ["reduce", str(frames), "--opd-folder", str(maps), "-o", str(products)]
-    arguments += ["--dry-run", "--size", "6"]
+    arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(products)]
+    arguments += ["--dry-run", "--size", "8"]
     assert main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
     target, reference = (
@@ -335,68 +342,117 @@ def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(
     assert "HIP-3" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--star-flux", "0.4 Jy"], "--star-flux: one_calints.fits is not calibrated"),
+        (["--opd", "flat", "--opd-date", "before"], "--opd-date is for --opd FOLDER"),
+        (["--size", "9"], "9"),
+    ],
+)
+def test_a_dry_run_refuses_what_the_run_would_refuse(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    reduced: list[StubReduction],
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    words: str,
+) -> None:
+    arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(tmp_path / "products")]
+    arguments += ["--size", "8", *options]
+    answers = []
+    for dry in ([], ["--dry-run"]):
+        assert main([*arguments, *dry]) != 0
+        answers.append(capsys.readouterr().err)
+    assert answers[0] == answers[1]
+    assert words in answers[0]
+    assert reduced == []
+    assert not (tmp_path / "products").exists()
+
+
+def test_a_full_disk_is_noticed_before_the_work(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    reduced: list[StubReduction],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    usage = SimpleNamespace(total=1e9, used=1e9 - 1e5, free=1e5)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(tmp_path / "products")]
+    assert main([*arguments, "--size", "8"]) == 1
+    assert "has 0 MB of room, expected at least" in capsys.readouterr().err
+    assert reduced == []
+
+
 def test_frames_without_a_map_start_from_a_flat_wavefront(
     tmp_path: Path, frames: Path, reduced: list[StubReduction], capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["reduce", str(frames), "--opd", "flat", "-o", str(tmp_path / "products")]
-    assert main(arguments) == 0
+    assert main([*arguments, "--size", "8"]) == 0
     assert "wavefront map: flat wavefront\n" in capsys.readouterr().out
     (call,) = reduced
-    assert not call.arguments["opd"].data.any()
+    assert not call.given.wavefront.data.any()
 
 
 def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
-    sequence = Sequence.from_files(frames)
-    names = [name for name, _ in steps_of(sequence, 6, "auto")]
+    def steps(sequence: Sequence, **options: Any) -> dict[str, float]:
+        return dict(steps_of(sequence, ReduceOptions(size=8, **options)))
+
+    sequence = Sequence.from_files(frames).cutout(8)
+    names = list(steps(sequence))
     assert names[0] == "reference stars: HIP-2"
-    alone = dict(steps_of(replace(sequence, references=()), 6, "auto"))
+    alone = steps(replace(sequence, references=()))
     assert len(alone) == len(names) - 1
     twice = replace(sequence, science=sequence.science * 2)
-    both = dict(steps_of(twice, 6, "off"))
+    both = steps(twice, systematics="off")
     assert both["search of point sources"] == 2 * alone["search of point sources"]
     one, two = alone["wavefront: 1 file of the target"], both["wavefront: 2 files of the target"]
     assert one < two < 2 * one
-    more = dict(steps_of(twice, 6, "off", disk=True))
+    more = steps(twice, systematics="off", disk=True)
     assert more.items() > both.items()
     assert more["extended light, and the wavefront without it"] > one
-    eight = dict(steps_of(twice, 6, "off", injections=8))
+    eight = steps(twice, systematics="off", injections=8)
     assert eight["8 injected planets"] == 2 * sum(list(both.values())[:2])
-    tied = dict(steps_of(twice, 6, "off", star_flux=True))
+    tied = steps(twice, systematics="off", star_flux=0.4)
     assert tied["wavefront: 2 files of the target"] == pytest.approx(1.6 * two)
-    whole = dict(steps_of(twice, 6, "off", wide=True))
+    whole = steps(twice, systematics="off", wide=True)
     assert set(whole) - set(both) == {"search of the whole frames"}
 
 
 # -- a reduction, with a stub in the place of the fit --------------------------------------------
 
 
+SUMMARY = {"sentence": "One companion.", "status": {"advice": "Use disk=True (--disk)."}}
+
+
 @dataclass
 class StubReduction:
     """Writes what a reduction writes, as far as the command line reads it."""
 
-    arguments: dict[str, Any]
+    given: Preparation
+    progress: bool
 
-    def write(self, folder: Path) -> list[Path]:
+    def write(self, folder: Path, **_: Any) -> list[Path]:
         folder.mkdir(exist_ok=True)
         path = folder / "summary.json"
-        path.write_text('{"sentence": "One companion."}')
-        return [path]
-
-    def __str__(self) -> str:
-        return "what was found"
+        path.write_text(json.dumps(SUMMARY))
+        return [folder / "report.html", path]
 
 
 @pytest.fixture
 def reduced(monkeypatch: pytest.MonkeyPatch) -> list[StubReduction]:
-    """Stub for `reduce`, which collects its calls."""
+    """Stub for the fits and searches, which collects what they were given."""
     made: list[StubReduction] = []
 
-    def stub(sequence: Sequence, opd: OPDMap, **options: Any) -> StubReduction:
+    def stub(given: Preparation, *, progress: bool) -> StubReduction:
         print("a library says hello")
-        made.append(StubReduction({"sequence": sequence, "opd": opd, **options}))
+        made.append(StubReduction(given, progress))
         return made[-1]
 
-    monkeypatch.setattr(reduction, "reduce", stub)
+    monkeypatch.setattr(Preparation, "run", stub)
     return made
 
 
@@ -408,21 +464,22 @@ def test_reduce_passes_its_options_on_and_names_the_products(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     products = tmp_path / "products"
-    arguments = ["reduce", str(frames), "--opd-folder", str(maps), "--opd-date", "before"]
-    arguments += ["-o", str(products), "--size", "6", "--threshold", "4", "--systematics", "off"]
-    arguments += ["--memory", "2 GB", "--injections", "7", "--star-flux", "0.4 Jy"]
+    arguments = ["reduce", str(frames), "--opd", str(maps), "--opd-date", "before"]
+    arguments += ["-o", str(products), "--size", "8", "--threshold", "4", "--systematics", "off"]
+    arguments += ["--memory", "2 GB", "--injections", "7", "--star-flux-error", "0.1"]
     assert main(arguments) == 0
     shown = capsys.readouterr()
-    assert "what was found\n" in shown.out
-    assert f"wrote {products / 'summary.json'}\n" in shown.out
+    # Names of the command line, and the page to open.
+    assert "One companion.\nUse --disk.\n" in shown.out
+    assert f"wrote {products / 'report.html'} and 1 more files\n" in shown.out
     (call,) = reduced
-    assert call.arguments["opd"].name == "opd_2022-07-20.fits"
-    wanted = {"size": 6, "threshold": 4.0, "systematics": "off", "device": "cpu"}
-    wanted |= {"memory": "2 GB", "injections": 7, "star_flux": "0.4 Jy", "star_flux_error": 0.05}
-    assert wanted.items() <= call.arguments.items()
+    assert call.given.wavefront.name == "opd_2022-07-20.fits"
+    assert call.given.options == ReduceOptions(
+        size=8, threshold=4.0, systematics="off", memory="2 GB", injections=7, star_flux_error=0.1
+    )
     # Not on a terminal: no bar, but the stages.
-    assert call.arguments["progress"] is False
-    assert "4 of 4: products" in shown.err
+    assert call.progress is False
+    assert "1. products" in shown.err
 
 
 def test_json_is_all_that_goes_to_standard_output(
@@ -434,11 +491,11 @@ def test_json_is_all_that_goes_to_standard_output(
 ) -> None:
     arguments = ["detect", str(frames / "one_calints.fits"), "--opd", str(maps / "x.fits")]
     arguments[-1] = str(maps / "opd_2022-07-31.fits")
-    assert main([*arguments, "-o", str(tmp_path / "products"), "--json"]) == 0
+    assert main([*arguments, "-o", str(tmp_path / "products"), "--size", "8", "--json"]) == 0
     shown = capsys.readouterr()
-    assert json.loads(shown.out) == {"sentence": "One companion."}
+    assert json.loads(shown.out) == SUMMARY
     assert "a library says hello" in shown.err
-    assert "what was found" in shown.err
+    assert "One companion." in shown.err
 
 
 @pytest.mark.parametrize("before", [True, False])
@@ -455,13 +512,13 @@ def test_general_options_stand_before_or_after_the_command(
     monkeypatch.setattr(torch, "set_num_threads", threads.append)
     log = tmp_path / "logs" / "run.log"
     general = ["-q", "--threads", "1", "--log-file", str(log)]
-    command = ["detect", str(frames / "one_calints.fits"), "--opd-folder", str(maps)]
-    command += ["-o", str(tmp_path / "products")]
+    command = ["detect", str(frames / "one_calints.fits"), "--opd", str(maps)]
+    command += ["-o", str(tmp_path / "products"), "--size", "8"]
     assert main([*general, *command] if before else [*command, *general]) == 0
     assert threads == [1]
     assert capsys.readouterr().err == ""
     lines = log.read_text().splitlines()
-    assert any(line.endswith("INFO 4 of 4: products") for line in lines)
+    assert any(line.endswith("INFO 1. products") for line in lines)
     assert any("opd_2022-07-31.fits" in line for line in lines)
     # What the run changed is as it was.
     assert not any(getattr(h, "baseFilename", "") == str(log) for h in logging.root.handlers)
@@ -478,15 +535,15 @@ def test_warnings_and_errors_are_messages(
     maps = tmp_path / "old"
     maps.mkdir()
     old.rename(maps / old.name)
-    arguments = ["detect", str(frames / "one_calints.fits"), "--opd-folder", str(maps)]
-    arguments += ["-o", str(tmp_path / "products"), "-q"]
+    arguments = ["detect", str(frames / "one_calints.fits"), "--opd", str(maps)]
+    arguments += ["-o", str(tmp_path / "products"), "-q", "--size", "8"]
 
     def twice(*_: Any, **__: Any) -> None:
         for _ in range(2):
             warnings.warn("the map is old", DiffrenderWarning, stacklevel=1)
         raise RefinementError("no fit")
 
-    monkeypatch.setattr(reduction, "reduce", twice)
+    monkeypatch.setattr(Preparation, "run", twice)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         assert main(arguments) == 1
@@ -511,9 +568,9 @@ def test_too_little_memory_is_a_message(
     def fail(*_: Any, **__: Any) -> None:
         raise error
 
-    monkeypatch.setattr(reduction, "reduce", fail)
-    arguments = ["detect", str(frames / "one_calints.fits"), "--opd-folder", str(maps)]
-    arguments += ["-o", str(tmp_path / "products")]
+    monkeypatch.setattr(Preparation, "run", fail)
+    arguments = ["detect", str(frames / "one_calints.fits"), "--opd", str(maps)]
+    arguments += ["-o", str(tmp_path / "products"), "--size", "8"]
     assert main(arguments) == 1
     assert "pyklip-diffrender: not enough memory; a smaller --size" in capsys.readouterr().err
     # Any other error is a fault of the program, with its traceback.
@@ -543,19 +600,19 @@ def test_an_interrupted_run_says_what_it_left(
     products = tmp_path / "products"
     products.mkdir()
     (products / "notes.txt").write_text("mine")
-    arguments = ["detect", str(frames / "one_calints.fits"), "--opd-folder", str(maps), "-q"]
-    arguments += ["-o", str(products)]
+    arguments = ["detect", str(frames / "one_calints.fits"), "--opd", str(maps), "-q"]
+    arguments += ["-o", str(products), "--size", "8"]
 
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
     write = StubReduction.write
-    monkeypatch.setattr(StubReduction, "write", lambda self, folder: interrupt(write(self, folder)))
+    monkeypatch.setattr(StubReduction, "write", lambda self, to, **_: interrupt(write(self, to)))
     assert main(arguments) == 130
     assert f"interrupted; these files in {products} are new and complete: summary.json\n" in (
         capsys.readouterr().err
     )
-    monkeypatch.setattr(reduction, "reduce", interrupt)
+    monkeypatch.setattr(Preparation, "run", interrupt)
     assert main([*arguments, "--overwrite"]) == 130
     assert capsys.readouterr().err.strip() == "pyklip-diffrender: interrupted; nothing was written"
 
@@ -575,10 +632,11 @@ def test_mast_is_asked_for_the_map_of_the_date(
             raise MissingOPDError("no wavefront map from MAST (no route to host)")
         return random_opd(1, npix=64)
 
-    monkeypatch.setattr(wss, "load_wss_opd_by_date", retrieve)
+    monkeypatch.setattr("pyklip_diffrender.cli.reduction.load_wss_opd_by_date", retrieve)
     arguments = ["detect", str(frames / "one_calints.fits"), "-o", str(tmp_path / "products")]
-    assert main([*arguments, "--opd-date", "nearest"]) == 0
-    assert reduced[0].arguments["opd"].name == "random_opd(seed=1)"
+    arguments += ["--size", "8", "--opd", "mast"]
+    assert main(arguments) == 0
+    assert reduced[0].given.wavefront.name == "random_opd(seed=1)"
     capsys.readouterr()
     assert main([*arguments, "--opd-date", "after", "--overwrite"]) == 1
     assert "no route to host" in capsys.readouterr().err
@@ -625,20 +683,20 @@ def test_a_written_configuration_gives_the_same_run(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     config, products = tmp_path / "run.toml", tmp_path / "products"
-    arguments = ["reduce", str(frames), "--opd-folder", str(maps), "-o", str(products), "-q"]
-    arguments += ["--size", "6", "--target", "HIP-1"]
+    arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(products), "-q"]
+    arguments += ["--size", "8", "--target", "HIP-1"]
     assert main([*arguments, "--write-config", str(config)]) == 0
     assert capsys.readouterr().out == f"wrote {config}\n"
     assert reduced == []
     content = tomllib.loads(config.read_text())["reduce"]
     assert content["frames"] == [str(frames)]
-    assert content["opd-folder"] == str(maps)
+    assert content["opd"] == str(maps)
     assert content["quiet"] is True
     assert content["json"] is False
     assert main(["reduce", "--config", str(config)]) == 0
-    assert main(["--config", str(config), "reduce", "--size", "8", "--overwrite"]) == 0
-    assert [call.arguments["size"] for call in reduced] == [6, 8]
-    assert reduced[0].arguments["sequence"].target == "HIP-1"
+    assert main(["--config", str(config), "reduce", "--threshold", "6", "--overwrite"]) == 0
+    assert [call.given.options.threshold for call in reduced] == [5, 6]
+    assert reduced[0].given.sequence.target == "HIP-1"
     assert capsys.readouterr().err == ""
     # It is a product like others.
     assert main([*arguments, "--write-config", str(config)]) == 2
@@ -704,7 +762,7 @@ def test_the_shell_completes_commands_and_options() -> None:
             "COMP_CWORD": "2",
         },
     )
-    assert done.stdout.splitlines() == ["plain,--opd-folder", "plain,--opd-date"], done.stderr
+    assert done.stdout.splitlines() == ["plain,--opd-date"], done.stderr
 
 
 # -- doctor --------------------------------------------------------------------------------------

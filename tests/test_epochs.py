@@ -12,7 +12,7 @@ from astropy.io import fits
 
 from benchmarks.calints_files import calints
 from pyklip_diffrender.cli import main
-from pyklip_diffrender.report import compare_epochs, write_epochs
+from pyklip_diffrender.reduction import compare_epochs, write_epochs
 
 MOTION = (0.28, -0.36)
 """Of AU Mic, arcsec per year."""

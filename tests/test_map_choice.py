@@ -11,7 +11,6 @@ from astropy.io import fits
 from astropy.time import Time
 from stpsf_data import wss_file
 
-from pyklip_diffrender import reduction
 from pyklip_diffrender.errors import (
     CorruptFileError,
     DiffrenderWarning,
@@ -21,6 +20,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.io import sensing_date
 from pyklip_diffrender.optics import resample
+from pyklip_diffrender.reduction import pipeline
 from pyklip_diffrender.scene import Observation, Sequence
 from pyklip_diffrender.wavefront import OPDMap, choose_map, random_opd, read_opd, wavefront_for
 
@@ -162,8 +162,8 @@ def test_reduce_takes_the_nearest_map_of_a_folder(
         chosen.append(opd.name)
         raise RefinementError("that is all")
 
-    monkeypatch.setattr(reduction, "model_for", lambda *_, **__: None)
-    monkeypatch.setattr(reduction, "refine", stop)
+    monkeypatch.setattr(pipeline, "model_for", lambda *_, **__: None)
+    monkeypatch.setattr(pipeline, "refine", stop)
     frames = tuple(
         Observation.from_arrays(
             np.ones((8, 8)), np.ones((8, 8)), pixelscale=0.06, date=Time(f"2022-08-{day}")
@@ -173,7 +173,7 @@ def test_reduce_takes_the_nearest_map_of_a_folder(
     sequence = Sequence("star", frames)
     assert sequence.date == Time("2022-08-14")
     with pytest.raises(RefinementError, match="that is all"):
-        reduction.reduce(sequence, folder, size=8, systematics="off")
+        pipeline.reduce(sequence, folder, size=8, systematics="off")
     assert chosen == ["R2022081102-NRCA3_FP1-1.fits"]
 
 

@@ -7,6 +7,7 @@ import logging
 import pytest
 
 from pyklip_diffrender.io import ProgressBar, progress, stage
+from pyklip_diffrender.io.progress import numbered_stages
 
 
 def last_shown(text: str) -> str:
@@ -16,11 +17,13 @@ def last_shown(text: str) -> str:
 def test_a_bar_shows_the_stage_and_what_the_fit_has_reached(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    with stage("2 of 4: wavefront"), ProgressBar("wavefront", shown=True) as bar:
+    with numbered_stages(), stage("place"):
+        pass
+    with numbered_stages(), stage("place"), ProgressBar("wavefront", shown=True) as bar:
         bar.update(chi2=4.123)
         bar._bar.refresh()
         shown = last_shown(capsys.readouterr().err)
-        assert shown.startswith("2 of 4: wavefront, chi2 4.12, step 1 [00:0")
+        assert shown.startswith("1. place, chi2 4.12, step 1 [00:0")
         # A bar inside takes no line of its own.
         with ProgressBar("response", 10, shown=True) as inner:
             inner.update(10)
@@ -45,7 +48,11 @@ def test_the_log_gets_stages_and_at_most_a_line_a_minute(
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)
     with (
         caplog.at_level(logging.INFO),
-        stage("2 of 4: wavefront"),
+        numbered_stages(),
+        stage("place on the detector"),
+        # A part of a numbered work goes on with its numbers.
+        numbered_stages(),
+        stage("wavefront"),
         ProgressBar("x", shown=False) as bar,
     ):
         for _ in range(9):
@@ -55,15 +62,16 @@ def test_the_log_gets_stages_and_at_most_a_line_a_minute(
                 now += 1e-3
                 inner.update()
     assert [record.getMessage() for record in caplog.records] == [
-        "2 of 4: wavefront",
-        "2 of 4: wavefront, chi2 3, step 3",
-        "2 of 4: wavefront, chi2 3, step 6",
-        "2 of 4: wavefront, chi2 3, step 9",
+        "1. place on the detector",
+        "2. wavefront",
+        "2. wavefront, chi2 3, step 3",
+        "2. wavefront, chi2 3, step 6",
+        "2. wavefront, chi2 3, step 9",
     ]
 
 
 def test_a_stage_ends_with_its_block_even_when_it_fails() -> None:
-    with pytest.raises(ValueError, match="no"), stage("1 of 4: frames"):
+    with pytest.raises(ValueError, match="no"), stage("frames"):
         raise ValueError("no")
     with ProgressBar("S/N map", shown=False) as bar:
         assert bar._name == "S/N map"

@@ -25,15 +25,15 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.pattern import pattern_size
-from pyklip_diffrender.refinement import Status
-from pyklip_diffrender.report import summarise, write_report
-from pyklip_diffrender.report.html import page
-from pyklip_diffrender.report.words import (
+from pyklip_diffrender.reduction import summarise, write_report
+from pyklip_diffrender.reduction.page import page
+from pyklip_diffrender.reduction.words import (
     advice,
     plus_minus,
     probability,
     scientific,
 )
+from pyklip_diffrender.refinement import Status
 
 PLANET = dr.Planet(2e-5, 0.6, 40.0)
 ROLL = 30.0
@@ -286,8 +286,10 @@ def test_every_picture_has_words_and_nothing_is_loaded(folder: Path) -> None:
         assert len(attributes["alt"] or "") > 30
         assert (attributes["src"] or "").startswith("data:image/png;base64,iVBOR")
     assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.tags}
-    loaded = [a.get("src") or a.get("href") or "data:" for _, a in page.tags]
-    assert all(each.startswith("data:") for each in loaded)
+    assert all((a.get("src") or "data:").startswith("data:") for _, a in page.tags)
+    # Links are to the files beside it.
+    linked = {a["href"] for _, a in page.tags if "href" in a}
+    assert linked == {each.name for each in folder.iterdir()}
     assert "http" not in " ".join(page.words)
 
 
@@ -314,11 +316,29 @@ def test_a_header_cannot_write_into_the_page(tmp_path: Path) -> None:
     assert json.loads(data.read_text(encoding="utf-8"))["target"] == HOSTILE
 
 
+def test_names_beyond_ascii_do_not_end_a_reduction(tmp_path: Path) -> None:
+    """FITS headers have printable ASCII only; the page and the summary keep the names."""
+    whole = reduction()
+    (frame,) = whole.detection.fits[0].frames
+    named = replace(frame.observation, name="Čeče_été\n.fits")
+    fit = replace(
+        whole.detection.fits[0],
+        frames=(replace(frame, observation=named),),
+        initial=replace(whole.fit.initial, name="carte_été.fits"),
+    )
+    detection = replace(whole.detection, fits=(fit,))
+    with fits.open(detection.write(tmp_path)[0]) as hdus:
+        assert hdus[0].header["DROPD"] == "carte_ete.fits"
+        assert "frame Cece_ete?.fits" in str(hdus[0].header["HISTORY"])
+    back = dr.Refinement.read(fit.write(tmp_path / "fit.fits", linear=False))
+    assert back.initial.name == "carte_été.fits"
+
+
 @pytest.fixture
 def _few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw the S/N map and the contrast curve alone."""
     for name in ("star_pictures", "wavefront_pictures"):
-        monkeypatch.setattr(f"pyklip_diffrender.report.write.{name}", lambda *_: [])
+        monkeypatch.setattr(f"pyklip_diffrender.reduction.products.{name}", lambda *_: [])
 
 
 @pytest.mark.usefixtures("_few_pictures")
@@ -374,7 +394,7 @@ def test_a_failure_of_klip_does_not_break_the_report(
         raise ValueError("singular")
 
     monkeypatch.setattr("pyklip_diffrender.pyklip_backend.klip.klip_curve", broken)
-    monkeypatch.setattr("pyklip_diffrender.report.write.search_pictures", lambda *_: [])
+    monkeypatch.setattr("pyklip_diffrender.reduction.products.search_pictures", lambda *_: [])
     whole = reduction()
     sequence = replace(whole.sequence, references=whole.sequence.science)
     _, data = write_report(replace(whole, sequence=sequence), tmp_path)
@@ -390,7 +410,7 @@ def test_a_report_that_fails_leaves_the_old_one(
     def broken(*_: Any, **__: Any) -> str:
         raise ValueError("no disk")
 
-    monkeypatch.setattr("pyklip_diffrender.report.write.json.dumps", broken)
+    monkeypatch.setattr("pyklip_diffrender.reduction.products.json.dumps", broken)
     with pytest.raises(ValueError, match="no disk"):
         write_report(reduction(), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]

@@ -374,11 +374,11 @@ def test_references_are_fitted_only_where_they_are_needed(
         return known if library or references else None
 
     choosing = "pyklip_diffrender.pattern.choice"
-    for module in ("pyklip_diffrender.reduction", choosing):
+    for module in ("pyklip_diffrender.reduction.pipeline", choosing):
         monkeypatch.setattr(f"{module}.refine", fit)
     monkeypatch.setattr(f"{choosing}.known_systematics", from_library)
     monkeypatch.setattr(f"{choosing}.lacks_pattern", lambda fit: not shown)
-    monkeypatch.setattr("pyklip_diffrender.reduction.detect", lambda fit, **options: None)
+    monkeypatch.setattr("pyklip_diffrender.reduction.pipeline.detect", lambda fit, **options: None)
     there = replace(frame("TARGET", 20), first_pixel=(0, 0))
     sequence = Sequence("TARGET", (there,), (frame("REF", 10), frame("REF", 11)))
     result = reduce(sequence, opd(), size=SIZE, systematics=systematics)  # type: ignore[arg-type]

@@ -61,7 +61,7 @@ def test_without_a_map_the_star_is_less_certain(
     known = replace(SETTINGS, star_flux_error=0.05)
     assert star_flux_error(replace(fit, initial=flat, settings=known)) == 0.05
     # `reduce` says so, unless the flux is given.
-    monkeypatch.setattr("pyklip_diffrender.reduction.model_for", _stop)
+    monkeypatch.setattr("pyklip_diffrender.reduction.pipeline.model_for", _stop)
     sequence = dr.Sequence("A STAR", (fit.frames[0].observation,))
     for opd, flux, warned in (
         ("flat", None, True),

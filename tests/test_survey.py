@@ -194,7 +194,22 @@ def test_the_same_job_twice_is_a_mistake(tmp_path: Path) -> None:
         planned(config)
 
 
-def test_of_a_folder_of_maps_the_nearest_in_time_is_used(tmp_path: Path) -> None:
+def calints_file(path: Path, star: str, day: str | None, *, reference: bool = False) -> None:
+    primary = fits.PrimaryHDU()
+    primary.header.update({"FILTER": "F444W", "TARGPROP": star, "IS_PSF": reference})
+    if day is not None:
+        primary.header["DATE-BEG"] = f"{day}T00:00:00"
+    data = np.random.default_rng(1).normal(10, 2, (2, 8, 10)).astype(np.float32)
+    planes = {"SCI": data, "ERR": np.ones_like(data), "DQ": np.zeros(data.shape, dtype=np.uint32)}
+    hdus = [primary, *(fits.ImageHDU(array, name=name) for name, array in planes.items())]
+    hdus[1].header.update(
+        {"BUNIT": "MJy/sr", "PIXAR_A2": 0.00396, "CRPIX1": 6.0, "CRPIX2": 5.0,
+         "ROLL_REF": 100.0, "V3I_YANG": -0.5, "VPARITY": -1}
+    )  # fmt: skip
+    fits.HDUList(hdus).writeto(path, overwrite=True)
+
+
+def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path: Path) -> None:
     config = inputs(tmp_path, 1)
     maps = tmp_path / "maps"
     maps.mkdir()
@@ -205,14 +220,18 @@ def test_of_a_folder_of_maps_the_nearest_in_time_is_used(tmp_path: Path) -> None
         hdu.writeto(maps / f"map{day}.fits")
     (maps / "broken.fits").write_bytes(b"nothing")
     config["sequence"][0]["opd"] = str(maps)
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    config["sequence"][0]["files"] = str(frames)
+    calints_file(frames / "target.fits", "HD-1", None)
     with pytest.raises(IncompatibleSetupError, match="no date"):
         planned(config)
-    frame = fits.PrimaryHDU(np.ones((4, 4)))
-    frame.header["DATE-BEG"] = "2022-08-15T00:00:00"
-    frame.writeto(config["sequence"][0]["files"], overwrite=True)
+    # The reference star was observed when another map was the nearest.
+    calints_file(frames / "target.fits", "HD-1", "2022-08-15")
+    calints_file(frames / "reference.fits", "HD-2", "2022-08-01", reference=True)
     (job,) = planned(config)
     assert job.opd == str(maps / "map11.fits")
-    assert list(job.inputs) == [config["sequence"][0]["files"], job.opd]
+    assert sorted(job.inputs) == sorted([*map(str, frames.iterdir()), job.opd])
 
 
 def test_a_sequence_may_have_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -342,13 +361,54 @@ def test_only_what_dead_processes_left_is_removed(tmp_path: Path) -> None:
         pass
     mine = folders.staging(jobs, "a" * 64)
     left = jobs / mine.name.replace(f"-{os.getpid()}-", f"-{dead.pid}-")
-    elsewhere, old = left.with_name(f"{left.name}x"), left.with_name(f"{left.name}y")
-    for each in (left, elsewhere, old):
+    elsewhere = left.with_name(f"{left.name}x")
+    for each in (left, elsewhere):
         each.mkdir()
         (each / "half").write_text("half")
-    os.utime(old, (0, 0))
+    # Another machine may run this job, whatever its clock or ours says.
+    os.utime(elsewhere, (0, 0))
     folders.clean(jobs)
     assert sorted(jobs.iterdir()) == sorted([mine, elsewhere])
+
+
+def test_containers_with_one_host_name_leave_each_other_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first process of another container has a number that means nothing here."""
+    jobs = folders.prepare(tmp_path)
+    here = os.stat
+    folders._place.cache_clear()
+    monkeypatch.setattr(
+        os, "stat",
+        lambda path, **options: SimpleNamespace(st_ino=1)
+        if path == "/proc/self/ns/pid" else here(path, **options),
+    )  # fmt: skip
+    theirs = folders.staging(jobs, "a" * 64)
+    monkeypatch.undo()
+    folders._place.cache_clear()
+    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
+        pass
+    foreign = theirs.rename(str(theirs).replace(f"-{os.getpid()}-", f"-{dead.pid}-"))
+    folders.clean(jobs)
+    assert list(jobs.iterdir()) == [foreign]
+
+
+def test_a_message_in_another_encoding_stops_nothing(tmp_path: Path) -> None:
+    config, output = inputs(tmp_path / "data", 2), tmp_path / "out"
+
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        if job.name.startswith("star1"):
+            # As Python quotes a Latin-1 name of a file.
+            raise ValueError("no such file: " + os.fsdecode(b"caf\xe9.fits"))
+        return stub(job, folder)
+
+    for _ in range(2):
+        table = run_survey(config, output, work)
+        assert sorted(table["status"]) == ["failed", "finished"]
+    (message,) = table["message"][table["status"] == "failed"]
+    assert message == r"ValueError: no such file: caf\udce9.fits"
+    assert message in Table.read(output / "results.ecsv")["message"]
+    assert list(run_survey(config, output, stub)["status"]) == ["finished"] * 2
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"products": {}}', '{"products": 3}'])

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from contextlib import nullcontext, redirect_stdout
-from json import dumps, loads
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,19 +20,11 @@ from pyklip_diffrender.cli.run import Run
 from pyklip_diffrender.errors import IncompatibleSetupError
 
 if TYPE_CHECKING:
-    from pyklip_diffrender.io.opd_map import OPDMap
     from pyklip_diffrender.scene.sequence import Sequence
 
 __all__ = ["demo", "detect_in_file", "psf", "reduce_frames", "survey"]
 
 _DEMO = ("demo.fits", "demo.ecsv", "candidates.ecsv", "demo.png")
-_REDUCTION = (
-    "detection.fits", "candidates.ecsv", "contrast.ecsv", "fit.fits", "systematics.fits",
-    "astrometry.csv", "wide_field.fits", "wide_field_candidates.ecsv", "wide_field_contrast.ecsv",
-    "disk.fits", "injections.ecsv", "report.html", "summary.json", "detection.png",
-)  # fmt: skip
-
-_EPOCHS = ("epochs.html", "epochs.json")
 
 
 @click.command(
@@ -110,9 +99,9 @@ def demo(
     cls=Command,
     epilog="""\b
 Examples:
-  pyklip-diffrender reduce frames --opd-folder maps -o products
+  pyklip-diffrender reduce frames --opd maps -o products
   pyklip-diffrender reduce frames --target G-7-34 --filter F444W --opd map.fits -o products
-  pyklip-diffrender reduce frames --opd-folder maps -o products --dry-run
+  pyklip-diffrender reduce frames --opd maps -o products --dry-run
   pyklip-diffrender reduce --program 1184 --target G-7-34 --filter F444W --opd map.fits -o out""",
 )
 @click.argument("frames", type=file_type(), nargs=-1)
@@ -147,7 +136,7 @@ def reduce_frames(
     cache: Path | None,
     **options: Any,
 ) -> None:
-    """Search all rolls of a target, with what its reference stars teach.
+    """Subtract the star from all rolls of a target and search for planets.
 
     FRAMES are calints files, or one folder of them. With --program they come from MAST. Epochs more
     than 5 days apart are reduced one by one, into a folder for each, and compared on one page.
@@ -170,7 +159,9 @@ def reduce_frames(
             )
         return Sequence.by_epoch(files, target=target, filter=filter)
 
-    _reduction(run, read, **options)
+    from pyklip_diffrender.cli.reduction import run_reduction
+
+    run_reduction(run, read, **options)
 
 
 @click.command(
@@ -179,8 +170,8 @@ def reduce_frames(
     epilog="""\b
 Examples:
   pyklip-diffrender detect calints.fits --opd map.fits -o products
-  pyklip-diffrender detect calints.fits --opd-folder maps --opd-date before -o products
-  pyklip-diffrender detect calints.fits --opd-folder maps -o products --json | jq .sentence""",
+  pyklip-diffrender detect calints.fits --opd maps --opd-date before -o products
+  pyklip-diffrender detect calints.fits --opd maps -o products --json | jq .sentence""",
 )
 @click.argument("frames", type=file_type())
 @wavefront
@@ -188,7 +179,7 @@ Examples:
 @outputs()
 @click.pass_obj
 def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
-    """Search a single file.
+    """Subtract the star from a single file and search for planets.
 
     FRAMES is a calints file.
     """
@@ -202,7 +193,9 @@ def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
             )
         return (Sequence.from_files([frames]),)
 
-    _reduction(run, read, **options)
+    from pyklip_diffrender.cli.reduction import run_reduction
+
+    run_reduction(run, read, **options)
 
 
 @click.command(
@@ -283,112 +276,6 @@ def survey(run: Run, /, file: Path, output: Path, scheduler: str | None) -> int:
     return run_survey(file, output, scheduler, progress=run.progress)
 
 
-def _reduction(
-    run: Run,
-    read: Any,
-    *,
-    output: Path,
-    overwrite: bool,
-    json: bool,
-    dry_run: bool,
-    size: int,
-    threshold: float,
-    wide: bool,
-    disk: bool,
-    injections: int,
-    systematics: str,
-    star_flux: str | None,
-    star_flux_error: float,
-    memory: str | None,
-    opd: Path | None,
-    opd_folder: Path | None,
-    opd_date: str | None,
-) -> None:
-    """Reduce the epochs of a sequence, write all products and say what they show."""
-    if (opd is not None) == (opd_folder is not None or opd_date is not None):
-        raise click.UsageError("Give either --opd FILE, or --opd-folder FOLDER or --opd-date.")
-    if dry_run and json:
-        raise click.UsageError("A --dry-run has no summary to print with --json.")
-    run.claim_folder(output, (*_REDUCTION, *_EPOCHS), overwrite)
-    # Libraries may print, too.
-    with redirect_stdout(sys.stderr) if json else nullcontext():
-        sequences = read()
-        folders = [output]
-        if len(sequences) > 1:
-            folders = [output / _day(each) for each in sequences]
-            for folder in folders:
-                run.claim_folder(folder, _REDUCTION, overwrite)
-        maps = []
-        for sequence, folder in zip(sequences, folders, strict=True):
-            if len(sequences) > 1:
-                click.echo(f"\nepoch {folder.name}, {len(sequences)} in all:")
-            _show(sequence)
-            maps.append(_map(sequence, opd, opd_folder, opd_date))
-            click.echo(f"wavefront map: {maps[-1].name}{_age(maps[-1], sequence)}")
-            if dry_run:
-                from pyklip_diffrender.cli.estimate import describe_plan
-
-                parts: dict[str, Any] = {"wide": wide, "disk": disk, "injections": injections}
-                parts["star_flux"] = star_flux is not None
-                click.echo(describe_plan(sequence, size, systematics, **parts))
-        if dry_run:
-            return
-        from pyklip_diffrender.io.progress import stage
-        from pyklip_diffrender.reduction import reduce
-        from pyklip_diffrender.scene.systematics import Systematics
-
-        known: Any = systematics
-        if known not in ("auto", "references", "off"):
-            known = Systematics.read(known)
-        for sequence, map_, folder in zip(sequences, maps, folders, strict=True):
-            reduction = reduce(
-                sequence,
-                map_,
-                size=size,
-                systematics=known,
-                threshold=threshold,
-                wide=wide,
-                disk=disk,
-                injections=injections,
-                star_flux=star_flux,
-                star_flux_error=star_flux_error,
-                device=run.device,
-                memory=memory,
-                progress=run.progress,
-            )
-            with stage("4 of 4: products"):
-                written = reduction.write(folder)
-            click.echo(f"\n{reduction}")
-            for path in written:
-                click.echo(f"wrote {path}")
-        if len(folders) > 1:
-            for path in _compare(sequences[0], folders, output):
-                click.echo(f"wrote {path}")
-    if json:
-        name = "epochs.json" if len(folders) > 1 else "summary.json"
-        summary = loads((output / name).read_text(encoding="utf-8"))
-        click.echo(dumps(summary, indent=2))
-
-
-def _day(sequence: Sequence) -> str:
-    """First date of a sequence."""
-    dates = [each.date.isot[:10] for each in sequence.science if each.date is not None]
-    return min(dates, default="no-date")
-
-
-def _compare(sequence: Sequence, folders: list[Path], output: Path) -> list[Path]:
-    """Write the page that compares epochs."""
-    from pyklip_diffrender.report import write_epochs
-    from pyklip_diffrender.scene.exposure import proper_motion
-
-    summaries = {
-        folder.name: loads((folder / "summary.json").read_text(encoding="utf-8"))
-        for folder in folders
-    }
-    first = sequence.science[0]
-    return write_epochs(summaries, proper_motion(first.header, first.name), output)
-
-
 def _is_to_fetch(program: int, target: str | None, filter: str | None, cache: Path | None) -> bool:
     """List the files of a programme; whether some of them would have to be fetched."""
     from pyklip_diffrender.archive import list_calints
@@ -400,43 +287,3 @@ def _is_to_fetch(program: int, target: str | None, filter: str | None, cache: Pa
     size = missing["size"].to_value("Mbyte").sum()
     click.echo(f"to fetch: {len(missing)} of {len(listing)} files, {size:.0f} MB")
     return len(missing) > 0
-
-
-def _show(sequence: Sequence) -> None:
-    from pyklip_diffrender.scene.admission_table import SHORT
-
-    table = sequence.table
-    used = table[table["use"] != "excluded"]
-    click.echo("\n".join(used[list(SHORT)].pformat(max_lines=-1, max_width=-1)))
-    for row in used:
-        if row["remark"]:
-            click.echo(f"{row['file']}: {row['remark']}")
-    for name, reason in sequence.excluded:
-        click.echo(f"left out: {name}: {reason}")
-
-
-def _age(opd: OPDMap, sequence: Sequence) -> str:
-    """When a map was sensed, as an apposition."""
-    days = None if sequence.date is None else opd.days_after(sequence.date)
-    if opd.date is None or days is None:
-        return ""
-    side = "after" if days > 0 else "before"
-    return f", sensed {opd.date.isot[:16]}, {abs(days):.1f} days {side} the frames"
-
-
-def _map(sequence: Sequence, opd: Path | None, folder: Path | None, rule: str | None) -> OPDMap:
-    """The wavefront map that the options ask for."""
-    from pyklip_diffrender.wavefront.map_choice import choose_map
-    from pyklip_diffrender.wavefront.opd import as_opd_map
-    from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
-
-    if opd is not None:
-        return as_opd_map(str(opd))
-    date, rule = sequence.date, rule or "nearest"
-    if date is None:
-        raise IncompatibleSetupError(
-            "the frames have no date (DATE-BEG) to choose a wavefront map by; give one with --opd"
-        )
-    if folder is not None:
-        return choose_map(folder, date, rule)  # type: ignore[arg-type]
-    return load_wss_opd_by_date(date, "closest" if rule == "nearest" else rule)

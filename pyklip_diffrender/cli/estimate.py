@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from pyklip_diffrender.cli.machine import free_memory
 from pyklip_diffrender.detection.recovery import TOGETHER
 from pyklip_diffrender.pattern import known_systematics
+from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.scene.sequence import Sequence
 
-__all__ = ["describe_plan", "steps_of"]
+__all__ = ["describe_plan", "size_of_products", "steps_of"]
 
 # Measured on two cores with frames of 80 x 80 pixels: one roll of HIP 65426 takes 50 s, of which
 # 14 s find its place on the detector, two rolls of G 7-34 take 46 s and of HIP 17695 75 s. In two
@@ -28,30 +28,24 @@ _PIXELS = 0.17
 _MEMORY = 1.4e9
 _MEMORY_PER_FRAME = 0.4e9
 
+# Bytes for frames of 80 x 80 pixels.
+_REPORT = 5e6
+_PRODUCTS = 10e6
+_DERIVATIVES = 50e6
 
-def steps_of(
-    sequence: Sequence,
-    size: int,
-    systematics: str,
-    *,
-    wide: bool = False,
-    disk: bool = False,
-    injections: int = 0,
-    star_flux: bool = False,
-) -> list[tuple[str, float]]:
+
+def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, float]]:
     """The steps of a reduction, each with its duration on two cores, s.
 
-    `wide`, `disk` and `injections` are those of `reduce`; `star_flux` says whether there is one.
-
-    Raises
-    ------
-    ShapeError
-        If the frames are smaller than `size`.
+    Parameters
+    ----------
+    sequence : Sequence
+        Cut to the fitted pixels, on which depends whether the library has a pattern for them.
+    options : ReduceOptions
     """
-    # What of the library is known depends on the pixels that are fitted.
-    sequence = sequence.cutout(size)
     count = len(sequence.science)
-    area = (size / 80) ** 2
+    systematics = options.systematics
+    area = (options.size / 80) ** 2
     fit = _FIT * area**_PIXELS
     steps = []
     known = systematics == "auto" and known_systematics(sequence.science[0]) is not None
@@ -62,27 +56,35 @@ def steps_of(
     elif not known and systematics in ("auto", "references") and stars:
         frames = len(sequence.references)
         steps.append((f"reference stars: {', '.join(sorted(stars))}", fit * frames**_FRAMES))
-    joint = fit * count**_FRAMES * (1 + _TIED * star_flux)
+    joint = fit * count**_FRAMES * (1 + _TIED * (options.star_flux is not None))
     steps.append((f"wavefront: {_frames(count)} of the target", joint))
-    if disk:
+    if options.disk:
         refit = _DISK * joint
         steps.append(("extended light, and the wavefront without it", refit))
     steps.append(("search of point sources", _SEARCH * area * count))
-    if injections:
+    if options.injections:
         seconds = joint + _SEARCH * area * count
-        steps.append((f"{injections} injected planets", math.ceil(injections / TOGETHER) * seconds))
-    if wide:
+        rounds = math.ceil(options.injections / TOGETHER)
+        steps.append((f"{options.injections} injected planets", rounds * seconds))
+    if options.wide:
         steps.append(("search of the whole frames", _WIDE * count))
     steps.append(("products", _WRITE))
     return steps
 
 
-def describe_plan(sequence: Sequence, size: int, systematics: str, **parts: Any) -> str:
-    """Steps, time and memory as lines of text; `parts` are options of `steps_of`."""
-    steps = steps_of(sequence, size, systematics, **parts)
+def size_of_products(sequence: Sequence, *, derivatives: bool) -> float:
+    """Bytes that the products of a reduction may take, with some to spare."""
+    ny, nx = sequence.science[0].shape
+    each = _PRODUCTS + _DERIVATIVES * derivatives
+    return _REPORT + each * len(sequence.science) * nx * ny / 80**2
+
+
+def describe_plan(sequence: Sequence, options: ReduceOptions) -> str:
+    """Steps, time and memory as lines of text; arguments as for `steps_of`."""
+    steps = steps_of(sequence, options)
     lines = [f"{k}. {name}: about {_duration(s)}" for k, (name, s) in enumerate(steps, 1)]
     total = sum(seconds for _, seconds in steps)
-    memory = _MEMORY + _MEMORY_PER_FRAME * len(sequence.science) * (size / 80) ** 2
+    memory = _MEMORY + _MEMORY_PER_FRAME * len(sequence.science) * (options.size / 80) ** 2
     free = free_memory()
     of = "" if free is None else f" ({free / 1e9:.1f} GB are free)"
     lines.append(

@@ -207,19 +207,17 @@ def outputs(default: str | None = None, *, folder: bool = True) -> Decorator:
 
 
 wavefront = _all(
-    option("--opd", type=file_type(), metavar="FILE", section="Wavefront map",
-           help="Wavefront map to start from (FITS), or flat: without a map a fit takes longer, "
-           "and contrasts are uncertain by 40 % unless --star-flux is given."),
-    option("--opd-folder", type=file_type(), metavar="FOLDER", section="Wavefront map",
-           help="Folder of wavefront maps, of which one is chosen by its date."),
+    option("--opd", required=True, metavar="FILE|FOLDER|flat|mast", section="Wavefront map",
+           help="Wavefront map to start from: a FITS file; a folder of maps, of which one is "
+           "chosen by its date; mast for the maps of MAST, through stpsf; or flat, with which a "
+           "fit takes longer and contrasts are uncertain by 40 % unless --star-flux is given."),
     option("--opd-date", type=click.Choice(["nearest", "before", "after", "interpolate"]),
            section="Wavefront map",
-           help="Which map to choose, with respect to the frames; default: nearest. Without "
-           "--opd-folder, the map comes from MAST through stpsf."),
+           help="Which map of a folder or of MAST, with respect to the frames; default: nearest."),
 )  # fmt: skip
 
 search = _all(
-    option("--size", type=click.IntRange(min=1), default=80, show_default=True, metavar="N",
+    option("--size", type=click.IntRange(min=8), default=80, show_default=True, metavar="N",
            section="Fit and search", help="Side of the fitted square about the star, pixels."),
     option("--threshold", type=float, default=5.0, show_default=True, metavar="S/N",
            section="Fit and search", help="S/N of a candidate."),
@@ -234,16 +232,19 @@ search = _all(
     option("--star-flux", metavar="FLUX", section="Fit and search",
            help='Flux density of the star in the filter, such as "0.45 Jy", to which contrasts '
                 "refer; default: what diffracted light says, to 10 %."),
-    option("--star-flux-error", type=float, default=0.05, show_default=True, metavar="PART",
-           section="Fit and search", help="Relative error of --star-flux."),
+    option("--star-flux-error", type=float, default=0.05, show_default=True, metavar="FRACTION",
+           section="Fit and search", help="Relative error of --star-flux, at most 1."),
     option("--systematics", default="auto", show_default=True, metavar="CHOICE",
            section="Fit and search",
-           help="Pattern of the model's error: auto (the package's library, else the reference "
+           help="Flat-field pattern: auto (the package's library, else the reference "
            "stars), references (both), off, or a systematics.fits of an earlier reduction."),
     option("--memory", metavar="SIZE", section="Fit and search",
            help='Memory that the process may take, such as "2 GB"; default: as much as it needs.'),
     option("--dry-run", is_flag=True, section="Output",
-           help="Show frames, wavefront map, steps, time and memory, and stop."),
+           help="Make all checks, show frames, wavefront map, steps, time and memory, and stop."),
+    option("--derivatives", is_flag=True, section="Output",
+           help="Keep the fit's derivatives in fit.fits, which then takes ten times the space: "
+           "they are needed to search the fit again."),
     option("--json", is_flag=True, section="Output",
            help="Print the content of summary.json and nothing else on standard output."),
 )  # fmt: skip

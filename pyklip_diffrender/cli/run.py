@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+import re
+import shutil
 import sys
 import warnings
 from collections.abc import Iterator
@@ -14,11 +16,35 @@ from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 
-__all__ = ["PROGRAM", "Run"]
+__all__ = ["PROGRAM", "Run", "with_options"]
 
 PROGRAM = "pyklip-diffrender"
 
 _log = logging.getLogger(__name__)
+
+
+_ARGUMENTS = "|".join([
+    "disk", "filter", "injections", "memory", "opd", "program", "size", "star_flux",
+    "star_flux_error", "systematics", "target", "threshold", "wide",
+])  # fmt: skip
+"""Arguments of `reduce` and `fetch_calints` that are options of the command line."""
+
+_BOTH = re.compile(r"\w+(=True)? \((--[\w-]+)( on the command line)?\)")
+_FIRST = re.compile(rf"(?<![\w.-])({_ARGUMENTS})(?=(, ({_ARGUMENTS}))*: )")
+
+
+def with_options(message: str) -> str:
+    """Name options of the command line where a message names arguments of Python.
+
+    Examples
+    --------
+    >>> with_options("threshold: got -3 sigma, expected a positive number")
+    '--threshold: got -3 sigma, expected a positive number'
+    >>> with_options("repeat the reduction with disk=True (--disk on the command line)")
+    'repeat the reduction with --disk'
+    """
+    message = _BOTH.sub(r"\2", message)
+    return _FIRST.sub(lambda found: f"--{found[0].replace('_', '-')}", message)
 
 
 class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
@@ -30,7 +56,7 @@ class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
         tqdm.write(self.format(record), file=sys.stderr)
 
     def format(self, record: logging.LogRecord) -> str:
-        message = record.getMessage()
+        message = with_options(record.getMessage())
         if record.levelno < logging.WARNING:
             return message
         warning = "warning: " if record.levelno == logging.WARNING else ""
@@ -115,8 +141,7 @@ class Run:
         """
         if folder.exists() and not folder.is_dir():
             raise IncompatibleSetupError(f"--output: {folder} is a file, expected a folder")
-        existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
-        self._claim(folder, existing, [folder / name for name in products], overwrite)
+        self._claim(folder, _existing(folder), [folder / name for name in products], overwrite)
 
     def claim_file(self, path: Path, overwrite: bool) -> None:
         """Refuse, before any work, a file that could not be written or would be replaced.
@@ -143,6 +168,20 @@ class Run:
             raise IncompatibleSetupError(f"{output} cannot be written: no permission in {folder}")
         self._output, self._before = output, _files(output)
 
+    def require_room(self, folder: Path, size: float) -> None:
+        """Refuse, before any work, products for which there is no room on the disk.
+
+        Raises
+        ------
+        IncompatibleSetupError
+        """
+        free = shutil.disk_usage(_existing(folder)).free
+        if free < size:
+            raise IncompatibleSetupError(
+                f"--output: {folder} has {free / 1e6:.0f} MB of room, expected at least "
+                f"{size / 1e6:.0f} MB. Make room, or choose another place"
+            )
+
     def left(self) -> str:
         """What an interrupted run has left, as a sentence."""
         output = self._output
@@ -151,6 +190,11 @@ class Run:
             return "nothing was written"
         names = sorted(path.name for path, _ in written)
         return f"these files in {output} are new and complete: {', '.join(names)}"
+
+
+def _existing(folder: Path) -> Path:
+    """The folder, or the nearest one above it that exists."""
+    return next(path for path in (folder, *folder.absolute().parents) if path.exists())
 
 
 def _files(output: Path) -> dict[Path, int]:

@@ -179,7 +179,14 @@ def fit_beside(path: Path) -> Refinement:
             f"{path}: measurements need the linear model of the fit, and there is no fit.fits in "
             "the same folder. Pass the fit that was searched: Detection.read(path, fit=fit)"
         )
-    return Refinement.read(file)
+    fit = Refinement.read(file)
+    if fit.linear is None:
+        raise IncompatibleSetupError(
+            f"{file}: measurements need the linear model of the fit, and this file has none. Write "
+            "the reduction with derivatives=True (--derivatives), or pass the fit that was "
+            "searched: Detection.read(path, fit=fit)"
+        )
+    return fit
 
 
 def groups_of_searched(

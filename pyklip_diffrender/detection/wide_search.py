@@ -369,7 +369,7 @@ def _search(
         sources.append(fitted)
     if len(sources) >= _MOST:
         _log.warning("more than %d sources in the whole field; the fainter are left out", _MOST)
-    return information, _refined(frames, sources), factor
+    return information, _significant(frames, _refined(frames, sources), factor, threshold), factor
 
 
 def _light_of(sources: Sequence[_Measurement]) -> tuple[Image, Image]:
@@ -386,6 +386,26 @@ def _refined(frames: Sequence[WholeFrame], sources: list[_Measurement]) -> list[
         fitted = _measured(frames, images, source.values[1:], source.values[0])
         sources[k] = source if fitted is None else fitted
     return sources
+
+
+def _significant(
+    frames: Sequence[WholeFrame],
+    sources: list[_Measurement],
+    factor: ErrorFactor,
+    threshold: float,
+) -> list[_Measurement]:
+    """Leave out sources that are faint in a fit beside all others, and fit the rest again.
+
+    Peaks of a background that was not subtracted look like sources one by one.
+    """
+    while True:
+        scatter = factor.at(separation_of(_light_of(sources)[0]))
+        kept = [
+            each for each, by in zip(sources, scatter, strict=True) if each.snr >= threshold * by
+        ]
+        if len(kept) == len(sources):
+            return kept
+        sources = _refined(frames, kept)
 
 
 def _measured(

@@ -12,11 +12,14 @@ from typing import Self
 
 from tqdm import tqdm
 
-__all__ = ["ProgressBar", "stage"]
+__all__ = ["ProgressBar", "numbered_stages", "stage"]
 
 _log = logging.getLogger(__name__)
 
 _STAGE: ContextVar[str] = ContextVar("stage", default="")
+
+_COUNT: ContextVar[int | None] = ContextVar("count", default=None)
+"""Number of stages that have begun; None where they are not numbered."""
 
 _BUSY: ContextVar[bool] = ContextVar("busy", default=False)
 """Whether a bar is shown already; bars inside it are not."""
@@ -29,8 +32,25 @@ _OPEN = "{desc}, step {n} [{elapsed}]"
 
 
 @contextmanager
+def numbered_stages() -> Iterator[None]:
+    """Number the stages inside from 1, unless they are part of stages that are numbered."""
+    outermost = _COUNT.get() is None
+    if outermost:
+        _COUNT.set(0)
+    try:
+        yield
+    finally:
+        if outermost:
+            _COUNT.set(None)
+
+
+@contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Name what is being done, such as "2 of 4: wavefront", for bars inside and for the log."""
+    """Name what is being done, such as "wavefront", for bars inside and for the log."""
+    count = _COUNT.get()
+    if count is not None:
+        _COUNT.set(count + 1)
+        name = f"{count + 1}. {name}"
     token = _STAGE.set(name)
     _log.info("%s", name)
     try:

@@ -250,7 +250,7 @@ def _fit_references(
     fits, failed = [], []
     for star, frames in _by_star(references).items():
         try:
-            with stage(f"1 of 4: reference star {star}"):
+            with stage(f"reference star {star}"):
                 fits.append(refine(model, frames, opd, **common))
         except DiffrenderError as error:
             _log.warning("reference star %s is left out: %s", star, error)
@@ -270,7 +270,7 @@ def _registered(
     for each in science:
         frame: Observation | None = each
         if each.first_pixel is None:
-            with stage(f"1 of 4: place of {each.name} on the detector"):
+            with stage(f"place of {each.name} on the detector"):
                 frame = place_on_detector(_rough_fit(model, each, opd, **common), pattern)
         if frame is None:
             _log.warning(

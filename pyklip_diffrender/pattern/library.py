@@ -15,6 +15,7 @@ import numpy as np
 from astropy.io import fits
 
 from pyklip_diffrender.io.files import open_fits, write_fits
+from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.names import same_name
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pattern.measure import (
@@ -121,7 +122,7 @@ def write_patterns(patterns: Sequence[MeasuredPattern], path: str | os.PathLike[
         value = fits.ImageHDU(pattern.value.astype(np.float32), name="PATTERN", ver=k)
         error = np.sqrt(np.where(np.isfinite(pattern.variance), pattern.variance, np.nan))
         header = value.header
-        header["STAR"] = (pattern.star, "star that it was measured on")
+        header["STAR"] = (fits_text(pattern.star), "star that it was measured on")
         header["FILTER"], header["CORONMSK"] = pattern.filter or "", pattern.image_mask or ""
         header["STARX"], header["STARY"] = pattern.center
         header["PEDESTAL"] = (
@@ -130,7 +131,7 @@ def write_patterns(patterns: Sequence[MeasuredPattern], path: str | os.PathLike[
         )
         if pattern.first_pixel is not None:
             header["COLUMN"], header["ROW"] = pattern.first_pixel
-        header["FRAME"], header["DATE-BEG"] = pattern.frame, pattern.date
+        header["FRAME"], header["DATE-BEG"] = fits_text(pattern.frame), pattern.date
         hdus += [value, fits.ImageHDU(error.astype(np.float32), name="ERROR", ver=k)]
     write_fits(fits.HDUList(hdus), path)
     return Path(path)

@@ -10,6 +10,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["primary_hdu", "world_coordinates"]
@@ -58,9 +59,9 @@ def primary_hdu(
     for key in _OBSERVED:
         if key in observation.header:
             header[key] = (observation.header[key], observation.header.comments[key])
-    header["OBJECT"] = observation.target
+    header["OBJECT"] = fits_text(observation.target)
     if observation.filter is not None:
-        header["FILTER"] = observation.filter
+        header["FILTER"] = fits_text(observation.filter)
     if observation.date is not None:
         header["DATE-BEG"] = observation.date.isot
     if mjd is not None:
@@ -69,10 +70,10 @@ def primary_hdu(
         value = provenance.get(name)
         if value is not None:
             # FITS has no NaN in headers.
-            finite = not isinstance(value, float) or math.isfinite(value)
-            header[key] = (value if finite else str(value), comment)
+            is_text = isinstance(value, str) or not math.isfinite(value)
+            header[key] = (fits_text(str(value)) if is_text else value, comment)
     for name in provenance.get("observations", ()):
-        header.add_history(f"frame {name}")
+        header.add_history(fits_text(f"frame {name}"))
     return hdu
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, ShapeError
 from pyklip_diffrender.io.files import open_fits, write_fits
+from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.scene.observation import Observation
@@ -110,7 +111,7 @@ class Systematics:
             fits.ImageHDU(self.error, name="PATTERN_ERROR"),
         ]
         header = hdus[0].header
-        header["LABEL"] = self.name
+        header["LABEL"] = fits_text(self.name)
         header["STARX"], header["STARY"] = self.center
         if self.first_pixel is not None:
             header["COLUMN"], header["ROW"] = self.first_pixel

@@ -7,7 +7,7 @@ import os
 import re
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ _SETTINGS = (
 
 @dataclass(frozen=True)
 class Options:
-    """Arguments of `reduce` for a sequence.
+    """Options of `ReduceOptions` for a sequence, as plain values.
 
     Attributes
     ----------
@@ -58,6 +58,12 @@ class Options:
     star_flux: float | None = None
     star_flux_error: float = 0.05
     settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """Arguments of `ReduceOptions`, but for `settings`."""
+        names = (each.name for each in fields(self))
+        return {name: getattr(self, name) for name in names if name != "settings"}
 
 
 @dataclass(frozen=True)
@@ -298,7 +304,7 @@ def _options(table: _Table, default: Options) -> Options:
         "star_flux", default.star_flux, "a flux density in Jy, such as 0.45", _positive
     )
     star_error = table.take(
-        "star_flux_error", default.star_flux_error, "a relative error, such as 0.05", _positive
+        "star_flux_error", default.star_flux_error, "a relative error, such as 0.05", _fraction
     )
     own = table.take("settings", {}, "a table with arguments of GaussNewton", _mapping)
     # Those of a sequence come on top of the survey's.
@@ -364,6 +370,12 @@ def _number(value: Any) -> float:
 
 def _positive(value: Any) -> float:
     if _number(value) <= 0:
+        raise ValueError
+    return float(value)
+
+
+def _fraction(value: Any) -> float:
+    if not 0 < _number(value) <= 1:
         raise ValueError
     return float(value)
 

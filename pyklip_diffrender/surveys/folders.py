@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
 import os
 import secrets
 import shutil
 import socket
-import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ from pyklip_diffrender.surveys.jobs import Job
 __all__ = [
     "RECORD",
     "clean",
+    "encodable",
     "finished",
     "prepare",
     "publish",
@@ -29,10 +33,9 @@ __all__ = [
 
 RECORD = "job.json"
 
-Record = dict[str, Any]
+_log = logging.getLogger(__name__)
 
-_OLD = 7 * 86400.0
-"""Seconds after which what another machine left unfinished is taken for abandoned."""
+Record = dict[str, Any]
 
 
 def prepare(output: Path) -> Path:
@@ -59,9 +62,22 @@ def prepare(output: Path) -> Path:
 
 def staging(jobs: Path, key: str) -> Path:
     """Make a folder for the products of a running job, which `publish` renames."""
-    path = jobs / f".{key}-{os.getpid()}-{secrets.token_hex(4)}@{socket.gethostname()}"
+    path = jobs / f".{key}-{os.getpid()}-{secrets.token_hex(4)}@{_place()}"
     path.mkdir()
     return path
+
+
+@cache
+def _place() -> str:
+    """Where the numbers of processes mean what they mean for this process.
+
+    Containers may share the name of a host and count their processes apart.
+    """
+    facts = [socket.gethostname()]
+    with suppress(OSError):
+        facts.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii"))
+        facts.append(str(os.stat("/proc/self/ns/pid").st_ino))
+    return hashlib.sha256("\n".join(facts).encode()).hexdigest()[:16]
 
 
 def publish(folder: Path, final: Path) -> None:
@@ -99,11 +115,26 @@ def write_record(folder: Path, job: Job, record: Mapping[str, Any]) -> Record:
     about = asdict(job)
     # JSON has no infinity.
     about["options"]["settings"] = {k: repr(v) for k, v in job.options.settings.items()}
-    whole = {**record, "job": about, "products": products}
+    whole = encodable({**record, "job": about, "products": products})
     text = json.dumps(whole, indent=2, allow_nan=False) + "\n"
     (folder / RECORD).write_text(text, encoding="utf-8")
     read: Record = json.loads(text)
     return read
+
+
+def encodable(value: Any) -> Any:
+    """The same nested values with text that UTF-8 can encode.
+
+    Names of files, and messages that quote them, may have bytes of another encoding, which Python
+    keeps as surrogates and no table takes.
+    """
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode("utf-8")
+    if isinstance(value, Mapping):
+        return {encodable(key): encodable(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [encodable(each) for each in value]
+    return value
 
 
 def read_record(final: Path) -> Record | None:
@@ -124,17 +155,27 @@ def finished(final: Path) -> bool:
 
 
 def clean(jobs: Path) -> None:
-    """Remove what processes that are no more have left unfinished."""
+    """Remove what processes that are no more have left unfinished.
+
+    Only processes of this machine can be asked for. What others have left stays: their jobs may
+    run, and clocks may differ.
+    """
+    elsewhere = 0
     for path in jobs.glob(".*@*"):
-        owner, host = path.name.split("@", 1)
+        owner, place = path.name.split("@", 1)
         try:
             process = int(owner.split("-")[1])
-            same = host.removesuffix(".old") == socket.gethostname()
-            abandoned = time.time() - path.stat().st_mtime > _OLD
-        except (IndexError, ValueError, OSError):
+        except (IndexError, ValueError):
             continue
-        if abandoned or (same and not _runs(process)):
+        if place.removesuffix(".old") != _place():
+            elsewhere += 1
+        elif not _runs(process):
             shutil.rmtree(path, ignore_errors=True)
+    if elsewhere:
+        _log.info(
+            "%d unfinished jobs in %s are of other machines, or of before a restart; if nothing "
+            "else works there, their folders (.*@*) can be removed", elsewhere, jobs,
+        )  # fmt: skip
 
 
 def _runs(process: int) -> bool:

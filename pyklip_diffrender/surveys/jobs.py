@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from astropy.time import Time
-
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
-from pyklip_diffrender.io.files import open_fits, sha256
-from pyklip_diffrender.io.headers import header_date, merged_header
+from pyklip_diffrender.io.files import sha256
 from pyklip_diffrender.io.opd_map import FLAT
+from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
-from pyklip_diffrender.wavefront.map_choice import dated_maps
+from pyklip_diffrender.wavefront.map_choice import wavefront_for
 
 __all__ = ["Injection", "Job", "jobs_of"]
 
@@ -102,10 +99,10 @@ def jobs_of(config: Config) -> list[Job]:
     jobs: dict[str, Job] = {}
     problems = []
     # Sequences may share files.
-    digest, date = cache(sha256), cache(_date)
+    digest = cache(sha256)
     for sequence in config.sequences:
         try:
-            found = _jobs(sequence, digest, date)
+            found = _jobs(sequence, digest)
         except (DiffrenderError, OSError) as error:
             problems.append(f"{sequence.name}: {error}")
             continue
@@ -118,13 +115,11 @@ def jobs_of(config: Config) -> list[Job]:
     return list(jobs.values())
 
 
-def _jobs(
-    sequence: SequenceConfig, digest: Callable[[Path], str], date: Callable[[Path], Time | None]
-) -> list[Job]:
+def _jobs(sequence: SequenceConfig, digest: Callable[[Path], str]) -> list[Job]:
     files = _files(sequence.files)
     opd, is_flat = sequence.opd, str(sequence.opd) == FLAT
     if not is_flat and opd.is_dir():
-        opd = _nearest(opd, files, date)
+        opd = _nearest(opd, sequence)
     pattern, star = sequence.options.systematics, sequence.options.star_flux
     known = [] if pattern in ("auto", "references", "off") else [Path(pattern)]
     maps = [] if is_flat else [opd]
@@ -193,24 +188,8 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
     return inside
 
 
-def _nearest(folder: Path, files: list[Path], date: Callable[[Path], Time | None]) -> Path:
-    """The map of a folder that was sensed nearest in time to the first frame."""
-    first = min((each.mjd for each in map(date, files) if each is not None), default=math.nan)
-    if math.isnan(first):
-        raise IncompatibleSetupError(
-            f"opd: got the folder {folder}, and the frames have no date (DATE-BEG) to choose a map "
-            "by. Name the map itself"
-        )
-    return min(dated_maps(folder), key=lambda each: (abs(each[0].mjd - first), each[1].name))[1]
-
-
-def _date(path: Path) -> Time | None:
-    """Date of a file; None if it has none or cannot be read."""
-    try:
-        with open_fits(path) as hdus:
-            header = hdus[0].header
-            for hdu in hdus[1:2]:
-                header = merged_header(header, hdu.header, path.name)
-            return header_date(header, ("DATE-BEG", "DATE-OBS"), path.name)
-    except DiffrenderError:
-        return None
+def _nearest(folder: Path, sequence: SequenceConfig) -> Path:
+    """The map that `reduce` would take from a folder: the one nearest to the target's frames."""
+    files = sequence.files[0] if len(sequence.files) == 1 else sequence.files
+    frames = Sequence.from_files(files, target=sequence.target, filter=sequence.filter)
+    return folder / wavefront_for(folder, frames.date).name

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender._version import __version__
-from pyklip_diffrender.report import pieces
-from pyklip_diffrender.report.pictures import Picture
-from pyklip_diffrender.report.words import number, plus_minus, probability, scientific
+from pyklip_diffrender.reduction import html
+from pyklip_diffrender.reduction.html import Picture
+from pyklip_diffrender.reduction.words import number, plus_minus, probability, scientific
 from pyklip_diffrender.surveys.folders import Record
 from pyklip_diffrender.surveys.jobs import Job
 
@@ -36,18 +36,18 @@ def page(rows: Rows, name: str) -> str:
         Of the survey.
     """
     sections = [
-        pieces.section("Contrast", _limits(rows)),
-        pieces.section("Candidates", _candidates(rows)),
-        pieces.section("Injected planets", _injections(rows)),
-        pieces.section("Jobs", _jobs(rows)),
-        pieces.section("Failures", _failures(rows)),
+        html.section("Contrast", _limits(rows)),
+        html.section("Candidates", _candidates(rows)),
+        html.section("Injected planets", _injections(rows)),
+        html.section("Jobs", _jobs(rows)),
+        html.section("Failures", _failures(rows)),
     ]
     if not any(job.injection for job, _ in rows):
         del sections[2]
     states = [_status(record) for _, record in rows]
     done, failed, waiting = map(states.count, ("finished", "failed", "waiting"))
     tone = "bad" if failed else "warn" if waiting else "good"
-    parts = [f"{done} of {pieces.count(len(rows), 'job')} finished"]
+    parts = [f"{done} of {html.count(len(rows), 'job')} finished"]
     parts += [f"{failed} failed"] if failed else []
     parts += [f"{waiting} not finished yet"] if waiting else []
     advice = (
@@ -69,9 +69,9 @@ def page(rows: Rows, name: str) -> str:
         f'<p class="setup">Survey with pyklip_diffrender {__version__}, state of {now} UTC</p>\n'
         f'<p class="result">{escape(_sentence(rows))}</p>\n'
         f'<div class="status {tone}"><strong>{escape(", ".join(parts))}.</strong>'
-        f"<p>{advice}</p></div>\n{pieces.facts(facts)}\n</header>\n"
+        f"<p>{advice}</p></div>\n{html.facts(facts)}\n</header>\n"
     )
-    return pieces.document(f"{name}: survey", header, sections)
+    return html.document(f"{name}: survey", header, sections)
 
 
 def _finished(rows: Rows, *, injected: bool = False) -> list[tuple[Job, Record]]:
@@ -93,11 +93,11 @@ def _sentence(rows: Rows) -> str:
     counts = [len(record["result"].get("candidates", ())) for _, record in plain]
     if not plain:
         return "No sequence is reduced yet."
-    stars = pieces.count(len(plain), "sequence")
+    stars = html.count(len(plain), "sequence")
     if not any(counts):
         return f"{stars} reduced, no companion candidate."
     return (
-        f"{stars} reduced, {pieces.count(sum(counts), 'companion candidate')} in "
+        f"{stars} reduced, {html.count(sum(counts), 'companion candidate')} in "
         f"{sum(map(bool, counts))} of them."
     )
 
@@ -107,7 +107,7 @@ def _limits(rows: Rows) -> str:
         (job, record["result"]) for job, record in _finished(rows) if record["result"].get("curve")
     ]
     if not curves:
-        return pieces.note("There are no contrast curves yet.")
+        return html.note("There are no contrast curves yet.")
     sigmas = curves[0][1]["curve"]["sigmas"]
     candidates = [
         (each["separation_arcsec"], each["contrast"])
@@ -128,7 +128,7 @@ def _limits(rows: Rows) -> str:
     picture = Picture(
         drawing.to_png(figure, dpi=200),
         f"Curves of the contrast at {sigmas:g} sigma against separation in arcsec for "
-        f"{pieces.count(len(curves), 'sequence')}; the table has their values.",
+        f"{html.count(len(curves), 'sequence')}; the table has their values.",
         f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "
         f"median of all position angles.{' Circles are candidates.' if candidates else ''}",
     )
@@ -141,7 +141,7 @@ def _limits(rows: Rows) -> str:
         cells = [scientific(limits[s]) if s in limits else "" for s in separations]
         table.append([job.name, *cells])
     header = ["Sequence", *(f"at {each:.3g} arcsec" for each in separations)]
-    return pieces.pictures([picture], "single") + pieces.table(header, table)
+    return html.pictures([picture], "single") + html.table(header, table)
 
 
 def _array(result: dict[str, Any], key: str) -> NDArray[np.float64]:
@@ -164,10 +164,10 @@ def _candidates(rows: Rows) -> str:
         for each in record["result"].get("candidates", ())
     ]
     if not table:
-        return pieces.note("There are no candidates.")
+        return html.note("There are no candidates.")
     header = ["Sequence", "Star", "Separation (arcsec)", "Position angle (deg)", "Contrast", "S/N",
               "False-alarm probability"]  # fmt: skip
-    return pieces.table(header, table)
+    return html.table(header, table)
 
 
 def _injections(rows: Rows) -> str:
@@ -190,11 +190,11 @@ def _injections(rows: Rows) -> str:
             ]
         )
     if not table:
-        return pieces.note("No injected planet is measured yet.")
+        return html.note("No injected planet is measured yet.")
     header = ["Sequence", "Separation (arcsec)", "Position angle (deg)", "Injected", "Recovered",
               "Recovered / injected", "S/N", "Detected"]  # fmt: skip
     note = "A planet that is not detected is measured at its place."
-    return pieces.table(header, table) + pieces.note(note)
+    return html.table(header, table) + html.note(note)
 
 
 def _jobs(rows: Rows) -> str:
@@ -217,13 +217,13 @@ def _jobs(rows: Rows) -> str:
         )
     header = ["Job", "Filter", "Job status", "Fit status", "Reduced chi-squared", "Candidates",
               "Time", "Peak memory"]  # fmt: skip
-    return pieces.table(header, table, wrap=0)
+    return html.table(header, table, wrap=0)
 
 
 def _failures(rows: Rows) -> str:
     failed = [(job, r) for job, r in rows if r is not None and r["status"] == "failed"]
     if not failed:
-        return pieces.note("No job has failed.")
+        return html.note("No job has failed.")
     return "\n".join(
         f"<h3>{escape(_label(job))}</h3>\n<p>{escape(record['message'])}</p>\n"
         "<details><summary>Traceback</summary>"
@@ -241,8 +241,8 @@ def _label(job: Job) -> str:
     return f"{job.name}, planet of {contrast} at {place}"
 
 
-def _report(job: Job, label: str | None = None) -> pieces.Markup:
-    return pieces.link(f"jobs/{job.key}/report.html", label or job.name)
+def _report(job: Job, label: str | None = None) -> html.Markup:
+    return html.link(f"jobs/{job.key}/report.html", label or job.name)
 
 
 def _time(seconds: float) -> str:

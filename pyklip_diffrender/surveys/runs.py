@@ -19,6 +19,7 @@ from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.io.files import sha256
 from pyklip_diffrender.surveys.folders import (
     Record,
+    encodable,
     publish,
     read_record,
     staging,
@@ -61,11 +62,11 @@ def run_job(job: Job, jobs: Path, work: Work) -> Record:
 
 def failure(job: Job, jobs: Path, error: BaseException, **circumstances: Any) -> Record:
     """Publish the record of a failed job, as far as the disk takes it, and return it."""
-    record = {
+    record: Record = {
         **circumstances,
         "status": "failed",
-        "message": f"{type(error).__name__}: {error}".removesuffix(": "),
-        "traceback": "".join(traceback.format_exception(error)),
+        "message": encodable(f"{type(error).__name__}: {error}".removesuffix(": ")),
+        "traceback": encodable("".join(traceback.format_exception(error))),
         "result": {},
     }
     folder = None

@@ -9,12 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.detection import measured_planet, with_planets
-from pyklip_diffrender.reduction import Reduction, reduce
+from pyklip_diffrender.reduction import (
+    ReduceOptions,
+    Reduction,
+    prepare,
+    summarise,
+    write_products,
+)
 from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement
-from pyklip_diffrender.report import summarise, write_report
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.surveys.jobs import Injection, Job
 
 __all__ = ["reduce_job"]
@@ -22,42 +26,21 @@ __all__ = ["reduce_job"]
 
 def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str, Any]:
     """Reduce a sequence, perhaps with a planet in it, and write the products."""
-    options = job.options
-    known: Any
-    common: dict[str, Any] = {
-        "size": options.size,
-        "threshold": options.threshold,
-        "memory": memory,
-        "disk": options.disk,
-        "star_flux": options.star_flux,
-        "star_flux_error": options.star_flux_error,
-    }
+    options: dict[str, Any] = {**job.options.keywords, "memory": memory}
     if job.injection is not None and job.base is not None:
         fit = Refinement.read(folder.parent / job.base / "fit.fits")
         first = fit.frames[0].observation
         planet = _planet(job.injection, first.position_angle)
         science = with_planets(_with_disk(fit.frames, job), [planet])
-        sequence, known = Sequence(first.target, science), fit.systematics or "off"
+        sequence = Sequence(first.target, science)
+        options |= {"systematics": fit.systematics or "off", "wide": False}
     else:
         sequence = Sequence.from_files(job.files, target=job.target, filter=job.filter)
-        known = options.systematics
-        if known not in ("auto", "references", "off"):
-            known = Systematics.read(known)
-        common["wide"] = options.wide
-    if options.settings:
-        common["settings"] = GaussNewton.nircam(sequence.science[0].filter, **options.settings)
-    reduction = reduce(sequence, job.opd, systematics=known, **common)
-    written = reduction.detection.write(folder)
-    if reduction.wide is not None:
-        written += reduction.wide.write(folder)
-    if reduction.disk is not None:
-        written.append(reduction.disk.write(folder))
-    if job.injection is None:
-        # The linear model takes twenty times the rest of the fit, which injections start from.
-        written.append(reduction.fit.write(folder / "fit.fits", linear=False))
-    if reduction.systematics is not None:
-        written.append(reduction.systematics.write(folder / "systematics.fits"))
-    write_report(reduction, folder, written)
+    if job.options.settings:
+        name = sequence.science[0].filter
+        options["settings"] = GaussNewton.nircam(name, **job.options.settings)
+    reduction = prepare(sequence, job.opd, ReduceOptions(**options)).run()
+    write_products(reduction, folder, fit=job.injection is None)
     result = _result(summarise(reduction))
     if job.injection is not None and job.base is not None:
         result["recovered"] = _recovered(reduction, job.injection)

@@ -10,6 +10,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import DiffrenderWarning, UnitError
+from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.units import require_finite, to_metres
 from pyklip_diffrender.optics.grid import JWST_DIAMETER
@@ -99,11 +100,11 @@ def opd_to_hdus(opd: Any, diameter: float = JWST_DIAMETER) -> fits.HDUList:
     header["PUPLSCAL"] = (diameter / values.shape[-1], "[m / pixel]")
     header["CONTENTS"] = "OTE OPD, entrance pupil orientation"
     if isinstance(opd, OPDMap):
-        header["OPDFILE"] = (opd.name, "Origin of the map")
+        header["OPDFILE"] = (fits_text(opd.name), "Origin of the map")
         if opd.aperture:
             header["APERNAME"] = (opd.aperture, "Sensing field point")
         if opd.date is not None:
             header["DATE-OBS"], header["TIME-OBS"] = opd.date.isot.split("T")
         for line in opd.history:
-            header.add_history(line)
+            header.add_history(fits_text(line))
     return fits.HDUList([fits.PrimaryHDU(values, header)])

@@ -1,17 +1,27 @@
-"""Pieces of an HTML page, with everything escaped that is not markup."""
+"""Elements of an HTML page, with everything escaped that is not markup."""
 
 from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
 from importlib import resources
 from string import Template
 from urllib.parse import quote
 
-from pyklip_diffrender.report.pictures import Picture
-
-__all__ = ["Markup", "count", "document", "facts", "link", "note", "pictures", "section", "table"]
+__all__ = [
+    "Markup",
+    "Picture",
+    "count",
+    "document",
+    "facts",
+    "link",
+    "note",
+    "pictures",
+    "section",
+    "table",
+]
 
 _PAGE = Template("""\
 <!DOCTYPE html>
@@ -35,6 +45,23 @@ $sections
 """)
 
 
+@dataclass(frozen=True)
+class Picture:
+    """A picture and its words.
+
+    Attributes
+    ----------
+    png : bytes
+    alt : str
+        What it shows, for readers who do not see it.
+    caption : str
+    """
+
+    png: bytes
+    alt: str
+    caption: str
+
+
 class Markup(str):
     """Text that is HTML already."""
 
@@ -48,7 +75,7 @@ def link(path: str, text: str) -> Markup:
 
 def document(title: str, header: str, sections: Iterable[str]) -> str:
     """A whole page that loads nothing; header and sections are HTML, the title is text."""
-    style = resources.files("pyklip_diffrender.report").joinpath("page.css")
+    style = resources.files("pyklip_diffrender.reduction").joinpath("page.css")
     return _PAGE.substitute(
         title=escape(title),
         style=style.read_text(encoding="utf-8"),

@@ -8,9 +8,9 @@ from html import escape
 from string import Template
 from typing import Any
 
-from pyklip_diffrender.report import pieces
-from pyklip_diffrender.report.pictures import Picture
-from pyklip_diffrender.report.words import (
+from pyklip_diffrender.reduction import html
+from pyklip_diffrender.reduction.html import Picture
+from pyklip_diffrender.reduction.words import (
     number,
     plus_minus,
     probability,
@@ -32,23 +32,6 @@ $facts
 </header>
 """)
 
-_PRODUCTS = {
-    "wide_field.fits": "maps of the whole frames",
-    "wide_field_candidates.ecsv": "candidates in the whole frames",
-    "wide_field_contrast.ecsv": "contrast curve to the edge of the frames",
-    "detection.fits": "maps, star-subtracted frames and candidates, for Detection.read",
-    "candidates.ecsv": "the candidates with all columns",
-    "contrast.ecsv": "the contrast curve",
-    "astrometry.csv": "epoch and positions of the candidates, for orbitize!",
-    "injections.ecsv": "injected planets, and what was measured of them",
-    "disk.fits": "the extended light: frames without the star, and its sources",
-    "detection.png": "the S/N map and the contrast curve",
-    "fit.fits": "the fit, for Refinement.read",
-    "systematics.fits": "the pattern of the model's error, for other reductions",
-    "summary.json": "the content of this page, for programs",
-    "report.html": "this page",
-}
-
 
 def page(
     summary: Mapping[str, Any],
@@ -57,7 +40,7 @@ def page(
     wavefront: Sequence[Picture],
     wide: Sequence[Picture] = (),
     disk: Sequence[Picture] = (),
-    files: Sequence[str] = (),
+    files: Mapping[str, str] | None = None,
     injections: str = "",
 ) -> str:
     """The report.
@@ -70,8 +53,8 @@ def page(
         Those of whole frames, `wide`, and of extended light, `disk`, may be missing.
     stars : sequence of sequence of Picture
         One for each frame of the target that is shown.
-    files : sequence of str
-        Names of the files that were written with it.
+    files : mapping of str to str, optional
+        Names of the files that were written with it, and their content.
     injections : str
         A section, see `injections_section`.
 
@@ -84,24 +67,24 @@ def page(
     message = status["message"]
     tone = "good" if status["name"] == "CONVERGED" else "warn" if status["usable"] else "bad"
     sections = [
-        pieces.section(
-            "Search", pieces.pictures(search, "pair"), _candidates(summary), _limits(summary)
+        html.section(
+            "Search", html.pictures(search, "pair"), _candidates(summary), _limits(summary)
         ),
         *(
-            [pieces.section("Whole frames", pieces.pictures(wide, "pair"), _wide(summary))]
+            [html.section("Whole frames", html.pictures(wide, "pair"), _wide(summary))]
             if wide
             else []
         ),
         *(
-            [pieces.section("Extended light", pieces.pictures(disk, "pair"), _disk(summary))]
+            [html.section("Extended light", html.pictures(disk, "pair"), _disk(summary))]
             if disk
             else []
         ),
         *filter(None, [injections]),
-        pieces.section("Star subtraction", *_star(summary, stars)),
-        pieces.section("Wavefront", _wavefront(summary), pieces.pictures(wavefront)),
-        pieces.section("Frames", _frames(summary), _left_out(summary)),
-        pieces.section("Provenance", _provenance(summary, files)),
+        html.section("Star subtraction", *_star(summary, stars)),
+        html.section("Wavefront", _wavefront(summary), html.pictures(wavefront)),
+        html.section("Frames", _frames(summary), _left_out(summary)),
+        html.section("Provenance", _provenance(summary, files or {})),
     ]
     text = {
         "target": summary["target"],
@@ -114,10 +97,10 @@ def page(
     }
     header = _HEADER.substitute(
         {name: escape(str(value)) for name, value in text.items()},
-        facts=pieces.facts(_key_facts(summary)),
+        facts=html.facts(_key_facts(summary)),
     )
     title = f"{summary['target']}, {summary['filter'] or 'no filter'}: report"
-    return pieces.document(title, header, sections)
+    return html.document(title, header, sections)
 
 
 def _setup(summary: Mapping[str, Any]) -> str:
@@ -131,8 +114,8 @@ def _setup(summary: Mapping[str, Any]) -> str:
         summary["image_mask"],
         summary["program"] and f"program {summary['program']}",
         " to ".join(dict.fromkeys(filter(None, dates))),
-        pieces.count(len(targets), "frame") + " of the target",
-        pieces.count(references, "reference frame") if references else None,
+        html.count(len(targets), "frame") + " of the target",
+        html.count(references, "reference frame") if references else None,
     ]
     return " · ".join(str(part) for part in parts if part)
 
@@ -182,7 +165,7 @@ def _age(days: float | None) -> str:
 
 def _candidates(summary: Mapping[str, Any]) -> str:
     if not summary["candidates"]:
-        return pieces.note(f"No candidate has an S/N above {summary['threshold_snr']:g}.")
+        return html.note(f"No candidate has an S/N above {summary['threshold_snr']:g}.")
     rows = [
         [
             str(k),
@@ -209,8 +192,8 @@ def _candidates(summary: Mapping[str, Any]) -> str:
     )
     return (
         "<h3>Candidates</h3>"
-        + pieces.table(header, rows)
-        + pieces.note(note)
+        + html.table(header, rows)
+        + html.note(note)
         + _on_sky(summary["candidates"])
     )
 
@@ -223,7 +206,7 @@ def _disk(summary: Mapping[str, Any]) -> str:
         if disk["position_angle_deg"] is None
         else f" Its long axis has a position angle of {disk['position_angle_deg']:.1f} deg."
     )
-    return pieces.note(
+    return html.note(
         f"Altogether {scientific(disk['contrast'])} of the star's light, in {disk['sources']} "
         f"sources that lower chi-squared by {disk['chi2_decrease']:.0f}.{axis} The search and the "
         "limits above are for frames without this light. Planets may be part of it."
@@ -245,7 +228,7 @@ def _wide(summary: Mapping[str, Any]) -> str:
         for k, each in enumerate(candidates, 1)
     ]
     if not rows:
-        return pieces.note(f"No candidate has an S/N above {summary['threshold_snr']:g}.")
+        return html.note(f"No candidate has an S/N above {summary['threshold_snr']:g}.")
     angle = "east of north" if summary["oriented"] else "from +y of the first frame"
     header = ["", "Separation (arcsec)", f"Position angle (deg, {angle})", "Contrast", "S/N",
               "Chi-squared of the image"]  # fmt: skip
@@ -254,7 +237,7 @@ def _wide(summary: Mapping[str, Any]) -> str:
         "outside the pixels in which the star was fitted; much above 1, the source is extended, "
         "blended, or no source."
     )
-    return "<h3>Candidates</h3>" + pieces.table(header, rows) + pieces.note(note)
+    return "<h3>Candidates</h3>" + html.table(header, rows) + html.note(note)
 
 
 _SKY = (
@@ -282,7 +265,7 @@ def _on_sky(candidates: Sequence[Mapping[str, Any]]) -> str:
         "of flux densities do not include that of the photometric calibration."
     )
     titles = ["", *(title for title, *_ in columns)]
-    return "<h3>Astrometry and photometry</h3>" + pieces.table(titles, rows) + pieces.note(note)
+    return "<h3>Astrometry and photometry</h3>" + html.table(titles, rows) + html.note(note)
 
 
 def _limits(summary: Mapping[str, Any]) -> str:
@@ -303,7 +286,7 @@ def _limits(summary: Mapping[str, Any]) -> str:
         "Separation (arcsec)", "Contrast, median", "Magnitude difference (mag)",
         "Contrast, all angles", "Contrast if the star were known",
     ]  # fmt: skip
-    return f"<h3>Limits at {sigmas:g} sigma</h3>" + pieces.table(header, rows)
+    return f"<h3>Limits at {sigmas:g} sigma</h3>" + html.table(header, rows)
 
 
 def _star(summary: Mapping[str, Any], stars: Sequence[Sequence[Picture]]) -> Iterable[str]:
@@ -311,9 +294,9 @@ def _star(summary: Mapping[str, Any], stars: Sequence[Sequence[Picture]]) -> Ite
     for frame, pictures in zip(targets, stars, strict=False):
         if len(targets) > 1:
             yield f"<h3>{escape(_label(frame))}</h3>"
-        yield pieces.pictures(pictures)
+        yield html.pictures(pictures)
     if len(stars) < len(targets):
-        yield pieces.note(
+        yield html.note(
             f"The first {len(stars)} of {len(targets)} frames are shown; detection.fits has all."
         )
 
@@ -349,7 +332,7 @@ def _frames(summary: Mapping[str, Any]) -> str:
     ]
     header = ["Use", "Star", "Date (UTC)", "Position angle of +y (deg)", "Integrations",
               "Pixels used (%)", "File"]  # fmt: skip
-    table = pieces.table(header, rows)
+    table = html.table(header, rows)
     bad = [
         f"{each['file']}: " + ", ".join(f"({x:+.2f}, {y:+.2f})" for x, y in each["bad_pixels"])
         for each in summary["frames"]
@@ -357,7 +340,7 @@ def _frames(summary: Mapping[str, Any]) -> str:
     ]
     if not bad:
         return table
-    return table + pieces.note(
+    return table + html.note(
         "Pixels left out because they deviate from the model and no point source explains it "
         f"(x, y from the star, arcsec): {'; '.join(bad)}."
     )
@@ -366,11 +349,11 @@ def _frames(summary: Mapping[str, Any]) -> str:
 def _left_out(summary: Mapping[str, Any]) -> str:
     rows = [[each["name"], each["reason"]] for each in summary["left_out"]]
     if not rows:
-        return pieces.note("No frame was left out.")
-    return "<h3>Left out</h3>" + pieces.table(["Name", "Reason"], rows, wrap=1)
+        return html.note("No frame was left out.")
+    return "<h3>Left out</h3>" + html.table(["Name", "Reason"], rows, wrap=1)
 
 
-def _provenance(summary: Mapping[str, Any], files: Sequence[str]) -> str:
+def _provenance(summary: Mapping[str, Any], files: Mapping[str, str]) -> str:
     seconds, map_ = summary["seconds"], summary["wavefront_map"]
     versions = ", ".join(" ".join(each) for each in summary["versions"].items())
     facts = [
@@ -383,16 +366,13 @@ def _provenance(summary: Mapping[str, Any], files: Sequence[str]) -> str:
         [name, "none" if value is None else str(value)]
         for name, value in summary["settings"].items()
     ]
-    known = [[name, _PRODUCTS.get(name, "")] for name in files]
-    parts = [pieces.facts(facts), pieces.facts(long, "facts long")]
-    if known:
-        parts += [
-            "<h3>Files written with this page</h3>",
-            pieces.table(["Name", "Content"], known, wrap=1),
-        ]
+    parts = [html.facts(facts), html.facts(long, "facts long")]
+    if files:
+        rows = [[html.link(name, name), content] for name, content in files.items()]
+        parts += ["<h3>Files written with this page</h3>", html.table(["File", "Content"], rows, 1)]
     parts += [
         "<details><summary>Settings of the fit</summary>",
-        pieces.table(["Setting", "Value"], settings, wrap=1),
+        html.table(["Setting", "Value"], settings, wrap=1),
         "</details>",
     ]
     return "\n".join(parts)

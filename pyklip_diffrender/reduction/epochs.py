@@ -14,10 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.io.files import replacing
-from pyklip_diffrender.report import pieces
-from pyklip_diffrender.report.words import plus_minus
+from pyklip_diffrender.reduction import html
+from pyklip_diffrender.reduction.words import plus_minus
 
-__all__ = ["compare_epochs", "write_epochs"]
+__all__ = ["EPOCHS", "compare_epochs", "write_epochs"]
+
+EPOCHS = ("epochs.html", "epochs.json")
+"""Files that `write_epochs` writes."""
 
 _YEAR = 365.25
 
@@ -144,9 +147,9 @@ def write_epochs(
         ],
         "pairs": pairs,
     }  # fmt: skip
-    html, data = (Path(folder) / name for name in ("epochs.html", "epochs.json"))
+    page, data = (Path(folder) / name for name in EPOCHS)
     texts = {
-        html: _page(folders, pairs, motion),
+        page: _page(folders, pairs, motion),
         data: json.dumps(content, indent=2, allow_nan=False) + "\n",
     }
     for path, text in texts.items():
@@ -162,7 +165,7 @@ def _page(
 ) -> str:
     target = next(iter(folders.values()))["target"]
     epochs = [
-        [pieces.link(f"{name}/report.html", str(each["first_date"])[:10]), each["sentence"]]
+        [html.link(f"{name}/report.html", str(each["first_date"])[:10]), each["sentence"]]
         for name, each in folders.items()
     ]
     positions = [
@@ -188,25 +191,25 @@ def _page(
     ]
     known = "not known" if motion is None else "{:+.3f}, {:+.3f} arcsec per year".format(*motion)
     sections = [
-        pieces.section("Epochs", pieces.table(["Date", "Result"], epochs, wrap=1)),
-        pieces.section(
+        html.section("Epochs", html.table(["Date", "Result"], epochs, wrap=1)),
+        html.section(
             "Candidates",
-            pieces.table(
+            html.table(
                 ["Date", "", "Separation (arcsec)", "Position angle (deg)", "S/N"], positions
             )
             if positions
-            else pieces.note("No epoch has a candidate."),
+            else html.note("No epoch has a candidate."),
         ),
-        pieces.section(
+        html.section(
             "Between epochs",
-            pieces.table(
+            html.table(
                 ["Candidates", "Moved to east, north (arcsec)", "Chi-squared with the star",
                  "Chi-squared with the sky", "Verdict"],
                 moves, wrap=4,
             )
             if moves
-            else pieces.note("No candidate of one epoch has a counterpart in another."),
-            pieces.note(
+            else html.note("No candidate of one epoch has a counterpart in another."),
+            html.note(
                 "Every epoch was reduced alone, because its wavefront is another one. Chi-squared "
                 "has two degrees of freedom. Orbits, the star's parallax and errors of the proper "
                 f"motion are neglected. Proper motion of the star to east and north: {known}."
@@ -214,4 +217,4 @@ def _page(
         ),
     ]  # fmt: skip
     header = f"<header><h1>{escape(str(target))}: {len(folders)} epochs</h1></header>\n"
-    return pieces.document(f"{target}: epochs", header, sections)
+    return html.document(f"{target}: epochs", header, sections)

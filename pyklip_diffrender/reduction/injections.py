@@ -8,9 +8,9 @@ from typing import Any
 from astropy.table import QTable
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.report import pieces
-from pyklip_diffrender.report.pictures import Picture
-from pyklip_diffrender.report.words import plus_minus, scientific
+from pyklip_diffrender.reduction import html
+from pyklip_diffrender.reduction.html import Picture
+from pyklip_diffrender.reduction.words import plus_minus, scientific
 
 __all__ = ["injections_section"]
 
@@ -54,9 +54,9 @@ def injections_section(summary: Mapping[str, Any], planets: QTable) -> str:
         "Recovered over injected contrast. Filled: detected. Open: not detected, and measured at "
         "the known place.",
     )
-    return pieces.section(
+    return html.section(
         "Injected planets",
-        pieces.note(text),
-        pieces.pictures([picture], "half"),
-        pieces.table(header, rows),
+        html.note(text),
+        html.pictures([picture], "half"),
+        html.table(header, rows),
     )

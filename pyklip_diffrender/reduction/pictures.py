@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,13 @@ from astropy.table import QTable
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Detection, Disk, WideField
-from pyklip_diffrender.reduction import Reduction
-from pyklip_diffrender.report.summary import wavefronts
-from pyklip_diffrender.report.words import number
+from pyklip_diffrender.reduction.html import Picture
+from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.summary import wavefronts
+from pyklip_diffrender.reduction.words import number
 
 __all__ = [
     "MOST_FRAMES",
-    "Picture",
     "disk_pictures",
     "search_pictures",
     "star_pictures",
@@ -30,23 +29,6 @@ MOST_FRAMES = 4
 
 _LIMIT = 5.0
 """Limit of the scale for residuals, standard deviations."""
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A picture and its words.
-
-    Attributes
-    ----------
-    png : bytes
-    alt : str
-        What it shows, for readers who do not see it.
-    caption : str
-    """
-
-    png: bytes
-    alt: str
-    caption: str
 
 
 def search_pictures(

@@ -1,0 +1,139 @@
+"""The work of the commands `reduce` and `detect`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import nullcontext, redirect_stdout
+from json import dumps, loads
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pyklip_diffrender.cli.estimate import describe_plan, size_of_products
+from pyklip_diffrender.cli.run import Run, with_options
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.opd_map import OPDMap
+from pyklip_diffrender.io.progress import numbered_stages, stage
+from pyklip_diffrender.reduction import EPOCHS, PRODUCTS, ReduceOptions, prepare, write_epochs
+from pyklip_diffrender.scene.admission_table import SHORT
+from pyklip_diffrender.scene.exposure import proper_motion
+from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.wavefront.map_choice import Rule, choose_map
+from pyklip_diffrender.wavefront.opd import as_opd_map
+from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
+
+__all__ = ["run_reduction"]
+
+_MAST = "mast"
+"""Value of --opd for maps that come from MAST."""
+
+
+def run_reduction(
+    run: Run,
+    read: Callable[[], tuple[Sequence, ...]],
+    *,
+    output: Path,
+    overwrite: bool,
+    derivatives: bool,
+    json: bool,
+    dry_run: bool,
+    opd: str,
+    opd_date: Rule | None,
+    **options: Any,
+) -> None:
+    """Reduce the epochs of a target, write all products and say what they show.
+
+    A dry run makes all the checks of a run, and stops before the first fit.
+    """
+    if dry_run and json:
+        raise click.UsageError("A --dry-run has no summary to print with --json.")
+    try:
+        checked = ReduceOptions(device=run.device, **options)
+    except DiffrenderError as error:
+        raise click.UsageError(with_options(str(error))) from error
+    run.claim_folder(output, (*PRODUCTS, *EPOCHS), overwrite)
+    # Libraries may print, too.
+    with redirect_stdout(sys.stderr) if json else nullcontext():
+        sequences = read()
+        several = len(sequences) > 1
+        folders = [output / _day(each) for each in sequences] if several else [output]
+        prepared = []
+        for sequence, folder in zip(sequences, folders, strict=True):
+            if several:
+                run.claim_folder(folder, tuple(PRODUCTS), overwrite)
+                click.echo(f"\nepoch {folder.name}, {len(sequences)} in all:")
+            _show(sequence)
+            map_ = _map(sequence, opd, opd_date)
+            click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
+            prepared.append(prepare(sequence, map_, checked))
+            if dry_run:
+                click.echo(describe_plan(prepared[-1].sequence, checked))
+        sizes = (size_of_products(each.sequence, derivatives=derivatives) for each in prepared)
+        run.require_room(output, sum(sizes))
+        if dry_run:
+            return
+        summaries = {}
+        for preparation, folder in zip(prepared, folders, strict=True):
+            with numbered_stages():
+                reduction = preparation.run(progress=run.progress)
+                with stage("products"):
+                    written = reduction.write(folder, overwrite=overwrite, derivatives=derivatives)
+            summary = loads((folder / "summary.json").read_text(encoding="utf-8"))
+            summaries[folder.name] = summary
+            click.echo(f"\n{summary['sentence']}\n{with_options(summary['status']['advice'])}\n")
+            click.echo(f"wrote {folder / 'report.html'} and {len(written) - 1} more files")
+        if several:
+            first = sequences[0].science[0]
+            motion = proper_motion(first.header, first.name)
+            page, data = write_epochs(summaries, motion, output)
+            summary = loads(data.read_text(encoding="utf-8"))
+            click.echo(f"wrote {page}, which compares the epochs")
+    if json:
+        click.echo(dumps(summary, indent=2))
+
+
+def _day(sequence: Sequence) -> str:
+    """First date of a sequence."""
+    dates = [each.date.isot[:10] for each in sequence.science if each.date is not None]
+    return min(dates, default="no-date")
+
+
+def _show(sequence: Sequence) -> None:
+    """List the frames that are used, and those that are not with the reason."""
+    table = sequence.table
+    used = table[table["use"] != "excluded"]
+    click.echo("\n".join(used[list(SHORT)].pformat(max_lines=-1, max_width=-1)))
+    for row in used:
+        if row["remark"]:
+            click.echo(f"{row['file']}: {row['remark']}")
+    for name, reason in sequence.excluded:
+        click.echo(f"left out: {name}: {reason}")
+
+
+def _map(sequence: Sequence, opd: str, rule: Rule | None) -> OPDMap:
+    """The wavefront map that --opd and --opd-date ask for."""
+    is_folder = Path(opd).is_dir() and opd != "flat"
+    if opd != _MAST and not is_folder:
+        if rule is not None:
+            raise click.UsageError(f"--opd-date is for --opd FOLDER and --opd {_MAST}.")
+        return as_opd_map(opd)
+    date, rule = sequence.date, rule or "nearest"
+    if date is None:
+        raise IncompatibleSetupError(
+            "the frames have no date (DATE-BEG) to choose a wavefront map by; give the file of one "
+            "with --opd"
+        )
+    if is_folder:
+        return choose_map(opd, date, rule)
+    return load_wss_opd_by_date(date, "closest" if rule == "nearest" else rule)
+
+
+def _age(opd: OPDMap, sequence: Sequence) -> str:
+    """When a map was sensed, as an apposition."""
+    days = None if sequence.date is None else opd.days_after(sequence.date)
+    if opd.date is None or days is None:
+        return ""
+    side = "after" if days > 0 else "before"
+    return f", sensed {opd.date.isot[:16]}, {abs(days):.1f} days {side} the frames"

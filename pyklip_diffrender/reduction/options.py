@@ -1,0 +1,166 @@
+"""The options of a reduction, checked before any work."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Self
+
+from astropy import units as u
+
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.units import require_bound, to_bytes
+from pyklip_diffrender.pattern import PatternRequest, require_request
+from pyklip_diffrender.refinement import GaussNewton, to_jansky
+from pyklip_diffrender.scene.systematics import Systematics
+
+__all__ = ["ReduceOptions"]
+
+_SMALLEST = 8
+"""Side of the smallest fitted square, pixels."""
+
+
+@dataclass(frozen=True)
+class ReduceOptions:
+    """Options of `reduce`, which the command line and surveys share.
+
+    Parameters
+    ----------
+    size : int
+        Side in pixels of the square about the star that is fitted.
+    systematics : Systematics, path, "auto", "references" or "off"
+        Flat-field pattern, or a file with one (``systematics.fits``). "auto" takes that of the
+        library (see `known_systematics`), and fits the reference stars only where there is none
+        for these pixels; "references" fits them in any case and uses both. A fit that shows less
+        than half of the library's pattern is repeated without the library. Where nothing is known,
+        rolls of the same pixels share a pattern of which only the size is known. With "off" there
+        is no pattern.
+    settings : GaussNewton, optional
+        Settings of the fits; default those of `refine`.
+    threshold : float
+        S/N of a candidate.
+    wide : bool
+        Search the whole frames as well, see `wide_field`. If sources beyond the fitted pixels are
+        bright enough to be seen in these, the star is fitted once more without their light.
+    disk : bool
+        Fit extended light about the star, see `fit_disk`, and search the frames without it.
+    injections : int
+        Number of planets to add to the fitted frames, slightly brighter than the limits, to see
+        how well they are recovered; see `recover_planets`. Seven of them take as long as the
+        fit and the search, fewer where the fitted square is smaller than 80 pixels.
+    star_flux : float, str or Quantity, optional
+        Flux density of the star in the filter, from a catalogue or a model of its spectrum: Jy, or
+        an AB magnitude. Contrasts then refer to it, as spaceKLIP's do. By default the light that
+        is diffracted around the mask determines the star's flux, to 10 %, which errors of
+        contrasts include. Flux densities of planets do not depend on it. Takes a second, shorter
+        fit.
+    star_flux_error : float
+        Relative error of `star_flux`, at most 1, with that of the photometric calibration of the
+        frames.
+    device : str
+        PyTorch device of the optical model.
+    memory : float, str or Quantity, optional
+        Memory that the process may take, bytes or such as "2 GB"; see `GaussNewton`, whose value
+        it replaces.
+
+    Attributes
+    ----------
+    star_flux : float or None
+        Jy.
+    memory : float or None
+        Bytes.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For a value out of bounds, and for `wide` together with `disk`: beyond the fitted pixels a
+        disk would be taken for point sources.
+    UnitError, ShapeError, NonFiniteError
+        For a flux density, an error or a memory that is none.
+    CorruptFileError
+        For a file of `systematics` that is missing or damaged.
+
+    Examples
+    --------
+    >>> from pyklip_diffrender.reduction import ReduceOptions
+    >>> ReduceOptions(star_flux="450 mJy").star_flux
+    0.45
+    """
+
+    size: int = 80
+    systematics: PatternRequest | str | os.PathLike[str] = "auto"
+    settings: GaussNewton | None = None
+    threshold: float = 5.0
+    wide: bool = False
+    disk: bool = False
+    injections: int = 0
+    star_flux: float | str | u.Quantity | None = None
+    star_flux_error: float = 0.05
+    device: str = "cpu"
+    memory: float | str | u.Quantity | None = None
+
+    def __post_init__(self) -> None:
+        _require_whole(self.size, "size", _SMALLEST)
+        _require_whole(self.injections, "injections", 0)
+        require_bound(self.threshold, "threshold", "positive")
+        require_bound(self.star_flux_error, "star_flux_error", "positive")
+        if self.star_flux_error > 1:
+            raise IncompatibleSetupError(
+                f"star_flux_error: got {self.star_flux_error:g}, expected a relative error of at "
+                f"most 1; {self.star_flux_error:g} % are {self.star_flux_error / 100:g}"
+            )
+        if self.wide and self.disk:
+            raise IncompatibleSetupError(
+                "wide, disk: got both, expected one of them: beyond the fitted pixels a disk would "
+                "be taken for point sources. Reduce the frames twice"
+            )
+        if self.star_flux is not None:
+            object.__setattr__(self, "star_flux", to_jansky(self.star_flux))
+        if self.memory is not None:
+            object.__setattr__(self, "memory", to_bytes(self.memory, "memory"))
+        object.__setattr__(self, "systematics", _pattern(self.systematics))
+
+    @classmethod
+    def from_keywords(cls, keywords: Mapping[str, Any]) -> Self:
+        """Make options from keywords of `reduce`.
+
+        Raises
+        ------
+        TypeError
+            For a keyword that is no option, with the nearest that is one.
+        """
+        known = [each.name for each in fields(cls)]
+        for name in keywords:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                hint = f". Did you mean {near[0]!r}?" if near else ""
+                raise TypeError(
+                    f"reduce() got an unexpected keyword argument {name!r}, expected some of "
+                    f"{', '.join(known)}{hint}"
+                )
+        return cls(**keywords)
+
+
+def _require_whole(value: Any, name: str, least: int) -> None:
+    if isinstance(value, bool) or value != int(value) or value < least:
+        raise IncompatibleSetupError(
+            f"{name}: got {value!r}, expected a whole number of at least {least}"
+        )
+
+
+def _pattern(systematics: Any) -> PatternRequest:
+    """Read the pattern of a file; everything else is a request already."""
+    is_path = isinstance(systematics, str | os.PathLike)
+    if is_path and systematics not in ("auto", "references", "off"):
+        if not Path(systematics).is_file():
+            raise IncompatibleSetupError(
+                f"systematics: got {os.fspath(systematics)!r}, expected 'auto', 'references', "
+                "'off' or a systematics.fits that exists"
+            )
+        return Systematics.read(systematics)
+    require_request(systematics)
+    request: PatternRequest = systematics
+    return request

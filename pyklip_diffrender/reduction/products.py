@@ -1,0 +1,146 @@
+"""The files that a reduction writes."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+
+from astropy.table import QTable
+
+from pyklip_diffrender import drawing
+from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.reduction.injections import injections_section
+from pyklip_diffrender.reduction.page import page
+from pyklip_diffrender.reduction.pictures import (
+    MOST_FRAMES,
+    disk_pictures,
+    search_pictures,
+    star_pictures,
+    wavefront_pictures,
+    wide_pictures,
+)
+from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.summary import summarise
+
+__all__ = ["PRODUCTS", "existing_products", "write_products", "write_report"]
+
+_log = logging.getLogger(__name__)
+
+PRODUCTS = {
+    "report.html": "this page",
+    "summary.json": "the content of this page, for programs",
+    "detection.png": "the S/N map and the contrast curve",
+    "detection.fits": "maps, star-subtracted frames and candidates, for Detection.read",
+    "candidates.ecsv": "the candidates with all columns",
+    "contrast.ecsv": "the contrast curve",
+    "astrometry.csv": "epoch and positions of the candidates, for orbitize!",
+    "wide_field.fits": "maps of the whole frames",
+    "wide_field_candidates.ecsv": "candidates in the whole frames",
+    "wide_field_contrast.ecsv": "contrast curve to the edge of the frames",
+    "disk.fits": "the extended light: frames without the star, and its sources",
+    "injections.ecsv": "injected planets, and what was measured of them",
+    "fit.fits": "the fit, for Refinement.read",
+    "systematics.fits": "the flat-field pattern, for other reductions",
+}
+"""Every file that a reduction may write, with its content."""
+
+
+def existing_products(folder: Path) -> list[Path]:
+    """Files in a folder that are called like products of a reduction."""
+    return [folder / name for name in PRODUCTS if (folder / name).exists()]
+
+
+def write_products(
+    reduction: Reduction, folder: Path, *, fit: bool = True, derivatives: bool = False
+) -> list[Path]:
+    """Write the products of a reduction; see `Reduction.write`.
+
+    Parameters
+    ----------
+    reduction : Reduction
+    folder : Path
+        Made if it does not exist. Afterwards it has no products of an earlier reduction.
+    fit : bool
+        Write ``fit.fits``.
+    derivatives : bool
+        Write the derivatives of the fit with it.
+
+    Returns
+    -------
+    list of Path
+    """
+    written = reduction.detection.write(folder)
+    if fit:
+        # The fit that was searched: with the candidates in the model, if the star was fitted again.
+        searched = reduction.detection.fits[0]
+        written.append(searched.write(folder / "fit.fits", linear=derivatives))
+    if reduction.wide is not None:
+        written += reduction.wide.write(folder)
+    if reduction.disk is not None:
+        written.append(reduction.disk.write(folder))
+    if reduction.systematics is not None:
+        written.append(reduction.systematics.write(folder / "systematics.fits"))
+    if reduction.injections is not None:
+        written.append(folder / "injections.ecsv")
+        with replacing(written[-1]) as temporary:
+            reduction.injections.write(temporary, format="ascii.ecsv", overwrite=True)
+    figure, axes = drawing.new_figure(1, 2)
+    reduction.detection.plot(axes)
+    written.append(folder / "detection.png")
+    drawing.save(figure, written[-1])
+    written += write_report(reduction, folder, written)
+    for path in set(existing_products(folder)) - set(written):
+        path.unlink()
+    return written
+
+
+def write_report(reduction: Reduction, folder: Path, files: Iterable[Path] = ()) -> list[Path]:
+    """Write ``report.html``, one page that needs no other file, and ``summary.json``.
+
+    Parameters
+    ----------
+    reduction : Reduction
+    folder : Path
+        Made if it does not exist. Files of these names are replaced.
+    files : iterable of path
+        Other products, which the page lists.
+
+    Returns
+    -------
+    list of Path
+    """
+    html, data = (folder / name for name in ("report.html", "summary.json"))
+    klip = _klip_curve(reduction)
+    summary = summarise(reduction, klip)
+    frames = range(min(len(reduction.detection.fits[0].frames), MOST_FRAMES))
+    text = page(
+        summary,
+        search_pictures(reduction, summary, klip),
+        [star_pictures(reduction, frame) for frame in frames],
+        wavefront_pictures(reduction, summary),
+        [] if reduction.wide is None else wide_pictures(reduction.wide),
+        [] if reduction.disk is None else disk_pictures(reduction.disk),
+        {path.name: PRODUCTS.get(path.name, "") for path in (*files, html, data)},
+        "" if reduction.injections is None else injections_section(summary, reduction.injections),
+    )
+    written = {html: text, data: json.dumps(summary, indent=2, allow_nan=False) + "\n"}
+    for path, content in written.items():
+        with replacing(path) as temporary:
+            temporary.write_text(content, encoding="utf-8")
+    return list(written)
+
+
+def _klip_curve(reduction: Reduction) -> QTable | None:
+    """KLIP's contrast curve; None where KLIP has no references or fails."""
+    if not reduction.sequence.references and len(reduction.sequence.science) < 2:
+        return None
+    try:
+        # pyKLIP is loaded only if it is needed.
+        from pyklip_diffrender.pyklip_backend.klip import klip_curve
+
+        return klip_curve(reduction.detection, reduction.sequence.references)
+    except Exception as error:  # An addition to the report, which is complete without it.
+        _log.warning("the report has no contrast curve of KLIP: %s", error)
+        return None

@@ -1,0 +1,159 @@
+"""The result of a reduction."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from astropy.table import QTable
+
+from pyklip_diffrender.detection import Detection, Disk, WideField
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.refinement import Refinement
+from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.systematics import Systematics
+
+__all__ = ["Reduction"]
+
+_SEVERAL = 3
+"""Number of candidates from which extended light is more likely than planets."""
+
+_LARGE = 4.0
+"""Chi-squared per pixel above which more is missing than what real frames leave where the pattern
+of the flat field is known: at most 1.6 for stars without a disk, 5 to 32 for AU Mic."""
+
+_HOPELESS = 100.0
+"""Chi-squared per pixel that no disk explains: the star is misplaced, or the set-up is wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """Result of `reduce`.
+
+    Attributes
+    ----------
+    sequence : Sequence
+        The frames, cut to the fitted pixels.
+    fit : Refinement
+        All frames of the target, fitted together; without the light of a disk, if that was fitted.
+    detection : Detection
+    references : tuple of Refinement
+        One for each reference star that was fitted.
+    systematics : Systematics or None
+        The flat-field pattern that was used.
+    failed : tuple of (str, str)
+        Reference stars that could not be fitted, and why.
+    wide : WideField or None
+        The search of the whole frames, if it was asked for.
+    disk : Disk or None
+        Extended light about the star, if it was asked for.
+    injections : QTable or None
+        Measurements of injected planets, see `recover_planets`, if they were asked for.
+
+    Examples
+    --------
+    With frames and wavefront maps in folders, which the package does not contain:
+
+    >>> import pyklip_diffrender as dr
+    >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
+    >>> print(result.detection.table["separation", "contrast", "snr"])  # doctest: +SKIP
+    >>> result.write("products")  # doctest: +SKIP
+    """
+
+    sequence: Sequence
+    fit: Refinement
+    detection: Detection
+    references: tuple[Refinement, ...] = ()
+    systematics: Systematics | None = None
+    failed: tuple[tuple[str, str], ...] = ()
+    wide: WideField | None = None
+    disk: Disk | None = None
+    injections: QTable | None = None
+
+    @property
+    def remark(self) -> str:
+        """What to do about a poor fit, or about extended light; else empty."""
+        if self.fit.chi2_per_pixel > _HOPELESS:
+            return (
+                "The residual is so far above the noise that something basic is wrong: check that "
+                "the star is behind the mask where the header says, that filter and mask are those "
+                "of the header, that no frame is damaged, and the unit of the wavefront map."
+            )
+        if self.disk is not None:
+            return ""
+        if len(self.detection.table) >= _SEVERAL:
+            reason = (
+                "Several candidates about one star are more often parts of a disk, or residuals of "
+                "the star, than planets"
+            )
+        elif self.systematics is not None and self.fit.chi2_per_pixel > _LARGE:
+            reason = "The residual is far above the noise, as it is where the star has a disk"
+        else:
+            return ""
+        return f"{reason}: repeat the reduction with disk=True (--disk on the command line)."
+
+    def __repr__(self) -> str:
+        return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"
+
+    def __str__(self) -> str:
+        known = "none" if self.systematics is None else f"from {self.systematics.name}"
+        search = self.detection if self.wide is None else self.wide
+        return (
+            f"{self.sequence!r}\n{self.fit.status.message}\n"
+            f"flat-field pattern: {known}\n{search}\n{self.remark}"
+        ).rstrip()
+
+    def _repr_html_(self) -> str:
+        facts = {
+            "Status": self.fit.status.message,
+            "Frames": f"{len(self.sequence.science)} of the target, "
+            f"{len(self.sequence.references)} of reference stars",
+            "Filter": self.sequence.filter,
+            "Flat-field pattern": "none" if self.systematics is None else self.systematics.name,
+        }
+        if self.remark:
+            facts["Remark"] = self.remark
+        head = html_summary(f"Reduction of {self.sequence.target}", facts)
+        return f"{head}\n{self.detection._repr_html_()}"
+
+    def write(
+        self, folder: str | os.PathLike[str], *, overwrite: bool = False, derivatives: bool = False
+    ) -> list[Path]:
+        """Write maps, tables, the fit, the flat-field pattern, figures and a report.
+
+        Parameters
+        ----------
+        folder : path
+            Made if it does not exist.
+        overwrite : bool
+            Replace the products of an earlier reduction, and remove those that this one does not
+            have.
+        derivatives : bool
+            Keep the derivatives of the images in ``fit.fits``, which then takes ten times the
+            space: they are needed to search the fit again (`detect`), and to measure at other
+            places (`Detection.read(...).measure`).
+
+        Returns
+        -------
+        list of Path
+            The files that were written.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If there are products in the folder, and `overwrite` is False.
+        """
+        # The one import against the order of the modules: the products know this class.
+        from pyklip_diffrender.reduction.products import existing_products, write_products
+
+        folder = Path(folder)
+        existing = existing_products(folder)
+        if existing and not overwrite:
+            raise IncompatibleSetupError(
+                f"{folder}: got a folder with {', '.join(each.name for each in existing)}, "
+                "expected one without products. Choose another, or replace them with "
+                "overwrite=True"
+            )
+        return write_products(self, folder, derivatives=derivatives)
