@@ -172,6 +172,10 @@ def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation])
             continue
         source = folder.sources[name]
         used[source] += 1
+        if name in folder.other:
+            if each.reference or len(sequence.science) > 1:
+                faults.append(f"{name} is used beside others")
+            continue
         if name in folder.scaled:
             # A factor of two is seen only beside other frames of the star.
             if sum(other.target == each.target for other in _all(sequence)) > 1:
@@ -181,8 +185,9 @@ def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation])
         faults += [f"{name}: {fault}" for fault in _differences(each, twin[source], several)]
     faults += [f"{source} is used {n} times" for source, n in used.items() if n > 1]
     reasons = dict(sequence.excluded)
+    lone = any(_source(each.name) in folder.other for each in sequence.science)
     for name, source in folder.sources.items():
-        untouched = name not in folder.bad | folder.doubtful
+        untouched = not lone and name not in folder.bad | folder.doubtful
         if untouched and name == source and not used[source]:
             faults.append(f"{name} is not used: {reasons.get(name)}")
         if name not in reasons and name not in {_source(e.name) for e in _all(sequence)}:

@@ -35,6 +35,8 @@ class Folder:
         Files that may be used if the result is that of the unmutated file, or excluded.
     scaled : set of str
         Files whose unit is wrong by so little that only other frames of the star show it.
+    other : set of str
+        Files that belong to another set-up or epoch: wrong beside others, right alone.
     done : list of str
         What was done.
     """
@@ -44,6 +46,7 @@ class Folder:
     bad: set[str] = field(default_factory=set)
     doubtful: set[str] = field(default_factory=set)
     scaled: set[str] = field(default_factory=set)
+    other: set[str] = field(default_factory=set)
     done: list[str] = field(default_factory=list)
 
     def change(self, name: str, change: Change, rng: np.random.Generator) -> None:
@@ -185,13 +188,26 @@ def _cards(**cards: Any) -> Mutation:
 MUTATIONS["target acquisition"] = _cards(EXP_TYPE="NRC_TACQ")
 MUTATIONS["confirmation image"] = _cards(EXP_TYPE="NRC_TACONFIRM")
 MUTATIONS["background"] = _cards(BKGDTARG=True)
-MUTATIONS["another mask"] = _cards(
+
+
+def _other_cards(**cards: Any) -> Mutation:
+    """Cards of another set-up or epoch."""
+
+    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
+        folder.change(name, lambda hdus, _: _set(hdus, **cards), rng)
+        folder.doubtful.add(name)
+        folder.other.add(name)
+
+    return mutate
+
+
+MUTATIONS["another mask"] = _other_cards(
     CORONMSK="MASKA430R", SUBARRAY="SUB320A430R", APERNAME="NRCA5_MASK430R"
 )
-MUTATIONS["another detector"] = _cards(DETECTOR="NRCBLONG", MODULE="B")
-MUTATIONS["another stop"] = _cards(PUPIL="MASKBAR")
+MUTATIONS["another detector"] = _other_cards(DETECTOR="NRCBLONG", MODULE="B")
+MUTATIONS["another stop"] = _other_cards(PUPIL="MASKBAR")
 MUTATIONS["another filter"] = _cards(FILTER="F356W")
-MUTATIONS["another unit"] = _cards(BUNIT="DN/s")
+MUTATIONS["another unit"] = _other_cards(BUNIT="DN/s")
 MUTATIONS["no unit"] = _cards(BUNIT=None)
 MUTATIONS["an unknown unit"] = _cards(BUNIT="parsnips")
 MUTATIONS["no pixel area"] = _cards(PIXAR_A2=None)
@@ -199,7 +215,7 @@ MUTATIONS["a negative pixel area"] = _cards(PIXAR_A2=-0.0039)
 MUTATIONS["XOFFSET in mas"] = _cards(XOFFSET=20.0, YOFFSET=-10.0)
 MUTATIONS["contradicting masks"] = _cards(CORONMSK="MASKA430R")
 MUTATIONS["text for a number"] = _cards(ROLL_REF="seventy")
-MUTATIONS["another epoch"] = _cards(
+MUTATIONS["another epoch"] = _other_cards(
     DATE_BEG="2023-12-01T06:00:00", DATE_OBS="2023-12-01", EXPMID=60279.3, EXPSTART=60279.25
 )
 
