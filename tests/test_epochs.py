@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
-from calints_files import calints
 
+from benchmarks.calints_files import calints
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.report import compare_epochs, write_epochs
 

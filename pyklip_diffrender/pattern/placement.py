@@ -15,7 +15,7 @@ from scipy.ndimage import fourier_shift
 
 from pyklip_diffrender.pattern.measure import measure_patterns
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.scene.detector_pixels import shift_frames
+from pyklip_diffrender.scene.detector_pixels import shift_frames, shift_variances
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 
@@ -88,9 +88,7 @@ def place_on_detector(fit: Refinement, pattern: Systematics) -> Observation | No
     # Masked pixels are filled in, because empty ones would ring into their neighbours.
     valid = observation.valid
     data = shift_frames(np.where(valid, observation.data, frame.star), shift)
-    typical = np.median(observation.error[valid])
-    error = shift_frames(np.where(valid, observation.error, typical), shift)
-    valid = valid & (error > 0)
+    error = np.sqrt(shift_variances(observation.error, valid, shift))
     return replace(
         observation,
         data=np.where(valid, data, 0.0),

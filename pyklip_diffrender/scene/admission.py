@@ -26,13 +26,19 @@ from pyklip_diffrender.scene.exposure import Exposure, Star
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
 from pyklip_diffrender.scene.noise import why_odd_noise
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.pixel_checks import copies, why_no_star, why_other_brightness
+from pyklip_diffrender.scene.pixel_checks import (
+    copies,
+    why_no_star,
+    why_odd_unit,
+    why_other_brightness,
+)
 
 __all__ = [
     "EPOCH",
     "Candidate",
     "choose_filter",
     "choose_target",
+    "compare_brightness",
     "epochs_of",
     "exclude_copies",
     "exclude_other_setups",
@@ -98,7 +104,7 @@ class Candidate:
         try:
             return Observation.from_fits(self.path)
         except DiffrenderError as error:
-            self.reason = str(error)
+            self.reason = str(error).removeprefix(f"{self.name}: ")
             return None
 
 
@@ -291,6 +297,8 @@ def choose_target(
             star: frames for star, frames in stars.items()
             if not all(each.exposure.reference for each in frames)
         }  # fmt: skip
+        if not free:
+            _require_no_lost_target(candidates, stars)
         names = [each.star for frames in (free or stars).values() for each in frames]
         chosen = _the_only("target", None, names)
     else:
@@ -316,6 +324,24 @@ def choose_target(
                 "TARG_DEC, or IS_PSF for a reference star"
             )
     return stars[chosen], left(references)
+
+
+def _require_no_lost_target(
+    candidates: Sequence[Candidate], stars: Mapping[str, Sequence[Candidate]]
+) -> None:
+    """Refuse to take a reference star for the target because the target's frames are excluded."""
+    marked = [each.exposure.star for frames in stars.values() for each in frames]
+    lost = [
+        each for each in candidates
+        if each.reason and each.exposure.star.is_known and not each.exposure.reference
+        and not any(each.exposure.star.is_same(star) for star in marked)
+    ]  # fmt: skip
+    if lost:
+        reasons = "; ".join(f"{each.name}: {each.reason}" for each in lost)
+        raise NoValidPixelsError(
+            f"only frames that are marked as references (IS_PSF) can be used, of "
+            f"{', '.join(stars)}. Name one of them as the target, or correct the others: {reasons}"
+        )
 
 
 def _by_star(candidates: Sequence[Candidate]) -> dict[str, list[Candidate]]:
@@ -404,25 +430,35 @@ def exclude_unoriented(science: Sequence[Candidate]) -> None:
             )
 
 
-def judge_frames(candidates: Sequence[Candidate], frames: Mapping[int, Observation | None]) -> None:
-    """Exclude frames of a star whose pixels cannot be those of the star behind the mask.
+def judge_frames(candidates: Iterable[Candidate], frames: Mapping[int, Observation | None]) -> None:
+    """Exclude frames whose pixels cannot be those of a star behind the mask.
 
     Parameters
     ----------
-    candidates : sequence of Candidate
-        Of one star.
+    candidates : iterable of Candidate
     frames : mapping of int to Observation
         By the `id` of the candidate.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If frames differ in brightness, and there are no others to say which are right.
     """
     for each in candidates:
         observation = frames[id(each)]
         if observation is not None:
-            each.reason = why_odd_noise(observation.noise_ratios) or why_no_star(observation)
+            each.reason = (
+                why_odd_noise(observation.noise_ratios)
+                or why_odd_unit(observation)
+                or why_no_star(observation)
+            )
+
+
+def compare_brightness(
+    candidates: Iterable[Candidate], frames: Mapping[int, Observation | None]
+) -> None:
+    """Exclude frames that are much brighter or fainter than the others of their star.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If half of the frames or more are, and nothing says which are right.
+    """
     usable = left(candidates)
     odd = why_other_brightness([_known(frames[id(each)]) for each in usable])
     if 2 * len(odd) >= len(usable) and odd and not usable[0].exposure.reference:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import warnings
 from pathlib import Path
@@ -26,6 +27,9 @@ from pyklip_diffrender.scene.detector_pixels import (
     undo_shifts,
 )
 from pyklip_diffrender.scene.exposure import beginning, position_angle
+from pyklip_diffrender.scene.star_place import measured_offset
+
+_log = logging.getLogger(__name__)
 
 __all__ = ["BAD_PIXEL_BITS", "BEHIND_THE_MASK", "dither", "on_detector_pixels", "read_calints"]
 
@@ -36,6 +40,10 @@ may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
 
 BEHIND_THE_MASK = 0.1
 """Largest dither, arcsec, that leaves a star behind the mask; small-grid dithers are of 0.02."""
+
+_MISPLACED = 1.2
+"""Pixels of a star from its stated position beyond which that is wrong: it is measured to half a
+pixel, and stars are a few tenths of a pixel from the mask."""
 
 _CROPPED = 32
 """Whole pixels beyond which frames were cropped, and not only aligned."""
@@ -105,7 +113,7 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
             arguments["star_offset"] = offset
             if arguments["center"] is not None:
                 arguments["center"] += np.divide(offset, arguments["pixelscale"])
-    if shifts is None and not moved:
+    if shifts is None and not moved and data.ndim > 1:  # Other shapes are refused with the frames.
         ny, nx = data.shape[-2:]
         star = arguments["center"]
         if star is None:
@@ -215,6 +223,18 @@ def on_detector_pixels(
     good &= np.roll(usable, (up, right), axis=(1, 2))
     column, row = (int(each) for each in begin - pixels)
     sure = mask is not None and on_detector((column, row), data.shape[1:])
+    if sure:
+        # The whole pixels of the place are those of the star's stated position.
+        frame = shifted[0], sigma[0], good[0]
+        scale = float(np.mean(arguments["pixelscale"]))
+        away = measured_offset(*frame, (center + pixels - net)[0], scale)
+        if away is not None and np.abs(away).max() > _MISPLACED:
+            _log.warning(
+                "%s: the star is %.1f, %.1f pixels (x, y) from its stated position, so that the "
+                "place of the frames on the detector is not known",
+                name, *away,
+            )  # fmt: skip
+            sure = False
     return {
         "data": np.where(good, shifted, 0.0),
         "error": np.where(good, sigma, 1.0),

@@ -10,20 +10,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from astropy import units as u
 from numpy.typing import NDArray
 from scipy.ndimage import convolve
+from scipy.stats import median_abs_deviation
 
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.star_place import center_of_symmetry, stamp_about
 
-__all__ = ["brightness", "copies", "why_no_star", "why_other_brightness"]
+__all__ = ["brightness", "copies", "why_no_star", "why_odd_unit", "why_other_brightness"]
 
 Image = NDArray[np.float64]
-
-_FIELD = 2.5
-"""Radius, arcsec, of the square in which the star is looked for."""
-
-_LEAST_FIELD = 1.2
-"""Radius below which a frame is too small to judge."""
 
 _CORE = 1.0
 """Radius, arcsec, in which the light of a star behind a mask is summed."""
@@ -50,14 +47,17 @@ _ENOUGH = 2000
 _FAR = 3.0
 """arcsec from the star beyond which pixels show mostly noise."""
 
+_SCATTER = (1e-3, 20.0)
+"""Plausible scatter far from the star, MJy/sr, for exposures of a second to a day."""
+
 _NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
 
 
 def why_no_star(observation: Observation) -> str:
     """Why these cannot be frames of a star behind the mask; empty if they can.
 
-    The diffraction pattern of a star is nearly symmetric about the star. The centre of symmetry is
-    where the convolution of the image with itself is largest.
+    The diffraction pattern of a star is nearly symmetric about the star, see
+    `pyklip_diffrender.scene.star_place.center_of_symmetry`.
 
     Parameters
     ----------
@@ -82,12 +82,7 @@ def why_no_star(observation: Observation) -> str:
             f"the light around the star's position is as much negative as positive ({share:.0%} "
             "remain): the star was subtracted. Use frames before the subtraction (calints)"
         )
-    # Zeros around the stamp, so that the convolution is not periodic.
-    size = 2 * len(image)
-    transform = np.fft.rfft2(np.where(light > 0, light, 0.0), (size, size))
-    own = np.fft.irfft2(transform**2, (size, size))
-    row, column = np.unravel_index(int(own.argmax()), own.shape)
-    away = np.array([column, row]) / 2 - len(image) // 2
+    away = center_of_symmetry(light)
     x, y = away * observation.pixelscale
     if np.hypot(x, y) > _BEHIND:
         return (
@@ -135,6 +130,28 @@ def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
     return reasons
 
 
+def why_odd_unit(observation: Observation) -> str:
+    """Why frames cannot be in the unit that they state; empty if they can.
+
+    Parameters
+    ----------
+    observation : Observation
+        Only frames in MJy/sr with 2000 pixels far from the star are judged.
+    """
+    difference, usable = _noise(observation, clipped=False)
+    if usable.sum() < _ENOUGH or observation.unit != u.MJy / u.sr:
+        return ""
+    # A pixel less the mean of four.
+    scatter = float(median_abs_deviation(difference[usable], scale="normal")) / 1.25**0.5
+    low, high = _SCATTER
+    if low < scatter < high:
+        return ""
+    return (
+        f"far from the star its pixels scatter by {scatter:.2g} MJy/sr, expected {low:g} to "
+        f"{high:g}. BUNIT is probably wrong, or the pixels were multiplied by a factor"
+    )
+
+
 def copies(observations: Sequence[Observation]) -> dict[int, int]:
     """Find observations that show the same pixels as an earlier one, whatever their headers say.
 
@@ -170,24 +187,12 @@ def _mean(observation: Observation) -> tuple[Image, Image, NDArray[np.bool_]]:
 def _stamp(observation: Observation) -> tuple[Image, Image, Image] | None:
     """Image about the star, distances from it (arcsec), and noise; None for small frames."""
     data, error, valid = _mean(observation)
-    scale = float(np.mean(observation.pixelscale))
-    x, y = np.round(observation.center.mean(axis=0)).astype(int)
-    ny, nx = data.shape
-    room = min(x, y, nx - 1 - x, ny - 1 - y)
-    reach = min(int(_FIELD / scale), room)
-    if reach * scale < _LEAST_FIELD:
-        return None
-    window = np.s_[y - reach : y + reach + 1, x - reach : x + reach + 1]
-    rows, columns = np.indices((2 * reach + 1, 2 * reach + 1)) - reach
-    distance = np.hypot(rows, columns) * scale
-    y0, x0 = np.indices(data.shape)
-    outside = valid & (np.hypot(x0 - x, y0 - y) * scale > _FAR)
-    sky = data[outside] if outside.sum() > _ENOUGH else np.sort(data[valid])[: valid.sum() // 5 + 1]
-    image = np.where(valid[window], data[window] - float(np.median(sky)), 0.0)
-    return image, distance, error[window]
+    return stamp_about(
+        data, error, valid, observation.center.mean(axis=0), float(np.mean(observation.pixelscale))
+    )
 
 
-def _noise(observation: Observation) -> tuple[Image, NDArray[np.bool_]]:
+def _noise(observation: Observation, *, clipped: bool = True) -> tuple[Image, NDArray[np.bool_]]:
     """Differences from neighbouring pixels, clipped, and which of them are far from the star."""
     data, _, valid = _mean(observation)
     difference = data - convolve(data, _NEIGHBOURS, mode="nearest")
@@ -196,6 +201,6 @@ def _noise(observation: Observation) -> tuple[Image, NDArray[np.bool_]]:
     far = np.hypot(columns - x, rows - y) * float(np.mean(observation.pixelscale)) > _FAR
     usable = valid & far
     typical = float(np.median(np.abs(difference[usable]))) if usable.any() else 0.0
-    if typical > 0:
+    if typical > 0 and clipped:
         difference = np.clip(difference / typical, -6, 6)
     return difference, usable

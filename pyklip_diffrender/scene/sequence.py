@@ -18,6 +18,7 @@ from pyklip_diffrender.scene.admission import (
     Candidate,
     choose_filter,
     choose_target,
+    compare_brightness,
     epochs_of,
     exclude_copies,
     exclude_other_setups,
@@ -185,9 +186,11 @@ class Sequence:
         frames = {
             id(each): each.read() for each in (*science, *references) if not each.reason
         }  # fmt: skip
+        together = [*science, *references]
+        judge_frames([each for each in together if not each.reason], frames)
+        exclude_copies(together, frames)
         for group in (science, *_by_star(references)):
-            judge_frames([each for each in group if not each.reason], frames)
-        exclude_copies([*science, *references], frames)
+            compare_brightness(group, frames)
         exclude_unoriented(science)
         if all(each.reason for each in science):
             reasons = "; ".join(f"{each.name}: {each.reason}" for each in science)

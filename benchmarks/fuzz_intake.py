@@ -1,0 +1,278 @@
+"""Folders as people have them: every frame is used rightly, excluded with a reason, or refused.
+
+    python -m benchmarks.fuzz_intake --count 500 --output intake.jsonl
+    python -m benchmarks.fuzz_intake --count 20 --fits 5 --frames calints --output fits.jsonl
+
+Each folder has two rolls of a target and a reference star, of real frames if a folder of them is
+given and simulated ones else, and one to three random mutations. What must become of it is known
+from the untouched folder: the frames that are admitted must be the same, used once, as the same
+star, with the same roll, epoch, brightness and place on the detector. With ``--fits``, some of the
+folders are fitted as well and the limits compared. A run that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import shutil
+import tempfile
+import warnings
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+
+import pyklip_diffrender as dr
+from benchmarks.calints_files import calints, starlight
+from benchmarks.intake_mutations import MUTATIONS, Folder
+from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.scene.observation import Observation
+
+__all__ = ["check", "make_frames", "run"]
+
+_CYCLES, _SIZE = 6, 40
+
+_SAME_LIMIT = 1.25
+"""Ratio of limits of a fit and of the untouched fit: fewer frames of the target are allowed for."""
+
+
+def make_frames(folder: Path, real: Path | None = None) -> Path:
+    """Copy or simulate the untouched frames: two rolls of the target and a reference star."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if real is None:
+        name = "jw0118400{}001_03106_00001_nrcalong_calints.fits"
+        for k, roll in ((1, 70.0), (2, 80.0)):
+            calints(folder / name.format(k), observation=k, roll=roll,
+                    date=f"2022-10-03T0{3 * k}:00:00")  # fmt: skip
+        calints(folder / name.format(3), "HD 2", observation=3, roll=20.0, cards={"IS_PSF": True},
+                date="2022-10-03T12:00:00", light=0.3 * starlight())  # fmt: skip
+        return folder
+    # G 7-34 with both rolls, and a roll of HIP 17695 to sort after them.
+    for path in sorted(real.glob("*_03106_*calints.fits*")):
+        observation = path.name[7:10]
+        if observation not in ("003", "005", "006"):
+            continue
+        with fits.open(path) as hdus:
+            hdus[0].header["IS_PSF"] = observation == "003"
+            name = path.name.removesuffix(".gz")
+            if observation == "003":
+                name = f"z{name}"
+            hdus.writeto(folder / name, overwrite=True)
+    return folder
+
+
+def _sequence(folder: Path) -> dr.Sequence:
+    return dr.Sequence.from_files(folder, filter="F444W")
+
+
+def run(
+    frames: Path, seeds: Iterable[int], output: Path | None = None, fitted: int = 0
+) -> list[dict[str, Any]]:
+    """Check the folders of several seeds; returns one record for each.
+
+    Parameters
+    ----------
+    frames : path
+        Untouched frames, see `make_frames`.
+    seeds : iterable of int
+    output : path, optional
+        JSON lines; seeds that are there are not repeated.
+    fitted : int
+        Number of folders to fit.
+    """
+    twin = {_source(each.name): each for each in _all(_sequence(frames))}
+    before = _fit(_sequence(frames)) if fitted else None
+    records: list[dict[str, Any]] = []
+    if output is not None and output.exists():
+        records = [json.loads(line) for line in output.read_text(encoding="utf-8").splitlines()]
+    known = {record["seed"] for record in records}
+    for seed in seeds:
+        if seed in known:
+            continue
+        record = check(frames, twin, seed, before if fitted > 0 else None)
+        fitted -= "limits" in record
+        records.append(record)
+        if output is not None:
+            with output.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(record) + "\n")
+    return records
+
+
+def check(
+    frames: Path,
+    twin: dict[str, Observation],
+    seed: int,
+    before: np.ndarray | None = None,
+) -> dict[str, Any]:
+    """Make the folder of a seed, admit its files, and compare them with the untouched ones."""
+    rng = np.random.default_rng(seed)
+    with tempfile.TemporaryDirectory() as place:
+        folder = _mutated(frames, Path(place) / "frames", seed, rng)
+        record: dict[str, Any] = {"seed": seed, "mutations": folder.done}
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                sequence = _sequence(folder.path)
+        except DiffrenderError as error:
+            return record | {"outcome": "refused", "message": str(error)}
+        except Exception as error:
+            return record | {"outcome": "crash", "message": repr(error)}
+        faults = _faults(sequence, folder, twin)
+        if faults:
+            return record | {"outcome": "wrong", "message": "; ".join(faults)}
+        record["outcome"] = "excluded" if sequence.excluded else "as untouched"
+        record["message"] = "; ".join(f"{name}: {reason}" for name, reason in sequence.excluded)
+        if before is not None:
+            limits = _fit(sequence)
+            record["limits"] = (limits / before).tolist()
+            missing = 2 - len(sequence.science)
+            worst = np.abs(np.log(limits / before)).max()
+            if worst > np.log(_SAME_LIMIT) + missing * np.log(2.0):
+                record["outcome"] = "wrong"
+        return record
+
+
+def _mutated(frames: Path, place: Path, seed: int, rng: np.random.Generator) -> Folder:
+    shutil.copytree(frames, place)
+    folder = Folder(place, {path.name: path.name for path in sorted(place.glob("*.fits"))})
+    names = list(folder.sources)
+    rng.shuffle(names)
+    kinds = sorted(MUTATIONS)
+    # Every kind once before any comes again.
+    first = kinds[seed % len(kinds)]
+    others = rng.choice(kinds, size=int(rng.integers(0, 3)), replace=False)
+    for kind, name in zip([first, *others], names, strict=False):
+        if (place / name).exists() and name not in folder.bad | folder.doubtful:
+            MUTATIONS[str(kind)](folder, name, rng)
+            folder.done.append(str(kind))
+    return folder
+
+
+def _source(name: str) -> str:
+    return name.partition(" (pointing")[0]
+
+
+def _all(sequence: dr.Sequence) -> list[Observation]:
+    return [*sequence.science, *sequence.references]
+
+
+def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation]) -> list[str]:
+    """What is wrong with an admitted sequence."""
+    faults = []
+    used: Counter[str] = Counter()
+    for each in _all(sequence):
+        name = _source(each.name)
+        if name in folder.bad:
+            faults.append(f"{name} is used")
+            continue
+        source = folder.sources[name]
+        used[source] += 1
+        if name in folder.scaled:
+            # A factor of two is seen only beside other frames of the star.
+            if sum(other.target == each.target for other in _all(sequence)) > 1:
+                faults.append(f"{name} is used")
+            continue
+        several = len(sequence.science) > 1
+        faults += [f"{name}: {fault}" for fault in _differences(each, twin[source], several)]
+    faults += [f"{source} is used {n} times" for source, n in used.items() if n > 1]
+    reasons = dict(sequence.excluded)
+    for name, source in folder.sources.items():
+        untouched = name not in folder.bad | folder.doubtful
+        if untouched and name == source and not used[source]:
+            faults.append(f"{name} is not used: {reasons.get(name)}")
+        if name not in reasons and name not in {_source(e.name) for e in _all(sequence)}:
+            faults.append(f"{name} is in no list")
+    return faults + [f"{name}: no reason" for name, reason in reasons.items() if not reason]
+
+
+def _differences(got: Observation, expected: Observation, several: bool) -> list[str]:
+    """In what an observation is not that of the untouched file.
+
+    The orientation and the date need not be known of one roll alone.
+    """
+    faults = []
+    if got.reference != expected.reference:
+        faults.append(f"used as {'reference' if got.reference else 'target'}")
+    for name in ("unit", "filter", "pixelscale"):
+        if getattr(got, name) != getattr(expected, name):
+            faults.append(f"{name} is {getattr(got, name)}")
+    angles = [each.position_angles for each in (got, expected)]
+    if not got.reference:
+        if angles[0] is None or angles[1] is None:
+            if several:
+                faults.append("no position angle")
+        elif abs(angles[0][0] - angles[1][0]) > 0.02:
+            faults.append(f"position angle {angles[0][0]:.2f}")
+    if got.date is None or expected.date is None:
+        if several and not got.reference:
+            faults.append("no date")
+    elif abs(got.date.mjd - expected.date.mjd) > 1:
+        faults.append(f"date {got.date}")
+    if got.first_pixel not in (None, expected.first_pixel):
+        faults.append(f"first pixel {got.first_pixel}, not {expected.first_pixel}")
+    mine, other = got.combined(), expected.combined()
+    if np.abs(mine.center - other.center).max() > 4.5:
+        faults.append(f"star at {mine.center[0]}")
+    both = mine.valid & other.valid
+    if both.mean() < 0.9 * other.valid.mean():
+        faults.append(f"only {both.mean():.0%} of the pixels")
+    if got.first_pixel is not None and got.first_pixel == expected.first_pixel:
+        # Frames whose shift is known no longer are resampled otherwise, and compared in brightness.
+        away = np.abs(mine.data - other.data)[both] / other.error[both]
+        if np.quantile(away, 0.99) > 1.0 or (away > 5).mean() > 1e-3:
+            faults.append(f"pixels differ by {np.quantile(away, 0.99):.1f} standard deviations")
+    return faults
+
+
+def _fit(sequence: dr.Sequence) -> np.ndarray:
+    """Limits at 0.5, 0.8 and 1.1 arcsec of a small fit."""
+    settings = replace(dr.GaussNewton.nircam(sequence.filter), cycles=_CYCLES)
+    alone = replace(sequence, references=())
+    reduction = dr.reduce(alone, "flat", size=_SIZE, settings=settings)
+    curve = reduction.detection.contrast_curve
+    return np.interp([0.5, 0.8, 1.1], curve["separation"].to_value("arcsec"), curve["contrast"])
+
+
+def _table(records: list[dict[str, Any]]) -> str:
+    outcomes = ("as untouched", "excluded", "refused", "wrong", "crash")
+    counts = {kind: Counter[str]() for kind in sorted(MUTATIONS)}
+    for record in records:
+        for kind in record["mutations"]:
+            counts[kind][record["outcome"]] += 1
+    lines = [f"{'mutation':62s}" + "".join(f"{each:>13s}" for each in outcomes)]
+    lines += [
+        f"{kind:62s}" + "".join(f"{count[each]:13d}" for each in outcomes)
+        for kind, count in counts.items()
+    ]
+    total = Counter(record["outcome"] for record in records)
+    lines.append(f"{f'{len(records)} folders':62s}" + "".join(f"{total[e]:13d}" for e in outcomes))
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run the checks and print how often each kind of mutation came out how."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=500)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--fits", type=int, default=0, help="folders to fit")
+    parser.add_argument("--frames", type=Path, help="folder of real frames of programme 1184")
+    parser.add_argument("--output", type=Path, help="JSON lines, from which a run goes on")
+    options = parser.parse_args()
+    logging.getLogger("pyklip_diffrender").setLevel(logging.ERROR)
+    with tempfile.TemporaryDirectory() as place:
+        frames = make_frames(Path(place) / "untouched", options.frames)
+        seeds = range(options.first, options.first + options.count)
+        records = run(frames, seeds, options.output, options.fits)
+    print(_table(records))
+    for record in records:
+        if record["outcome"] in ("wrong", "crash"):
+            print(record)
+
+
+if __name__ == "__main__":
+    main()

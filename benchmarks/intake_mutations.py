@@ -1,0 +1,415 @@
+"""What happens to files in real folders, and what must become of them.
+
+Every mutation changes a folder of frames, and says which files may no longer be used (`bad`),
+which must be used as before unless a reason is given (`doubtful`), and which are copies.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+
+__all__ = ["MUTATIONS", "Folder"]
+
+Change = Callable[[fits.HDUList, np.random.Generator], None]
+
+
+@dataclass
+class Folder:
+    """A folder with frames whose right treatment is known.
+
+    Attributes
+    ----------
+    path : Path
+    sources : dict of str to str
+        Which of the unmutated files every file is made from, by name.
+    bad : set of str
+        Files that must not be used.
+    doubtful : set of str
+        Files that may be used if the result is that of the unmutated file, or excluded.
+    scaled : set of str
+        Files whose unit is wrong by so little that only other frames of the star show it.
+    done : list of str
+        What was done.
+    """
+
+    path: Path
+    sources: dict[str, str]
+    bad: set[str] = field(default_factory=set)
+    doubtful: set[str] = field(default_factory=set)
+    scaled: set[str] = field(default_factory=set)
+    done: list[str] = field(default_factory=list)
+
+    def change(self, name: str, change: Change, rng: np.random.Generator) -> None:
+        """Edit a file in place."""
+        with fits.open(self.path / name) as hdus:
+            copy = fits.HDUList([hdu.copy() for hdu in hdus])
+        change(copy, rng)
+        copy.writeto(self.path / name, overwrite=True)
+
+    def add(self, name: str, source: str, change: Change, rng: np.random.Generator) -> None:
+        """Add a file that is made from another one."""
+        with fits.open(self.path / source) as hdus:
+            copy = fits.HDUList([hdu.copy() for hdu in hdus])
+        change(copy, rng)
+        copy.writeto(self.path / name, overwrite=True)
+        self.sources[name] = self.sources[source]
+
+
+Mutation = Callable[[Folder, str, np.random.Generator], None]
+MUTATIONS: dict[str, Mutation] = {}
+
+
+def _mutation(name: str) -> Callable[[Mutation], Mutation]:
+    def register(function: Mutation) -> Mutation:
+        MUTATIONS[name] = function
+        return function
+
+    return register
+
+
+def _card(hdus: fits.HDUList, key: str) -> fits.Header:
+    return next((h.header for h in hdus if key in h.header), hdus[0].header)
+
+
+def _set(hdus: fits.HDUList, **cards: Any) -> None:
+    for key, value in cards.items():
+        key = key.replace("_", "-") if key in ("DATE_BEG", "DATE_OBS", "TIME_OBS") else key
+        header = _card(hdus, key)
+        if value is None:
+            if key in header:
+                del header[key]
+        else:
+            header[key] = value
+
+
+def _nothing(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    del hdus, rng
+
+
+# -- copies and other products ---------------------------------------------------------------------
+
+
+def _product(level: str, change: Change) -> Mutation:
+    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
+        new = name.replace("calints", level)
+        folder.add(new, name, change, rng)
+        # One of the two is used.
+        folder.doubtful |= {new, name}
+
+    return mutate
+
+
+def _to_rate(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    del rng
+    factor = float(_card(hdus, "PHOTMJSR").get("PHOTMJSR", 2.5))
+    for key in ("SCI", "ERR"):
+        hdus[key].data = hdus[key].data / factor
+    _set(hdus, BUNIT="DN/s")
+
+
+def _to_cal(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    del rng
+    for key in ("SCI", "ERR", "DQ"):
+        hdus[key].data = hdus[key].data[0]
+
+
+MUTATIONS["crfints"] = _product("a3001_crfints", _nothing)
+MUTATIONS["rateints"] = _product("rateints", _to_rate)
+MUTATIONS["cal"] = _product("cal", _to_cal)
+
+
+def _other_product(level: str) -> Mutation:
+    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
+        new = f"jw01184-c1001_t00{rng.integers(9)}_nircam_f444w-maskrnd_{level}.fits"
+        folder.add(new, name, lambda hdus, _: _set(hdus, OBSERVTN="050", FILENAME=new), rng)
+        folder.bad.add(new)
+
+    return mutate
+
+
+for _level in ("i2d", "psfsub", "psfalign", "psfstack"):
+    MUTATIONS[_level] = _other_product(_level)
+
+
+@_mutation("gzip beside fits")
+def _packed(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    del rng
+    path = folder.path / name
+    (folder.path / f"{name}.gz").write_bytes(gzip.compress(path.read_bytes(), 1))
+    folder.sources[f"{name}.gz"] = folder.sources[name]
+    folder.doubtful |= {name, f"{name}.gz"}
+
+
+@_mutation("symlink")
+def _link(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    del rng
+    (folder.path / f"a_{name}").symlink_to(folder.path / name)
+    folder.sources[f"a_{name}"] = folder.sources[name]
+    folder.doubtful |= {name, f"a_{name}"}
+
+
+@_mutation("copy with another header")
+def _copy(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    def change(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+        factor = rng.choice([1.0, 1e-3, 2.5])
+        for key in ("SCI", "ERR"):
+            hdus[key].data = hdus[key].data * factor
+        roll = float(_card(hdus, "ROLL_REF")["ROLL_REF"])
+        _set(hdus, OBSERVTN="077", FILENAME="zcopy.fits", DATE_BEG="2022-10-03T20:00:00")
+        _set(hdus, ROLL_REF=roll + 7.0)
+
+    folder.add(f"z_{rng.integers(100)}.fits", name, change, rng)
+    folder.bad.add(next(reversed(folder.sources)))
+
+
+# -- cards -----------------------------------------------------------------------------------------
+
+
+def _cards(**cards: Any) -> Mutation:
+    """Cards that make a file unusable."""
+
+    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
+        folder.change(name, lambda hdus, _: _set(hdus, **cards), rng)
+        folder.bad.add(name)
+
+    return mutate
+
+
+MUTATIONS["target acquisition"] = _cards(EXP_TYPE="NRC_TACQ")
+MUTATIONS["confirmation image"] = _cards(EXP_TYPE="NRC_TACONFIRM")
+MUTATIONS["background"] = _cards(BKGDTARG=True)
+MUTATIONS["another mask"] = _cards(
+    CORONMSK="MASKA430R", SUBARRAY="SUB320A430R", APERNAME="NRCA5_MASK430R"
+)
+MUTATIONS["another detector"] = _cards(DETECTOR="NRCBLONG", MODULE="B")
+MUTATIONS["another stop"] = _cards(PUPIL="MASKBAR")
+MUTATIONS["another filter"] = _cards(FILTER="F356W")
+MUTATIONS["another unit"] = _cards(BUNIT="DN/s")
+MUTATIONS["no unit"] = _cards(BUNIT=None)
+MUTATIONS["an unknown unit"] = _cards(BUNIT="parsnips")
+MUTATIONS["no pixel area"] = _cards(PIXAR_A2=None)
+MUTATIONS["a negative pixel area"] = _cards(PIXAR_A2=-0.0039)
+MUTATIONS["XOFFSET in mas"] = _cards(XOFFSET=20.0, YOFFSET=-10.0)
+MUTATIONS["contradicting masks"] = _cards(CORONMSK="MASKA430R")
+MUTATIONS["text for a number"] = _cards(ROLL_REF="seventy")
+MUTATIONS["another epoch"] = _cards(
+    DATE_BEG="2023-12-01T06:00:00", DATE_OBS="2023-12-01", EXPMID=60279.3, EXPSTART=60279.25
+)
+
+
+def _missing(*keys: str) -> Mutation:
+    """Cards that are missing, empty or unknown: used if others say the same, else excluded."""
+
+    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
+        value = rng.choice(np.array([None, "", "UNKNOWN"], dtype=object))
+        folder.change(name, lambda hdus, _: _set(hdus, **dict.fromkeys(keys, value)), rng)
+        folder.doubtful.add(name)
+
+    return mutate
+
+
+for _keys in (
+    ("ROLL_REF",), ("V3I_YANG",), ("ROLL_REF", "V3I_YANG", "PA_APER"), ("TARGPROP",),
+    ("TARGPROP", "TARGNAME"), ("TARG_RA", "TARG_DEC"), ("CORONMSK",), ("CORONMSK", "APERNAME"),
+    ("CORONMSK", "APERNAME", "SUBARRAY"), ("DETECTOR",), ("DETECTOR", "APERNAME", "FILENAME"),
+    ("DATE_BEG",), ("DATE_BEG", "TIME_OBS"), ("DATE_BEG", "DATE_OBS", "EXPSTART"), ("IS_PSF",),
+    ("EXP_TYPE",), ("PUPIL",), ("FILTER",), ("SUBARRAY",), ("APERNAME",), ("OBSERVTN",),
+    ("SUBSTRT1", "SUBSTRT2"),
+    ("TARGPROP", "TARGNAME", "TARG_RA", "TARG_DEC", "RA_REF", "DEC_REF", "IS_PSF"),
+):  # fmt: skip
+    MUTATIONS[f"without {', '.join(_keys)}"] = _missing(*_keys)
+
+
+@_mutation("APERNAME of the full frame")
+def _full(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    folder.change(name, lambda hdus, _: _set(hdus, APERNAME="NRCA5_FULL_MASK335R"), rng)
+    folder.doubtful.add(name)
+
+
+@_mutation("a reference with the target's name")
+def _namesake(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    names = sorted(folder.sources)
+    with fits.open(folder.path / names[0]) as hdus:
+        target = hdus[0].header["TARGPROP"]
+    folder.change(names[-1], lambda hdus, _: _set(hdus, TARGPROP=target, TARGNAME=target), rng)
+    folder.doubtful.add(names[-1])
+
+
+@_mutation("CRPIX off by three pixels")
+def _crpix(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    def change(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+        for key in ("CRPIX1", "CRPIX2"):
+            _set(hdus, **{key: float(_card(hdus, key)[key]) + rng.uniform(-3, 3)})
+
+    folder.change(name, change, rng)
+    folder.doubtful.add(name)
+
+
+# -- pixels ----------------------------------------------------------------------------------------
+
+
+def _pixels(change: Change, *, bad: bool) -> Mutation:
+    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
+        folder.change(name, change, rng)
+        (folder.bad if bad else folder.doubtful).add(name)
+
+    return mutate
+
+
+def _peak(hdus: fits.HDUList) -> tuple[int, int]:
+    frame = np.nan_to_num(np.atleast_3d(hdus["SCI"].data)[0])
+    row, column = np.unravel_index(int(frame.argmax()), frame.shape)
+    return int(row), int(column)
+
+
+def _hole(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    row, column = _peak(hdus)
+    hdus[rng.choice(["SCI", "ERR"])].data[0, row, column] = np.nan
+
+
+def _holes(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    data = hdus[rng.choice(["SCI", "ERR"])].data
+    for _ in range(200):
+        data[0, rng.integers(data.shape[1]), rng.integers(data.shape[2])] = rng.choice(
+            [np.nan, np.inf]
+        )
+
+
+def _cosmic_ray(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    row, column = rng.integers(60, 250, 2) % hdus["SCI"].data.shape[1]
+    hdus["SCI"].data[0, row, column] += 50 * hdus["ERR"].data[0, row, column]
+
+
+def _flags(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    data = hdus["DQ"].data
+    for _ in range(100):
+        data[0, rng.integers(data.shape[1]), rng.integers(data.shape[2])] = 1
+
+
+def _scaled(factor: float) -> Change:
+    def change(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+        del rng
+        for key in ("SCI", "ERR"):
+            hdus[key].data = hdus[key].data * np.float32(factor)
+
+    return change
+
+
+def _moved(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    angle = rng.uniform(0, 2 * np.pi)
+    by = np.round(24 * np.array([np.sin(angle), np.cos(angle)])).astype(int)
+    for key in ("SCI", "ERR"):
+        hdus[key].data = np.roll(hdus[key].data, tuple(by), axis=(1, 2))
+
+
+def _errors(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    hdus["ERR"].data = hdus["ERR"].data * np.float32(rng.choice([0.03, 30.0]))
+
+
+def _blank(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    hdus["SCI"].data = rng.normal(0, 1, hdus["SCI"].data.shape).astype(np.float32) * np.nanmedian(
+        hdus["ERR"].data
+    )
+
+
+def _zero(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    del rng
+    hdus["SCI"].data = np.zeros_like(hdus["SCI"].data)
+
+
+def _masked(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    del rng
+    hdus["DQ"].data = np.ones_like(hdus["DQ"].data)
+
+
+MUTATIONS["a hole at the peak"] = _pixels(_hole, bad=False)
+MUTATIONS["holes"] = _pixels(_holes, bad=False)
+MUTATIONS["a missed cosmic ray"] = _pixels(_cosmic_ray, bad=False)
+MUTATIONS["flagged pixels"] = _pixels(_flags, bad=False)
+for _factor in (1e-3, 1e3):
+    MUTATIONS[f"pixels times {_factor:g}"] = _pixels(_scaled(_factor), bad=True)
+
+
+def _another_unit(factor: float) -> Mutation:
+    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
+        folder.change(name, _scaled(factor), rng)
+        folder.doubtful.add(name)
+        folder.scaled.add(name)
+
+    return mutate
+
+
+MUTATIONS["pixels times 0.4"] = _another_unit(0.4)
+MUTATIONS["pixels times 2.5"] = _another_unit(2.5)
+MUTATIONS["star off the mask"] = _pixels(_moved, bad=True)
+MUTATIONS["errors of another unit"] = _pixels(_errors, bad=True)
+MUTATIONS["no star"] = _pixels(_blank, bad=True)
+MUTATIONS["zeros"] = _pixels(_zero, bad=True)
+MUTATIONS["all flagged"] = _pixels(_masked, bad=True)
+
+
+def _lost(key: str) -> Mutation:
+    def remove(hdus: fits.HDUList, _: np.random.Generator) -> None:
+        del hdus[key]
+
+    return _pixels(remove, bad=True)
+
+
+MUTATIONS["no SCI"], MUTATIONS["no ERR"] = _lost("SCI"), _lost("ERR")
+
+
+@_mutation("truncated")
+def _truncated(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    path = folder.path / name
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * rng.uniform(0.1, 0.95))])
+    folder.bad.add(name)
+
+
+@_mutation("files that are no frames")
+def _junk(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    del name
+    for k, content in enumerate((b"", b"not FITS", rng.bytes(5000))):
+        (folder.path / f"junk{k}.fits").write_bytes(content)
+        folder.bad.add(f"junk{k}.fits")
+    (folder.path / "notes.txt").write_text("notes", encoding="utf-8")
+
+
+@_mutation("one bad integration of several")
+def _cube(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    def change(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+        count, bad = 6, int(rng.integers(6))
+        error = np.nan_to_num(hdus["ERR"].data, nan=1.0) * 0.5
+        noise = rng.normal(size=(count, *error.shape[1:])) * np.abs(error)
+        # The mean of the good ones is the frame itself.
+        good = np.arange(count) != bad
+        noise[good] -= noise[good].mean(axis=0)
+        frames = (hdus["SCI"].data + noise).astype(np.float32)
+        flags = np.repeat(hdus["DQ"].data, count, axis=0)
+        kind = rng.choice(["zero", "flagged", "afterglow", "dim"])
+        if kind == "zero":
+            frames[bad] = 0
+        elif kind == "flagged":
+            flags[bad] = 1
+        elif kind == "dim":
+            frames[bad] *= 0.5
+        else:
+            row, column = _peak(hdus)
+            y, x = np.indices(frames.shape[1:])
+            near = np.exp(-((x - column - 12) ** 2 + (y - row + 9) ** 2) / 60)
+            frames[bad] += 0.3 * np.nanmax(hdus["SCI"].data) * near
+        hdus["SCI"].data, hdus["DQ"].data = frames, flags
+        hdus["ERR"].data = np.repeat(hdus["ERR"].data, count, axis=0)
+        for key in ("IMSHIFTS", "MASKOFFS"):
+            if key in hdus:
+                hdus[key].data = np.repeat(hdus[key].data, count, axis=0)
+
+    folder.change(name, change, rng)
+    folder.doubtful.add(name)

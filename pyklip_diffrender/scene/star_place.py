@@ -1,0 +1,116 @@
+"""Where the star is in an image of it behind a mask, to half a pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["center_of_symmetry", "measured_offset", "stamp_about"]
+
+Image = NDArray[np.float64]
+
+_FIELD = 2.5
+"""Radius, arcsec, of the square in which the star is looked for."""
+
+_LEAST_FIELD = 1.2
+"""Radius below which a frame is too small to judge."""
+
+_SKY = 3.0
+"""arcsec from the star beyond which the background is measured."""
+
+_ENOUGH = 2000
+"""Least number of pixels for that; with fewer, it is the faintest fifth of all."""
+
+_INNER, _OUTER, _CONCENTRATED = 1.0, 2.0, 5.0
+"""Ratio of the light within 1 arcsec and beyond 2 arcsec from which an image is that of a star."""
+
+_SEEN = 3.0
+"""S/N of the pixels that are looked at."""
+
+
+def stamp_about(
+    data: Image, error: Image, valid: NDArray[np.bool_], center: Image, pixelscale: float
+) -> tuple[Image, Image, Image] | None:
+    """Cut the square about a star out of an image, without the background.
+
+    Parameters
+    ----------
+    data, error : ndarray, (ny, nx)
+    valid : ndarray of bool, (ny, nx)
+    center : ndarray, (2,)
+        x, y of the star.
+    pixelscale : float
+        arcsec.
+
+    Returns
+    -------
+    image, distance, noise : ndarray, (n, n), or None
+        n is odd; distances from the middle in arcsec. None for images that reach less than 1.2
+        arcsec from the star.
+    """
+    x, y = np.round(center).astype(int)
+    ny, nx = data.shape
+    reach = min(int(_FIELD / pixelscale), x, y, nx - 1 - x, ny - 1 - y)
+    if reach * pixelscale < _LEAST_FIELD or not valid.any():
+        return None
+    window = np.s_[y - reach : y + reach + 1, x - reach : x + reach + 1]
+    rows, columns = np.indices((2 * reach + 1, 2 * reach + 1)) - reach
+    distance = np.hypot(rows, columns) * pixelscale
+    all_rows, all_columns = np.indices(data.shape)
+    outside = valid & (np.hypot(all_columns - x, all_rows - y) * pixelscale > _SKY)
+    sky = data[outside] if outside.sum() > _ENOUGH else np.sort(data[valid])[: valid.sum() // 5 + 1]
+    image = np.where(valid[window], data[window] - float(np.median(sky)), 0.0)
+    return image, distance, error[window]
+
+
+def center_of_symmetry(image: Image) -> Image:
+    """Find the point about which an image is most symmetric.
+
+    It is where the convolution of the image with itself is largest.
+
+    Parameters
+    ----------
+    image : ndarray, (n, n)
+        n is odd; negative pixels count as 0.
+
+    Returns
+    -------
+    ndarray, (2,)
+        x, y from the middle, to half a pixel.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> image = np.zeros((9, 9))
+    >>> image[5, 1:4] = 1.0
+    >>> center_of_symmetry(image)
+    array([-2.,  1.])
+    """
+    # Zeros around the image, so that the convolution is not periodic.
+    size = 2 * len(image)
+    transform = np.fft.rfft2(np.maximum(image, 0.0), (size, size))
+    own = np.fft.irfft2(transform**2, (size, size))
+    row, column = np.unravel_index(int(own.argmax()), own.shape)
+    return np.array([column, row]) / 2 - len(image) // 2
+
+
+def measured_offset(
+    data: Image, error: Image, valid: NDArray[np.bool_], center: Image, pixelscale: float
+) -> Image | None:
+    """How far a star is from where it is said to be, x, y in pixels.
+
+    The arguments are those of `stamp_about`.
+
+    Returns
+    -------
+    ndarray, (2,), or None
+        None if the image is too small, or is not that of a star.
+    """
+    stamp = stamp_about(data, error, valid, center, pixelscale)
+    if stamp is None:
+        return None
+    image, distance, noise = stamp
+    if image[distance < _INNER].mean() < _CONCENTRATED * np.abs(image[distance > _OUTER].mean()):
+        return None
+    bright = np.where(image > _SEEN * noise, image, 0.0)
+    return center_of_symmetry(bright) if np.count_nonzero(bright) >= 10 else None
