@@ -34,6 +34,7 @@ NPIX = 96
 pytestmark = [
     pytest.mark.filterwarnings("ignore:filled_circle_aa may not yield exact results"),
     pytest.mark.filterwarnings("ignore:Phase mask is very coarsely sampled"),
+    pytest.mark.filterwarnings("ignore:The 'warn' method is deprecated:DeprecationWarning"),
 ]
 
 

@@ -173,9 +173,15 @@ class Conversion:
         return turn.then(Orientation.inversion("y"))
 
     def _between_masks(self, index: int) -> bool:
-        """Whether a plane lies between masks, where light scattered beyond the pupil matters."""
-        kinds = [plane.planetype for plane in self.osys.planes]
-        return PlaneType.image in kinds[:index] and PlaneType.image in kinds[index:]
+        """Whether a plane lies between masks, where light scattered beyond the pupil matters.
+
+        Uniform image planes are no masks. Behind the last mask poppy cuts that light off.
+        """
+        masks = [
+            plane.planetype == PlaneType.image and not isinstance(plane, poppy.ScalarTransmission)
+            for plane in self.osys.planes
+        ]
+        return any(masks[:index]) and any(masks[index:])
 
     def _wave(self, wavelength: float, padded: bool = False) -> poppy.Wavefront:
         wave = poppy.Wavefront(
