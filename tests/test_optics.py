@@ -63,11 +63,31 @@ def test_a_source_at_positive_offset_appears_at_positive_offset() -> None:
     assert np.unravel_index(image.argmax(), image.shape) == (15 - 4, 15 + 6)
 
 
-def test_detector_shift_moves_the_image_and_nothing_else(opd: torch.Tensor) -> None:
-    model = small()
+@pytest.mark.parametrize("mask", ["MASK335R", None])
+def test_detector_shift_moves_the_image_and_nothing_else(
+    mask: str | None, opd: torch.Tensor
+) -> None:
+    """By the route through the occulter's cells, and by that through the planes."""
+    model = small(image_mask=mask)
     scale = model.detector.pixelscale[0]
     moved = model(opd, detector_shift=(3 * scale, -2 * scale))
     torch.testing.assert_close(moved[:-2, 3:], model(opd)[2:, :-3], rtol=1e-10, atol=1e-16)
+
+
+def test_blur_is_a_standard_deviation() -> None:
+    """Variances of Gaussians add, to the 1e-6 by which a sampled one differs."""
+    scale, width, blur = 0.06, 2.0, 0.09
+    detector = small(fov_pixels=33, pixelscale=scale).detector
+    x = torch.arange(33, dtype=torch.float64) - 16
+
+    def gaussian(variance: float) -> torch.Tensor:
+        profile = torch.exp(-(x**2) / (2 * variance)) / variance**0.5
+        return profile[:, None] * profile
+
+    values = {"blur": torch.tensor([blur], dtype=torch.float64)}
+    blurred = detector.image(gaussian(width**2), values)
+    expected = gaussian(width**2 + (blur / scale) ** 2)
+    torch.testing.assert_close(blurred, expected, rtol=0, atol=1e-5 * float(expected.max()))
 
 
 def test_an_opd_tilt_moves_the_star_as_the_convention_says() -> None:

@@ -135,7 +135,8 @@ def judge(breakage: Breakage, copy: Path, before: str | None, likely_only: bool)
     path = place_of(breakage, copy)
     whole = path.read_text(encoding="utf-8")
     began = resource.getrusage(resource.RUSAGE_CHILDREN)
-    likely = [f"tests/test_{name}.py" for name in breakage.tests.split()]
+    places = [Path("tests") / name for name in breakage.tests.split()]
+    likely = [f"{place.parent}/test_{place.name}.py" for place in places]
     likely = [name for name in likely if (copy / name).is_file()]
     stages = {"likely files": likely} if likely else {}
     if before and (copy / "tests" / before.split("::")[0]).is_file():

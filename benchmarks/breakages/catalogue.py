@@ -229,7 +229,8 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "checksum", "files whose data changed are refused",
-            "if hdu.verify_datasum() == 0:", "if hdu.verify_datasum() is None:", "files_units",
+            "if hdu.verify_datasum() == 0:", "if hdu.verify_datasum() is None:",
+            "hard/hard_files files_units",
         ),
         Breakage(
             "masked", "masked values do not enter as numbers",
