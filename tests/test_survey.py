@@ -753,7 +753,7 @@ def test_a_disk_and_the_whole_frames_are_part_of_the_job(
         assert record["curve"] == wide_field["contrast_curve"]
     # Other fields than those asked for are those of the preset in the filter of the frames.
     settings = GaussNewton.nircam("F356W", max_iterations=7)
-    common: dict[str, Any] = {"star_flux": 0.4, "settings": settings}
+    common: dict[str, Any] = {"size": 40, "star_flux": 0.4, "settings": settings}
     assert asked == [ReduceOptions(wide=True, **common), ReduceOptions(disk=True, **common)]
     assert written == [("a reduction", True)] * 2
 
