@@ -31,6 +31,7 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     RefinementError,
 )
+from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.refinement import FrameFit, GaussNewton
 from pyklip_diffrender.surveys import execution, folders, page, runs, work
 from pyklip_diffrender.surveys.config import read_config
@@ -726,42 +727,23 @@ def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for() -> None:
 def test_a_disk_and_the_whole_frames_are_part_of_the_job(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[dict[str, Any]] = []
+    asked: list[ReduceOptions] = []
 
-    class Part:
-        """Everything that a reduction has to write."""
+    def prepare(sequence: Any, opd: str, options: ReduceOptions) -> Any:
+        asked.append(options)
+        return SimpleNamespace(run=lambda: "a reduction")
 
-        def write(self, place: Path, **_: Any) -> Any:
-            return [place / "wide_field.fits"] if place.is_dir() else place
-
-    part = Part()
-
-    class Disk:
-        def write(self, folder: Path) -> Path:
-            return folder / "disk.fits"
-
-    def reduce(*_: Any, wide: bool, disk: bool, star_flux: Any, settings: Any, **__: Any) -> Any:
-        asked.append({"wide": wide, "disk": disk, "star_flux": star_flux})
-        # Other fields than those asked for are those of the preset in the filter of the frames.
-        assert settings == GaussNewton.nircam("F356W", max_iterations=7)
-        return SimpleNamespace(
-            detection=part, fit=part, systematics=None,
-            wide=part if wide else None, disk=Disk() if disk else None,
-        )  # fmt: skip
-
-    written: list[list[str]] = []
     wide_field = {"candidates": [{"snr": 7.0}], "contrast_curve": {k: [] for k in CURVE}}
     summary = {
         **result(), "status": {"name": "CONVERGED"}, "fit": {"reduced_chi2": 1, "error_factor": 1},
         "contrast_curve": {k: [1.0] for k in CURVE}, "frames": [], "wide_field": wide_field,
     }  # fmt: skip
-    monkeypatch.setattr(work, "reduce", reduce)
+    written: list[tuple[str, bool]] = []
+    monkeypatch.setattr(work, "prepare", prepare)
     frames = SimpleNamespace(science=(SimpleNamespace(filter="F356W"),))
     monkeypatch.setattr(work.Sequence, "from_files", lambda *_, **__: frames)
     monkeypatch.setattr(work, "summarise", lambda _: summary)
-    monkeypatch.setattr(
-        work, "write_report", lambda *args: written.append([each.name for each in args[2]])
-    )
+    monkeypatch.setattr(work, "write_products", lambda what, _, fit: written.append((what, fit)))
     config = inputs(tmp_path, 1)
     for name in ("wide", "disk"):
         options = {name: True, "star_flux": 0.4, "settings": {"max_iterations": 7}}
@@ -769,10 +751,11 @@ def test_a_disk_and_the_whole_frames_are_part_of_the_job(
         record = work.reduce_job(job, tmp_path)
         assert [each["false_alarm_probability"] for each in record["candidates"]] == [None]
         assert record["curve"] == wide_field["contrast_curve"]
-    asked_for = [{"wide": True, "disk": False}, {"wide": False, "disk": True}]
-    assert asked == [{**each, "star_flux": 0.4} for each in asked_for]
-    assert [len(each) for each in written] == [3, 3]
-    assert "disk.fits" in written[1]
+    # Other fields than those asked for are those of the preset in the filter of the frames.
+    settings = GaussNewton.nircam("F356W", max_iterations=7)
+    common: dict[str, Any] = {"size": 40, "star_flux": 0.4, "settings": settings}
+    assert asked == [ReduceOptions(wide=True, **common), ReduceOptions(disk=True, **common)]
+    assert written == [("a reduction", True)] * 2
 
 
 def test_a_planet_is_injected_into_the_frames_with_their_disk(
