@@ -49,7 +49,9 @@ SKY = Sky(north=NORTH, mjd=59855.5, star=(0.4, 0.04))
 
 
 def observation(folder: Path, **changes: object) -> Observation:
-    science = fits.ImageHDU(np.ones((1, 16, 20), "f4"), name="SCI")
+    # Not the same value everywhere, which would be an integration without data.
+    image = np.random.default_rng(3).normal(1.0, 0.01, (1, 16, 20))
+    science = fits.ImageHDU(image.astype("f4"), name="SCI")
     for key, value in {**REAL, **changes}.items():
         if value is not None:
             science.header[key] = value

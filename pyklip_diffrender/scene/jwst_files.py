@@ -113,7 +113,7 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
             arguments["star_offset"] = offset
             if arguments["center"] is not None:
                 arguments["center"] += np.divide(offset, arguments["pixelscale"])
-    if shifts is None and not moved:
+    if shifts is None and not moved and data.ndim > 1:  # Other shapes are refused with the frames.
         ny, nx = data.shape[-2:]
         star = arguments["center"]
         if star is None:
