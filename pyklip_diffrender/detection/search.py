@@ -30,7 +30,6 @@ from pyklip_diffrender.detection.relinearise import (
     lacks_candidates,
     with_companions,
 )
-from pyklip_diffrender.detection.rescue import with_raised_peaks
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.tables import measured_table
@@ -120,13 +119,6 @@ def detect(
     _require_positive(threshold=threshold, inner=inner, scatter=scatter)
     maps = Maps(groups_of(fits), progress)
     candidates, factor = _search(maps, fits, threshold, inner, scatter, Candidates.of_fit(fits[0]))
-    if not len(candidates):
-        better = with_raised_peaks(fits, maps, inner, progress)
-        if better is not None:
-            fits = better
-            maps = Maps(groups_of(fits), progress)
-            first = Candidates.of_fit(fits[0])
-            candidates, factor = _search(maps, fits, threshold, inner, scatter, first)
     if not all(fit.status.calibrated for fit in fits):
         relinearise = min(relinearise, threshold)
     bright = candidates.snr(factor) > relinearise
