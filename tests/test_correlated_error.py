@@ -12,7 +12,6 @@ from astropy.io import fits
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-import pyklip_diffrender as dr
 from pyklip_diffrender.linear import LinearFrame, LinearModel, Unknown
 from pyklip_diffrender.linear.noise import UNCORRELATED, CorrelatedError
 from pyklip_diffrender.refinement.correlated_error import fitted_correlated_error
@@ -122,26 +121,3 @@ def test_files_keep_the_correlated_error(tmp_path: Path) -> None:
     torch.testing.assert_close(again.frames[1].light, model.frames[1].light)
     assert earlier.correlated == UNCORRELATED
     torch.testing.assert_close(earlier.curvature, model.curvature)
-
-
-@pytest.mark.slow
-def test_a_fit_includes_the_error_that_its_frames_have(tmp_path: Path) -> None:
-    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=SIZE)
-    opd = dr.random_opd(1, npix=128)
-    clean = dr.simulate(model, dr.Scene(), opd, seed=3)
-    frame = replace(clean, data=clean.data * (1 + 0.05 * correlated(1)))
-    known = dr.Systematics(
-        np.zeros((SIZE, SIZE)), np.full((SIZE, SIZE), 1e-4), (15.5, 15.5), unknown=1e-4
-    )
-    settings = dr.GaussNewton(cycles=6, correlated_error=True, companions_if_stalled=False)
-    fit = dr.refine(model, frame, opd, settings=settings, systematics=known, plan="off")
-    without = dr.refine(
-        model, frame, opd, settings=replace(settings, correlated_error=False), systematics=known,
-        plan="off",
-    )  # fmt: skip
-    assert without.correlated_error == UNCORRELATED
-    assert fit.correlated_error.total > 0.005
-    assert fit.linear.correlated == fit.correlated_error
-    assert fit.summary()["correlated_error"] == fit.correlated_error.total
-    path = fit.write(tmp_path / "fit.fits")
-    assert dr.Refinement.read(path).correlated_error == fit.correlated_error

@@ -35,7 +35,6 @@ from pyklip_diffrender.detection.relinearise import (
     lacks_candidates,
     with_companions,
 )
-from pyklip_diffrender.detection.rescue import with_raised_peaks
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.detection.sky import Sky
@@ -126,13 +125,6 @@ def detect(
     maps = Maps(groups_of(fits), progress)
     known = Candidates.of_fit(fits[0])
     candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
-    if not len(candidates):
-        better = with_raised_peaks(fits, maps, inner, progress)
-        if better is not None:
-            fits = better
-            maps = Maps(groups_of(fits), progress)
-            known = Candidates.of_fit(fits[0])
-            candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
     if not all(fit.status.calibrated for fit in fits):
         relinearise = min(relinearise, threshold)
     bright = candidates.snr(factor) > relinearise
