@@ -305,6 +305,7 @@ def test_copies_with_added_sources_are_not_fitted_again(
             reduce(dataset_, tmp_path)
 
 
+@pytest.mark.slow
 def test_products_show_the_sky_of_all_rolls(
     small: OpticalSystem, frames: NDArray[np.float64], tmp_path: Path
 ) -> None:
