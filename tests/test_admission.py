@@ -16,8 +16,7 @@ from astropy.time import Time
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints, starlight
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.scene import Star
-from pyklip_diffrender.scene.exposure import Exposure, beginning, image_mask
+from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure, beginning, image_mask
 
 
 @pytest.fixture
@@ -156,15 +155,18 @@ def test_the_setup_of_most_of_the_targets_frames_is_reduced(folder: Path) -> Non
 
 
 def test_stars_are_told_apart_by_coordinates_and_signs() -> None:
-    plus, minus = Star(("BD+20-1790",), (110.0, 20.2)), Star(("BD-20-1790",), (110.0, -20.2))
+    plus, minus = (
+        CatalogueStar(("BD+20-1790",), (110.0, 20.2)),
+        CatalogueStar(("BD-20-1790",), (110.0, -20.2)),
+    )
     assert not plus.is_same(minus)
-    assert not Star(plus.names).is_same(Star(minus.names))
-    assert plus.is_same(Star(("HD 5",), (110.0, 20.2 + 3 / 3600)))
-    assert not plus.is_same(Star(("HD 5",), (110.0, 20.2 + 20 / 3600)))
+    assert not CatalogueStar(plus.names).is_same(CatalogueStar(minus.names))
+    assert plus.is_same(CatalogueStar(("HD 5",), (110.0, 20.2 + 3 / 3600)))
+    assert not plus.is_same(CatalogueStar(("HD 5",), (110.0, 20.2 + 20 / 3600)))
     # One star, whose coordinates are those of another epoch.
-    assert plus.is_same(Star(("BD +20 1790",), (110.0, 20.2 + 20 / 3600)))
-    assert not plus.is_same(Star(plus.names, (111.0, 20.2)))
-    assert plus.separation(Star((), (110.0 + 1e-3 / np.cos(np.deg2rad(20.2)), 20.2))) == (
+    assert plus.is_same(CatalogueStar(("BD +20 1790",), (110.0, 20.2 + 20 / 3600)))
+    assert not plus.is_same(CatalogueStar(plus.names, (111.0, 20.2)))
+    assert plus.separation(CatalogueStar((), (110.0 + 1e-3 / np.cos(np.deg2rad(20.2)), 20.2))) == (
         pytest.approx(3.6, rel=1e-6)
     )
 

@@ -30,11 +30,7 @@ from pyklip_diffrender.detection.field import (
 from pyklip_diffrender.detection.groups import groups_of, weigh
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.measurement import contrasts_at
-from pyklip_diffrender.detection.relinearise import (
-    has_unconfirmed_companions,
-    lacks_candidates,
-    with_companions,
-)
+from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.detection.sky import Sky
@@ -134,9 +130,7 @@ def detect(
             "not refined with them in the model",
             len(candidates),
         )
-    elif has_unconfirmed_companions(fits, candidates) or (
-        bright.any() and lacks_candidates(fits, candidates)
-    ):
+    elif bright.any() and lacks_candidates(fits, candidates):
         fits = with_companions(fits, candidates, progress)
         maps = Maps(groups_of(fits), progress)
         candidates, factor, significance = _search(

@@ -109,7 +109,8 @@ class GaussNewton:
     correlated_error : bool
         Fit the size of an error of the model that is proportional to starlight and correlated over
         about a pixel, see ``pyklip_diffrender.linear.noise``, where the pattern of the model's
-        error is known or shared. Errors of the result include it.
+        error is known or shared. Errors of the result include it. No preset does: a fit takes two
+        to three times as long, and what it gains on real frames has not been established.
     accurate_steps : bool
         Follow a step that fails, gains less than expected or is the last by steps with derivatives
         of the model itself, see ``pyklip_diffrender.refinement.accurate_step``. Fits of bright
@@ -326,7 +327,6 @@ class GaussNewton:
             max_iterations=40,
             relinearise=0.1,
             accurate_steps=True,
-            correlated_error=True,
             tolerance=5e-4,
         )
         # Parameters that are not free need no prior.

@@ -14,7 +14,7 @@ from astropy.time import Time
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.io.names import same_name, unknown_name
 from pyklip_diffrender.scene.candidates import Candidate, left, require_some
-from pyklip_diffrender.scene.exposure import Exposure, Star
+from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure
 from pyklip_diffrender.scene.noise import why_odd_noise
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.pixel_checks import (
@@ -170,7 +170,7 @@ def _by_star(candidates: Sequence[Candidate]) -> dict[str, list[Candidate]]:
     return stars
 
 
-def _namesake(star: Star, target: Star) -> str:
+def _namesake(star: CatalogueStar, target: CatalogueStar) -> str:
     away = star.separation(target)
     distance = "somewhere else" if away is None else f"{away / 3600:.2f} deg from the target"
     return f"a star of the target's name whose TARG_RA and TARG_DEC are {distance}"

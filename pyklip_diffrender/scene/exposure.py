@@ -18,8 +18,8 @@ from pyklip_diffrender.io.headers import card_error, header_date, header_number,
 from pyklip_diffrender.io.names import same_name
 
 __all__ = [
+    "CatalogueStar",
     "Exposure",
-    "Star",
     "beginning",
     "detector_of",
     "image_mask",
@@ -66,7 +66,7 @@ telescope pointed."""
 
 
 @dataclass(frozen=True)
-class Star:
+class CatalogueStar:
     """A star as a header describes it.
 
     Attributes
@@ -92,7 +92,7 @@ class Star:
         """Whether one of the names is this one, in any spelling."""
         return any(same_name(name, each) for each in self.names)
 
-    def separation(self, other: Star) -> float | None:
+    def separation(self, other: CatalogueStar) -> float | None:
         """Arcsec between the coordinates of two headers; None if one has none."""
         if self.coordinates is None or other.coordinates is None:
             return None
@@ -101,7 +101,7 @@ class Star:
         half = np.sin((e - d) / 2) ** 2 + np.cos(d) * np.cos(e) * np.sin((b - a) / 2) ** 2
         return float(np.rad2deg(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1)))) * 3600)
 
-    def is_same(self, other: Star) -> bool:
+    def is_same(self, other: CatalogueStar) -> bool:
         """Whether two headers describe one star: coordinates decide, names where there are none."""
         alike = any(other.is_called(name) for name in self.names)
         apart = self.separation(other)
@@ -130,7 +130,7 @@ class Exposure:
         The set-up; the mask without its module (MASK335R).
     unit : str or None
         BUNIT.
-    star : Star
+    star : CatalogueStar
     reference : bool or None
         IS_PSF.
     background : bool
@@ -155,7 +155,7 @@ class Exposure:
     subarray: str | None = None
     filter: str | None = None
     unit: str | None = None
-    star: Star = Star()
+    star: CatalogueStar = CatalogueStar()
     reference: bool | None = None
     background: bool = False
     position_angle: float | None = None
@@ -264,7 +264,7 @@ def image_mask(header: fits.Header, name: str) -> str | None:
     return next(iter(stated.values()), None)
 
 
-def star_of(header: fits.Header, name: str) -> Star:
+def star_of(header: fits.Header, name: str) -> CatalogueStar:
     """Read which star a header names, and where it is."""
     names = [header_text(header, key, name) for key in ("TARGPROP", "TARGNAME")]
     for keys in _COORDINATES:
@@ -274,8 +274,8 @@ def star_of(header: fits.Header, name: str) -> Star:
             ra, dec = (float(each or 0.0) for each in place)
             if not -90 <= dec <= 90:
                 raise card_error(name, keys[1], dec, "a declination in degrees")
-            return Star(tuple(filter(None, names)), (ra, dec), keys != _COORDINATES[0])
-    return Star(tuple(filter(None, names)))
+            return CatalogueStar(tuple(filter(None, names)), (ra, dec), keys != _COORDINATES[0])
+    return CatalogueStar(tuple(filter(None, names)))
 
 
 def _flag(header: fits.Header, key: str) -> bool | None:

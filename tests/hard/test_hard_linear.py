@@ -100,11 +100,11 @@ STAGES = {
     "whole coronagraph": whole,
     "sampled mask": of_plane(
         lambda _: SampledOcculter(
-            [BoxPart(gaussian, (-1.0, 1.0, -1.5, 1.2))], 3.0, JWST_DIAMETER, "box"
+            [BoxPart(gaussian, (-1.0, 1.0, -1.5, 1.2))], 3.0, JWST_DIAMETER, "box", GRID
         )
     ),
     "bar": of_plane(
-        lambda _: SampledOcculter([SeparablePart(bar, None, 3.0)], 3.0, JWST_DIAMETER, "bar")
+        lambda _: SampledOcculter([SeparablePart(bar, None, 3.0)], 3.0, JWST_DIAMETER, "bar", GRID)
     ),
     "padded FFT": of_plane(
         lambda _: FourierMask(
