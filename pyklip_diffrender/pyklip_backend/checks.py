@@ -80,11 +80,6 @@ def check_settings(settings: DiffrenderSettings) -> None:
         raise IncompatibleSetupError(
             f"image: got {settings.image!r}, expected one of {', '.join(IMAGES)}"
         )
-    if settings.image == "flux" and settings.injected_into is not None:
-        raise IncompatibleSetupError(
-            "image='flux': for copies with added sources there are the images 'cleaned' and "
-            "'subtracted' only"
-        )
     if settings.subtractor is not None:
         return
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph

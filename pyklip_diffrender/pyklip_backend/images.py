@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["IMAGES", "ProductImages", "image_of"]
 
-IMAGES = ("cleaned", "subtracted", "flux")
+IMAGES = ("cleaned", "subtracted")
 
 Image = NDArray[np.float64]
 
@@ -70,18 +69,17 @@ class ProductImages:
 
         return SkyModel(self.fits)
 
-    def put_into(self, residuals: Image, image: str, added: Image | None = None) -> None:
-        """Replace the fitted square of frames, (n, Ny, Nx), by an image, in place.
+    def put_into(self, residuals: Image, added: Image | None = None) -> None:
+        """Replace the fitted square of frames, (n, Ny, Nx), by the cleaned image, in place.
 
         Parameters
         ----------
         residuals : ndarray, (n, Ny, Nx)
             Frames minus their star.
-        image : {"cleaned", "flux"}
         added : ndarray, (n, Ny, Nx), optional
             Light in copies of the frames that those of the fit do not have.
         """
-        sky = self._cleaned(added) if image == "cleaned" else self._flux()
+        sky = self._cleaned(added)
         for part in self.pointings:
             here = self.sky.in_frame(sky, self.fits.index(part.result), part.index)
             pasted = part.paste(here, part.window)
@@ -99,17 +97,3 @@ class ProductImages:
                 known = self.sky.groups[group][0].frames[k].weight > 0
                 light[group][k] = light[group][k] + torch.where(known, image, 0.0)
         return np.asarray(self.sky.estimate(light)[0])
-
-    def _flux(self) -> Image:
-        from pyklip_diffrender.detection import detect
-
-        detection = detect(self.fits, relinearise=np.inf)
-        first = self.fits[0].frames[0]
-        pixels = self.sky.pixels_in_frame(first.grid, first.observation.position_angle)
-        contrast = np.where(np.isfinite(detection.contrast), detection.contrast, 0.0)
-        turned = map_coordinates(contrast, np.moveaxis(pixels, -1, 0), order=3)
-        # Of a source halfway to the edge, where the mask does not matter.
-        ny, nx = contrast.shape
-        row, column = np.array([ny // 2]), np.array([3 * nx // 4])
-        images = self.sky.groups[0][1].at_pixels(row, column)
-        return float(next(iter(images.values()))[0].max()) * turned

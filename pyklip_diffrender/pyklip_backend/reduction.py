@@ -305,8 +305,7 @@ class Reduction:
         """Fraction of a faint source's peak that the products have, on the first frame's pixels."""
         if record.image == "cleaned":
             return record.images.sky.throughput()
-        kept = throughput_map(result)
-        return np.ones_like(kept) if record.image == "flux" else kept
+        return throughput_map(result)
 
     def _image(self, subtraction: Subtraction) -> str:
         """Return which image the products carry."""
@@ -377,7 +376,7 @@ class Reduction:
             # The model of the sky is that of the fit, also for copies with added sources.
             original = before[len(self.records)] if before else record
             added = frames.data - original.frames.data if before else None
-            original.images.put_into(residuals, image, added)
+            original.images.put_into(residuals, added)
         self.records.append(record)
         residuals *= frames.factor[:, np.newaxis, np.newaxis]
         if self._filter is not None:

@@ -101,13 +101,12 @@ class DiffrenderSettings:
         model, so that none of their light is subtracted with the star; True by default for real
         NIRCam frames, else False. Undetected companions still lose light, as much as the
         throughput map says.
-    image : {"cleaned", "subtracted", "flux"}, optional
+    image : {"cleaned", "subtracted"}, optional
         Image that the products carry. "subtracted", the default and always that of forward models,
         is each frame minus its star. "cleaned" is the posterior mean of the sky from all rolls
         together, see `imaging.SkyModel`; every frame has it on its own pixels, so that pyKLIP's
-        mean or median of the frames is the same image. "flux" is the brightest pixel, without a
-        mask, of the point source at every pixel that fits the frames best. Pixels beyond the
-        fitted square have the frames minus star.
+        mean or median of the frames is the same image. Pixels beyond the fitted square have the
+        frames minus star.
     max_chi2 : float, optional
         Reduced chi-squared above which a fit is implausible and the reduction stops with a
         `RefinementError`; 100 by default, inf for no limit.
@@ -149,7 +148,7 @@ class DiffrenderSettings:
     systematics: Systematics | Literal["auto", "references", "off"] | None = None
     plan: str | None = None
     keep_detected: bool | None = None
-    image: Literal["cleaned", "subtracted", "flux"] | None = None
+    image: Literal["cleaned", "subtracted"] | None = None
     max_chi2: float | None = None
     injected_into: Any = None
     files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None
