@@ -21,9 +21,11 @@ SCRIPTS = sorted(
 WITHOUT_OPTIONS = ("examples/paper/summary.py",)
 
 
-def run(script: str) -> None:
+def run(script: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if script.startswith("benchmarks/"):
         name = script.removesuffix(".py").removesuffix("/__main__").replace("/", ".")
+        # Another test may have imported it.
+        monkeypatch.delitem(sys.modules, name, raising=False)
         runpy.run_module(name, run_name="__main__", alter_sys=True)
     else:
         runpy.run_path(str(ROOT / script), run_name="__main__")
@@ -43,6 +45,6 @@ def test_help(
         monkeypatch.syspath_prepend((ROOT / script).parent)
     monkeypatch.setattr(sys, "argv", [script, "--help"])
     with pytest.raises(SystemExit) as ended:
-        run(script)
+        run(script, monkeypatch)
     assert not ended.value.code
     assert capsys.readouterr().out.startswith("usage:")
