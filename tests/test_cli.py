@@ -482,6 +482,25 @@ def test_reduce_passes_its_options_on_and_names_the_products(
     assert "1. products" in shown.err
 
 
+def test_a_spectrum_says_how_bright_the_star_is(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    spectrum = tmp_path / "star.txt"
+    spectrum.write_text("2.0 0.4\n4.0 0.4\n6.0 0.4\n")
+    arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(tmp_path / "products")]
+    arguments += ["--size", "8", "--star-sed", str(spectrum)]
+    # These frames have no calibration, so that it goes no further.
+    assert main(arguments) == 1
+    shown = capsys.readouterr()
+    assert "star: 0.4 Jy in F444W, by star.txt" in shown.out
+    assert "--star-flux: one_calints.fits is not calibrated" in shown.err
+    assert main([*arguments, "--star-flux", "0.4 Jy"]) == 2
+    assert "both say how bright the star is" in capsys.readouterr().err
+
+
 def test_json_is_all_that_goes_to_standard_output(
     tmp_path: Path,
     frames: Path,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext, redirect_stdout
+from dataclasses import replace
 from json import dumps, loads
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import click
 from pyklip_diffrender.cli.estimate import describe_plan, size_of_products
 from pyklip_diffrender.cli.run import Run, with_options
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.instrument.star_flux import star_flux_density
 from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.reduction import EPOCHS, PRODUCTS, ReduceOptions, prepare, write_epochs
@@ -41,6 +43,7 @@ def run_reduction(
     dry_run: bool,
     opd: str,
     opd_date: Rule | None,
+    star_sed: Path | None,
     **options: Any,
 ) -> None:
     """Reduce the epochs of a target, write all products and say what they show.
@@ -49,6 +52,8 @@ def run_reduction(
     """
     if dry_run and json:
         raise click.UsageError("A --dry-run has no summary to print with --json.")
+    if star_sed is not None and options["star_flux"] is not None:
+        raise click.UsageError("--star-flux and --star-sed both say how bright the star is.")
     try:
         checked = ReduceOptions(device=run.device, **options)
     except DiffrenderError as error:
@@ -57,6 +62,11 @@ def run_reduction(
     # Libraries may print, too.
     with redirect_stdout(sys.stderr) if json else nullcontext():
         sequences = read()
+        if star_sed is not None:
+            name = sequences[0].filter or "unknown"
+            flux = star_flux_density(star_sed, name)
+            click.echo(f"star: {flux.value:.4g} Jy in {name}, by {star_sed.name}")
+            checked = replace(checked, star_flux=flux)
         several = len(sequences) > 1
         folders = [output / _day(each) for each in sequences] if several else [output]
         prepared = []

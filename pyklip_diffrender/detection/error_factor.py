@@ -43,7 +43,8 @@ _SPREAD = 0.5
 
 _STARLIGHT = -1.0
 _STARLIGHT_SPREAD = 1.0
-"""Prior mean and standard deviation of log B. Single rolls of four stars gave B of 0 to 5."""
+"""Prior mean and standard deviation of log B: the term of the starlight matters where the star is
+a hundred times the noise, and may be absent."""
 
 CLIP = 4.0
 """Standard deviations at which S/N is clipped, so that sources that are not yet candidates do not
