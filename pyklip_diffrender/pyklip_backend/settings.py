@@ -104,7 +104,7 @@ class DiffrenderSettings:
     image : {"cleaned", "subtracted"}, optional
         Image that the products carry. "subtracted", the default and always that of forward models,
         is each frame minus its star. "cleaned" is the posterior mean of the sky from all rolls
-        together, see `imaging.SkyModel`; every frame has it on its own pixels, so that pyKLIP's
+        together, see ``imaging.SkyModel``; every frame has it on its own pixels, so that pyKLIP's
         mean or median of the frames is the same image. Pixels beyond the fitted square have the
         frames minus star.
     max_chi2 : float, optional

@@ -133,7 +133,7 @@ class Reduction:
         derivatives : bool
             Keep the derivatives of the images in ``fit.fits``, which then takes ten times the
             space: they are needed to search the fit again (`detect`), and to measure at other
-            places (`Detection.read(...).measure`).
+            places (``Detection.read(...).measure``).
 
         Returns
         -------

@@ -228,7 +228,7 @@ class Observation:
         Errors of NIRCam frames are corrected for the noise that is measured far from the star, see
         `pyklip_diffrender.scene.noise.calibrated_errors`. Integrations that are empty are left out,
         and three or more are compared with each other, see
-        `pyklip_diffrender.scene.integrations.judge_integrations`; `remarks` says what was left out.
+        ``scene.integrations.judge_integrations``; `remarks` says what was left out.
 
         Parameters
         ----------

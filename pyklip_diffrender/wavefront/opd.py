@@ -50,7 +50,7 @@ def read_opd(
     Maps of the mission's wavefront sensing from MAST are recognised by their extension
     RESULT_PHASE. They are in microns without a unit in the header, and contain the aberrations of
     the sensing camera. These are subtracted with stpsf's models if stpsf and its data are
-    installed; otherwise they are kept, with a warning. See `wss.load_wss_opd`.
+    installed; otherwise they are kept, with a warning. See ``wss.load_wss_opd``.
 
     Parameters
     ----------
