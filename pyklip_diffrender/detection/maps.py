@@ -95,10 +95,13 @@ class Maps:
                     templates.at_pixels(rows[inside], columns[inside])
                 )
                 products += torch.stack([matrix[middle], matrix.diagonal()]).numpy()
-            deviation = np.sqrt(products[1] * products[0, middle])
-            total.ravel()[inside] += products[0] / deviation
-            count.ravel()[inside] += 1
-        return total / count
+            # Behind the mask the information is 0, and by rounding may be below it.
+            known = (products[1] > 0) & (products[0, middle] > 0)
+            pixels = np.flatnonzero(inside)[known]
+            deviation = np.sqrt(products[1, known] * products[0, middle])
+            total.ravel()[pixels] += products[0, known] / deviation
+            count.ravel()[pixels] += 1
+        return np.divide(total, count, out=np.zeros_like(total), where=count > 0)
 
     def _spare(self) -> float:
         """Bytes that the settings of the fits leave beside the linear models."""
