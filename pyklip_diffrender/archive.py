@@ -29,7 +29,7 @@ _UNKNOWN = -1
 
 @dataclass(frozen=True)
 class _Mast:
-    """What this module needs of astroquery.
+    """The part of astroquery that this module needs.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a reduction will do, and about how long it will take."""
+"""Steps of a reduction, and estimates of their time, memory and room on disk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the machine has left."""
+"""Memory and processors that the machine has left."""
 
 from __future__ import annotations
 

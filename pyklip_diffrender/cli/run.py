@@ -1,4 +1,4 @@
-"""What all commands need: messages and the log, outputs that may be written, the device."""
+"""Parts of all commands: messages and the log, outputs that may be written, the device."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ class Run:
             )
 
     def left(self) -> str:
-        """What an interrupted run has left, as a sentence."""
+        """Files that an interrupted run has left, as a sentence."""
         output = self._output
         written = [] if output is None else _files(output).items() - self._before.items()
         if not written:
