@@ -134,7 +134,8 @@ def test_a_listing_fetches_nothing(mast: Observations, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["../../x_calints.fits", "/elsewhere/x_calints.fits", r"..\x_calints.fits", ".x_calints.fits"]
+    "name",
+    ["../../x_calints.fits", "/elsewhere/x_calints.fits", r"..\x_calints.fits", ".x_calints.fits"],
 )
 def test_a_name_that_leaves_the_folder_is_refused(
     mast: Observations, tmp_path: Path, name: str
