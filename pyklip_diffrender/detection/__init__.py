@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.disk import Disk, fit_disk
+from pyklip_diffrender.detection.figure import draw_search
 from pyklip_diffrender.detection.recovery import measured_planet, recover_planets, with_planets
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure
-from pyklip_diffrender.detection.wide_search import WideField, wide_field
+from pyklip_diffrender.detection.wide_result import WideField
+from pyklip_diffrender.detection.wide_search import wide_field
 
 __all__ = [
     "Candidates",
@@ -22,6 +24,7 @@ __all__ = [
     "WideField",
     "contrast_curve",
     "detect",
+    "draw_search",
     "fit_disk",
     "measure",
     "measured_planet",

@@ -21,9 +21,9 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection.calibration import calibration_errors
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.contrast import described
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
+from pyklip_diffrender.detection.figure import draw_search
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.detection.measurement import (
     contrasts_at,
@@ -33,25 +33,19 @@ from pyklip_diffrender.detection.measurement import (
 from pyklip_diffrender.detection.orbits import write_astrometry
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.storage import (
-    candidates_of,
+    computed_of,
     digest,
     fit_beside,
     groups_of_searched,
     hdus_of,
-    maps_of,
-    table_of,
-    wcs_of,
+    searched_of,
 )
 from pyklip_diffrender.detection.tables import candidate_table, in_words, measured_table
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.files import replacing, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.storage import (
-    image,
-    observation_of,
-    reading,
-)
+from pyklip_diffrender.refinement.storage import reading
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["Detection"]
@@ -357,16 +351,7 @@ class Detection:
         ndarray of Axes, (2,)
         """
         axes = drawing.axes_for(ax, 2)
-        drawing.search(
-            axes,
-            self.snr,
-            self.grid,
-            self.table,
-            self.contrast_curve,
-            threshold=self.threshold,
-            north=None if self.observation.position_angles is None else self.north,
-            small_sample=self.error_factor.is_measured,
-        )
+        draw_search(axes, self)
         return np.array(axes)
 
     def write(self, folder: str | os.PathLike[str]) -> list[Path]:
@@ -438,32 +423,8 @@ class Detection:
         path = path / "detection.fits" if path.is_dir() else path
         fits = (fit,) if isinstance(fit, Refinement) else tuple(fit or ())
         with reading(path, "Detection") as (hdus, facts):
-            stars = sum(hdu.name == "SUBTRACTED" for hdu in hdus)
-            # What a new detection computes from its fits.
-            computed = {
-                "observation": observation_of(hdus, facts["observation"], 0),
-                "subtracted": tuple(image(hdus, "SUBTRACTED", k) for k in range(stars)),
-                "_wcs": tuple(wcs_of(hdus, "SUBTRACTED", k) for k in range(stars)),
-                "left_out": (image(hdus, "LEFT_OUT", 0), image(hdus, "LEFT_OUT_ERROR", 0)),
-                "_calibration_errors": np.array(facts["calibration_errors"], dtype=float),
-                "sky": Sky(**facts["sky"]),
-                "_provenance": {
-                    key: list(value) if isinstance(value, tuple) else value
-                    for key, value in facts["provenance"].items()
-                },
-                "_digests": facts["fits"],
-                "rolls": facts["rolls"],
-            }
-            detection = cls(
-                fits=fits,
-                groups=groups_of_searched(fits, facts["fits"], path) if fits else (),
-                threshold=facts["threshold"],
-                candidates=candidates_of(facts["candidates"]),
-                false_alarm=np.array(facts["false_alarm"], dtype=float),
-                rings=table_of(facts["rings"]),
-                contrast_curve=described(table_of(facts["contrast_curve"])),
-                path=path,
-                **maps_of(hdus),
-            )
+            groups = groups_of_searched(fits, facts["fits"], path) if fits else ()
+            detection = cls(fits=fits, groups=groups, path=path, **searched_of(hdus, facts))
+            computed = computed_of(hdus, facts)
         vars(detection).update(computed)
         return detection

@@ -14,31 +14,34 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.contrast import described
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group, groups_of
+from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.storage import image, observation_hdus, text_hdu
+from pyklip_diffrender.refinement.storage import (
+    image,
+    observation_hdus,
+    observation_of,
+    text_hdu,
+)
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
 __all__ = [
-    "MAPS",
-    "candidates_of",
+    "computed_of",
     "digest",
     "fit_beside",
     "groups_of_searched",
     "hdus_of",
     "image_hdu",
-    "maps_of",
-    "table_facts",
-    "table_of",
-    "wcs_of",
+    "searched_of",
 ]
 
 _WCS = re.compile(r"WCSAXES|RADESYS|(CTYPE|CUNIT|CRPIX|CRVAL)[12]|CD[12]_[12]")
 
-MAPS = {
+_MAPS = {
     "SNR": "snr",
     "RESIDUAL_SNR": "residual_snr",
     "CONTRAST": "contrast",
@@ -58,7 +61,7 @@ def image_hdu(
     return hdu
 
 
-def wcs_of(hdus: fits.HDUList, name: str, frame: int) -> fits.Header:
+def _wcs_of(hdus: fits.HDUList, name: str, frame: int) -> fits.Header:
     """Return the cards of an extension that `world_coordinates` made."""
     header = hdus[name, frame + 1].header
     cards = [each for each in header.cards if _WCS.fullmatch(each.keyword)]
@@ -75,12 +78,12 @@ def hdus_of(detection: Any) -> fits.HDUList:
     facts = {
         "threshold": detection.threshold,
         "false_alarm": detection.false_alarm,
-        "rings": table_facts(detection.rings),
+        "rings": _table_facts(detection.rings),
         "rolls": detection.rolls,
         "candidates": vars(detection.candidates),
         "calibration_errors": detection._calibration_errors,
         "sky": vars(detection.sky),
-        "contrast_curve": table_facts(detection.contrast_curve),
+        "contrast_curve": _table_facts(detection.contrast_curve),
         "observation": about,
         "provenance": detection._provenance,
         "fits": detection._digests,
@@ -90,7 +93,7 @@ def hdus_of(detection: Any) -> fits.HDUList:
             primary_hdu(detection.observation, detection._provenance, detection.sky.mjd),
             *(
                 image_hdu(getattr(detection, attribute), name, "", wcs)
-                for name, attribute in MAPS.items()
+                for name, attribute in _MAPS.items()
             ),
             *(
                 image_hdu(np.broadcast_to(values, detection.snr.shape), name, "", wcs)
@@ -115,7 +118,7 @@ def hdus_of(detection: Any) -> fits.HDUList:
     )
 
 
-def maps_of(hdus: fits.HDUList) -> dict[str, Any]:
+def _maps_of(hdus: fits.HDUList) -> dict[str, Any]:
     """Return the maps, the error factor and the grid of a detection, by attribute.
 
     Raises
@@ -123,7 +126,7 @@ def maps_of(hdus: fits.HDUList) -> dict[str, Any]:
     KeyError, ValueError
         If an extension is missing, or if not all images have the same shape.
     """
-    maps = {attribute: image(hdus, name, 0) for name, attribute in MAPS.items()}
+    maps = {attribute: image(hdus, name, 0) for name, attribute in _MAPS.items()}
     maps["grid"] = np.stack([image(hdus, "OFFSET_X", 0), image(hdus, "OFFSET_Y", 0)], axis=-1)
     factors, freedom = image(hdus, "ERROR_FACTOR", 0), image(hdus, "FREEDOM", 0)
     shapes = {each.shape[:2] for each in (*maps.values(), factors, freedom)}
@@ -135,7 +138,44 @@ def maps_of(hdus: fits.HDUList) -> dict[str, Any]:
     return {**maps, "error_factor": factor}
 
 
-def candidates_of(facts: dict[str, Any]) -> Candidates:
+def searched_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of a detection that do not need its fits.
+
+    Raises
+    ------
+    KeyError, ValueError
+        If a part is missing, or if not all images have the same shape.
+    """
+    return {
+        "threshold": facts["threshold"],
+        "candidates": _candidates_of(facts["candidates"]),
+        "false_alarm": np.array(facts["false_alarm"], dtype=float),
+        "rings": _table_of(facts["rings"]),
+        "contrast_curve": described(_table_of(facts["contrast_curve"])),
+        **_maps_of(hdus),
+    }
+
+
+def computed_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the cached properties that a new detection computes from its fits, by name."""
+    stars = sum(hdu.name == "SUBTRACTED" for hdu in hdus)
+    return {
+        "observation": observation_of(hdus, facts["observation"], 0),
+        "subtracted": tuple(image(hdus, "SUBTRACTED", k) for k in range(stars)),
+        "_wcs": tuple(_wcs_of(hdus, "SUBTRACTED", k) for k in range(stars)),
+        "left_out": (image(hdus, "LEFT_OUT", 0), image(hdus, "LEFT_OUT_ERROR", 0)),
+        "_calibration_errors": np.array(facts["calibration_errors"], dtype=float),
+        "sky": Sky(**facts["sky"]),
+        "_provenance": {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in facts["provenance"].items()
+        },
+        "_digests": facts["fits"],
+        "rolls": facts["rolls"],
+    }
+
+
+def _candidates_of(facts: dict[str, Any]) -> Candidates:
     """Make candidates from their attributes."""
     count = len(facts["contrasts"])
     shapes = {"offsets": (count, 2), "contrasts": (count,), "covariance": (3 * count, 3 * count)}
@@ -146,13 +186,13 @@ def candidates_of(facts: dict[str, Any]) -> Candidates:
     return Candidates(**arrays, converged=facts["converged"])
 
 
-def table_facts(table: QTable) -> dict[str, Any]:
+def _table_facts(table: QTable) -> dict[str, Any]:
     """Return the columns and the metadata of a table as settings that `text_hdu` writes."""
     return {"columns": {name: table[name] for name in table.colnames}, "meta": table.meta}
 
 
-def table_of(facts: dict[str, Any]) -> QTable:
-    """Make a table of numbers from what `table_facts` returned."""
+def _table_of(facts: dict[str, Any]) -> QTable:
+    """Make a table of numbers from what `_table_facts` returned."""
     columns = {
         name: column if hasattr(column, "unit") else np.array(column, dtype=np.float64)
         for name, column in facts["columns"].items()

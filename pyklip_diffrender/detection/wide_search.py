@@ -3,36 +3,28 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from astropy.io import fits
 from astropy.table import QTable, vstack
 from numpy.typing import NDArray
 
-from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image, far_from, ring_pixels, separation_of
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.significance import Significance
-from pyklip_diffrender.detection.storage import image_hdu
-from pyklip_diffrender.detection.tables import candidate_table, in_words
+from pyklip_diffrender.detection.tables import candidate_table
 from pyklip_diffrender.detection.whole_frames import WholeFrame
+from pyklip_diffrender.detection.wide_result import WideField
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.files import replacing, write_fits
-from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement import star_flux_error
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
-__all__ = ["WideField", "wide_field"]
+__all__ = ["wide_field"]
 
 _log = logging.getLogger(__name__)
 
@@ -67,144 +59,6 @@ class _Measurement:
     @property
     def snr(self) -> float:
         return float(self.values[0] / np.sqrt(self.variance[0]))
-
-
-@dataclass(frozen=True, eq=False)
-class WideField:
-    """Point sources in whole frames.
-
-    About the star the maps are those of the `Detection`, with the star marginalised. Elsewhere
-    they are those of a matched filter on the frames without the star, extrapolated from its fit,
-    and without the background. Images have the first frame's pixels.
-
-    Attributes
-    ----------
-    detection : Detection
-        The search of the pixels about the star.
-    threshold : float
-        Smallest S/N of a candidate.
-    contrast, error, snr : ndarray, (ny, nx)
-        As those of `Detection`; NaN where nothing is known.
-    grid : ndarray, (ny, nx, 2)
-        x, y of the pixels from the star, arcsec.
-    error_factor : ErrorFactor
-        Factor by which errors outside the fitted pixels were multiplied.
-    table : QTable
-        Candidates, highest S/N first, those of the detection included; columns as in
-        `Detection.table`, and fit_chi2.
-    contrast_curve : QTable
-        See `contrast.contrast_table`.
-    light : tuple of ndarray, (ny, nx)
-        Light of the sources outside the fitted pixels in every frame, in the data's unit.
-
-    Examples
-    --------
-    With frames and wavefront maps in folders, which the package does not contain:
-
-    >>> import pyklip_diffrender as dr
-    >>> result = dr.reduce("calints", "maps", wide=True)  # doctest: +SKIP
-    >>> print(result.wide)  # doctest: +SKIP
-    """
-
-    detection: Detection
-    threshold: float
-    contrast: Image
-    error: Image
-    snr: Image
-    grid: Image
-    error_factor: ErrorFactor
-    table: QTable
-    contrast_curve: QTable
-    light: tuple[Image, ...] = ()
-
-    def __repr__(self) -> str:
-        ny, nx = self.snr.shape
-        return f"<WideField: {nx} x {ny} pixels, {len(self.table)} candidates>"
-
-    def __str__(self) -> str:
-        """The candidates in words, at most 80 columns wide."""
-        return in_words(self.table, self.threshold)
-
-    def _repr_html_(self) -> str:
-        ny, nx = self.snr.shape
-        facts = {"Star": self.observation.target, "Pixels": f"{nx} x {ny}"}
-        title = f"WideField: {len(self.table)} candidates above {self.threshold:g} sigma"
-        columns = ("separation", "position_angle", "contrast", "contrast_error", "snr", "fit_chi2")
-        return html_summary(title, facts, self.table, columns)
-
-    @property
-    def observation(self) -> Observation:
-        """The first frame, as far as it was fitted."""
-        return self.detection.observation
-
-    @property
-    def north(self) -> float:
-        """Position angle of the first frame's +y axis, degrees east of north; 0 if not known."""
-        return self.detection.north
-
-    def subtracted(
-        self, whole: Sequence[Observation], cut: Sequence[Observation]
-    ) -> tuple[Observation, ...] | None:
-        """The fitted pixels without the light of sources outside them.
-
-        Parameters
-        ----------
-        whole, cut : sequence of Observation
-            All frames, and the cutouts that were fitted.
-
-        Returns
-        -------
-        tuple of Observation or None
-            None if there is too little of that light to be seen.
-        """
-        cleaned, seen = [], 0.0
-        for light, frame, part in zip(self.light, whole, cut, strict=True):
-            column, row = np.rint(frame.center[0] - part.center[0]).astype(int)
-            ny, nx = part.shape
-            inside = light[row : row + ny, column : column + nx]
-            combined = part.combined()
-            ratio = np.where(combined.valid[0], inside / combined.error[0], 0.0)
-            seen = max(seen, float(np.sqrt((ratio**2).sum())))
-            cleaned.append(replace(part, data=part.data - inside))
-        return tuple(cleaned) if seen > self.threshold else None
-
-    def plot(self, ax: Any = None) -> NDArray[Any]:
-        """Draw the S/N map with the candidates, and the contrast curve; see `Detection.plot`."""
-        axes = drawing.axes_for(ax, 2)
-        drawing.search(
-            axes,
-            self.snr,
-            self.grid,
-            self.table,
-            self.contrast_curve,
-            threshold=self.threshold,
-            north=None if self.observation.position_angles is None else self.north,
-            small_sample=self.error_factor.is_measured,
-        )
-        return np.array(axes)
-
-    def write(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables."""
-        folder = Path(folder)
-        about = self.detection
-        wcs = world_coordinates(self.grid, self.observation)
-        hdus = fits.HDUList(
-            [
-                primary_hdu(self.observation, about._provenance, about.sky.mjd),
-                image_hdu(self.snr, "SNR", "", wcs),
-                image_hdu(self.contrast, "CONTRAST", "", wcs),
-                image_hdu(self.error, "CONTRAST_ERROR", "", wcs),
-                image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec", wcs),
-                image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
-            ]
-        )
-        written = [folder / "wide_field.fits"]
-        write_fits(hdus, written[0])
-        for name, table in (("candidates", self.table), ("contrast", self.contrast_curve)):
-            written.append(folder / f"wide_field_{name}.ecsv")
-            with replacing(written[-1]) as temporary:
-                table.write(temporary, format="ascii.ecsv", overwrite=True)
-        return written
 
 
 def wide_field(

@@ -15,6 +15,7 @@ from pyklip_diffrender.errors import CorruptFileError
 
 __all__ = [
     "card_error",
+    "day_and_time",
     "fits_text",
     "header_date",
     "header_number",
@@ -134,6 +135,25 @@ def header_date(header: fits.Header, keys: tuple[str, ...], name: str) -> Time |
     return None
 
 
+def day_and_time(header: fits.Header, name: str) -> Time | None:
+    """Date (UTC) of DATE-OBS with TIME-OBS, None if one of them is missing; `name` is the file's.
+
+    Raises
+    ------
+    CorruptFileError
+        If together they are no date.
+    """
+    day, hour = (header_text(header, key, name) for key in ("DATE-OBS", "TIME-OBS"))
+    if not (day and hour) or "T" in day:
+        return None
+    try:
+        return Time(f"{day}T{hour}", scale="utc")
+    except ValueError as error:
+        expected = "a date such as '2022-08-11T01:02:03'"
+        cards = "DATE-OBS with TIME-OBS"
+        raise card_error(name, cards, f"{day}T{hour}", expected) from error
+
+
 def sensing_date(header: fits.Header, name: str) -> Time | None:
     """Date (UTC) at which a wavefront map was sensed, None if it is not known.
 
@@ -145,15 +165,9 @@ def sensing_date(header: fits.Header, name: str) -> Time | None:
     CorruptFileError
         If the cards do not hold a date.
     """
-    day, hour = (header_text(header, key, name) for key in ("DATE-OBS", "TIME-OBS"))
-    if day and hour and "T" not in day:
-        try:
-            return Time(f"{day}T{hour}", scale="utc")
-        except ValueError as error:
-            raise card_error(
-                name, "DATE-OBS with TIME-OBS", f"{day}T{hour}", "a date such as "
-                "'2022-08-11T01:02:03'",
-            ) from error  # fmt: skip
+    split = day_and_time(header, name)
+    if split is not None:
+        return split
     stated = header_date(header, ("DATE-OBS", "DATE-BEG"), name)
     match = _DATED_NAME.search(name)
     if stated is not None or match is None:

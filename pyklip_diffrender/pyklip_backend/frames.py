@@ -1,9 +1,6 @@
 """The frames of one wavelength of a pyKLIP dataset, with the recorded pixels where possible.
 
-The frames in ``dataset.input`` of a `JWSTData` were shifted to the centre of the array when they
-were read, which correlates their noise and makes sharp speckles ring. Where the recorded frames
-are known, the fit gets those, plus whatever was added to ``dataset.input`` since (an injected
-companion, for example). Only the subtracted frames are then shifted.
+The fit gets the pixels that the files recorded, see `recorded`, or those of ``dataset.input``.
 """
 
 from __future__ import annotations
@@ -11,7 +8,7 @@ from __future__ import annotations
 import logging
 import warnings
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from astropy import units as u
@@ -35,6 +32,7 @@ from pyklip_diffrender.pyklip_backend.pointings import (
     pointings_of,
     reference_frames,
 )
+from pyklip_diffrender.pyklip_backend.recorded import NotRecordedError, recorded_frames
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, settings_of
 from pyklip_diffrender.pyklip_backend.source import (
     ATTRIBUTE,
@@ -47,9 +45,6 @@ from pyklip_diffrender.scene.observation import Observation
 __all__ = ["Frames", "date_of_frames", "frames_of", "observation_from_dataset", "require_frames"]
 
 logger = logging.getLogger(__name__)
-
-_ROUNDING = 1e-5
-"""Relative difference of pixels that single precision explains."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,8 +246,8 @@ def _gather(
         places = source.places(dataset)
         header = source.headers[0 if places is None else places[index[0]]]
         try:
-            recorded = _recorded(source, places, dataset, index, imgs)
-        except _NotRecordedError as reason:
+            recorded = recorded_frames(source, places, dataset, index, imgs)
+        except NotRecordedError as reason:
             lost = str(reason)
         else:
             data, valid, error, centers, factor = recorded
@@ -293,116 +288,6 @@ def _gather(
         header=header,
     )
     return Frames(observation, data[usable], usable, pixels, noise, factor=factor[usable])
-
-
-class _NotRecordedError(Exception):
-    """Why the recorded pixels are not those of the dataset."""
-
-
-class _Recorded(NamedTuple):
-    """Recorded pixels with what was added to the dataset since, (n, ny, nx), and their star."""
-
-    data: NDArray[np.float64]
-    valid: NDArray[np.bool_]
-    error: NDArray[np.float64] | None
-    centers: NDArray[np.float64]
-    factor: NDArray[np.float64]
-
-
-def _recorded(
-    source: SourceFrames,
-    places: NDArray[np.intp] | None,
-    dataset: Any,
-    index: NDArray[np.intp],
-    imgs: NDArray[np.float64],
-) -> _Recorded:
-    """Recorded pixels plus what was added to `imgs` since reading, in the unit of the files.
-
-    Raises
-    ------
-    _NotRecordedError
-        If no recorded pixels correspond to those of the dataset.
-    """
-    from pyklip.klip import align_and_scale
-
-    if places is None:
-        raise _NotRecordedError("its frames are not those that were read, by their names")
-    if imgs.shape[1:] != source.aligned.shape[1:]:
-        ny, nx = source.aligned.shape[1:]
-        raise _NotRecordedError(
-            f"its frames have {imgs.shape[2]} x {imgs.shape[1]} pixels, and had {nx} x {ny} when "
-            "they were read"
-        )
-    rows = places[index]
-    before = native_float64(source.aligned[rows])
-    factor = np.array([_factor(one, other) for one, other in zip(imgs, before, strict=True)])
-    # Pixels that were NaN when they were read belong to flagged ones, whatever was filled in.
-    change = np.where(np.isfinite(before), imgs / factor[:, None, None] - before, 0.0)
-    data = native_float64(source.data[rows])
-    error = None if source.error is None else native_float64(source.error[rows])
-    if error is not None:
-        _require_same(change, error, source.usable[rows])
-    valid = source.usable[rows] & np.isfinite(data)
-    centers = native_float64(dataset.centers)[index]
-    moved = centers - source.aligned_centers[rows]
-    for i, frame in enumerate(rows):
-        shift = {"new_center": source.centers[frame], "old_center": source.aligned_centers[frame]}
-        masked = np.isnan(imgs[i]) & np.isfinite(before[i])
-        added = np.where(np.isfinite(change[i]), change[i], 0.0)
-        # A changed factor is known to the rounding of single precision.
-        if np.abs(added).max() > _ROUNDING * np.nanmax(np.abs(before[i])):
-            # Nothing is known beyond the edge of the shifted frame; assume nothing was added.
-            data[i] += np.nan_to_num(align_and_scale(added, **shift))
-        if masked.any():
-            # A pixel masked by hand invalidates every recorded pixel that contributed to it.
-            valid[i] &= np.nan_to_num(align_and_scale(masked.astype(float), **shift)) < 0.1
-    return _Recorded(data, valid, error, source.centers[rows] + moved, factor)
-
-
-def _factor(now: NDArray[np.float64], before: NDArray[np.float64]) -> float:
-    """Factor by which a frame was multiplied since it was read; 1 if it was not.
-
-    Raises
-    ------
-    _NotRecordedError
-        If it is not positive.
-    """
-    with np.errstate(invalid="ignore"):
-        bright = np.abs(before) > np.nanpercentile(np.abs(before), 90)
-    bright &= np.isfinite(now)
-    if not bright.any():
-        return 1.0
-    ratios = now[bright] / before[bright]
-    factor = float(np.median(ratios))
-    # Sources that were added since change few of the brightest pixels.
-    if abs(factor - 1) < _ROUNDING or np.median(np.abs(ratios - factor)) > _ROUNDING * abs(factor):
-        return 1.0
-    if factor <= 0:
-        raise _NotRecordedError(f"its frames were multiplied by {factor:.3g} after reading")
-    return factor
-
-
-def _require_same(
-    change: NDArray[np.float64], error: NDArray[np.float64], usable: NDArray[np.bool_]
-) -> None:
-    """Refuse frames in which most pixels were changed by more than their noise.
-
-    Faint sources change few pixels, and another background changes all by the same amount.
-
-    Raises
-    ------
-    _NotRecordedError
-    """
-    for frame, sigma, good in zip(change, error, usable, strict=True):
-        known, scale = frame[np.isfinite(frame)], sigma[good & (sigma > 0)]
-        if not known.size or not scale.size:
-            continue
-        spread = float(np.median(np.abs(known - np.median(known))))
-        if spread > float(np.median(scale)):
-            raise _NotRecordedError(
-                "most of its pixels were changed by more than their noise after reading, for "
-                "example by a filter"
-            )
 
 
 def _usable(valid: NDArray[np.bool_], name: str) -> NDArray[np.bool_]:

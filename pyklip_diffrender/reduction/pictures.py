@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import QTable
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.detection import Detection, Disk, WideField
+from pyklip_diffrender.detection import Detection, Disk, WideField, draw_search
 from pyklip_diffrender.reduction.html import Picture
 from pyklip_diffrender.reduction.result import Reduction
 from pyklip_diffrender.reduction.summary import wavefronts
@@ -195,17 +195,7 @@ def wavefront_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list
 def _search(result: Detection | WideField, klip: QTable | None = None) -> list[Any]:
     """Draw the S/N map and the contrast curve."""
     figures, axes = _panels(2)
-    drawing.search(
-        axes,
-        result.snr,
-        result.grid,
-        result.table,
-        result.contrast_curve,
-        threshold=result.threshold,
-        north=None if result.observation.position_angles is None else result.north,
-        small_sample=result.error_factor.is_measured,
-        klip=klip,
-    )
+    draw_search(axes, result, klip)
     return figures
 
 

@@ -14,7 +14,13 @@ from astropy.io import fits
 from astropy.time import Time
 
 from pyklip_diffrender.errors import CorruptFileError
-from pyklip_diffrender.io.headers import card_error, header_date, header_number, header_text
+from pyklip_diffrender.io.headers import (
+    card_error,
+    day_and_time,
+    header_date,
+    header_number,
+    header_text,
+)
 from pyklip_diffrender.io.names import same_name
 
 __all__ = [
@@ -337,15 +343,9 @@ def beginning(header: fits.Header, name: str) -> Time | None:
     whole = header_date(header, ("DATE-BEG",), name)
     if whole is not None:
         return whole
-    day, hour = (header_text(header, key, name) for key in ("DATE-OBS", "TIME-OBS"))
-    if day and hour and "T" not in day:
-        try:
-            return Time(f"{day}T{hour}", scale="utc")
-        except ValueError as error:
-            raise card_error(
-                name, "DATE-OBS with TIME-OBS", f"{day}T{hour}", "a date such as "
-                "'2022-08-11T01:02:03'",
-            ) from error  # fmt: skip
+    split = day_and_time(header, name)
+    if split is not None:
+        return split
     start = header_number(header, "EXPSTART", name)
     if start:
         return Time(start, format="mjd", scale="utc")

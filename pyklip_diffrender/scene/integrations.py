@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, uniform_filter
 from scipy.stats import median_abs_deviation
 
-__all__ = ["Judgement", "empty_integrations", "judge_integrations", "pointings"]
+__all__ = ["Judgement", "empty_integrations", "judge_integrations", "judge_pointings", "pointings"]
 
 Stack = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -57,7 +57,7 @@ _SAME_ANGLE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What is left of the integrations of a file.
+    """Integrations and pixels of a file that are used.
 
     Attributes
     ----------
@@ -151,6 +151,33 @@ def judge_integrations(
                     f"integration {k + 1} of {count}: {int(deviating.sum())} pixels that deviate "
                     "from the median of all are masked"
                 )
+    return Judgement(kept, left, tuple(remarks))
+
+
+def judge_pointings(
+    data: Stack,
+    error: Stack,
+    valid: Mask,
+    center: Stack,
+    angles: NDArray[np.float64] | None,
+    pixelscale: tuple[float, float],
+) -> Judgement:
+    """Compare the integrations of every pointing with their median, see `judge_integrations`.
+
+    Parameters
+    ----------
+    data, error, valid, center, pixelscale
+        See `judge_integrations`.
+    angles : ndarray, (frames,), or None
+        Position angles, degrees.
+    """
+    kept, left, remarks = np.ones(len(data), dtype=bool), valid.copy(), []
+    for group in pointings(center, angles):
+        part = judge_integrations(
+            data[group], error[group], valid[group], center[group], pixelscale
+        )
+        kept[group], left[group] = part.kept, part.valid
+        remarks += part.remarks
     return Judgement(kept, left, tuple(remarks))
 
 

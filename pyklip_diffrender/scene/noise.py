@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve
 from scipy.stats import median_abs_deviation
 
-__all__ = ["calibrated_errors", "calibration", "why_odd_noise"]
+__all__ = ["calibrated_errors", "weighted_mean", "why_odd_noise"]
 
 _log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ def calibrated_errors(
     center: Image,
     pixelscale: tuple[float, float],
     name: str = "frames",
-) -> Image:
+) -> tuple[Image, tuple[float, ...]]:
     """Correct the part of the errors that does not depend on the light.
 
     Pixels are compared with the mean of their four neighbours, 6 arcsec or more from the star. The
@@ -64,9 +64,11 @@ def calibrated_errors(
 
     Returns
     -------
-    ndarray, (frames, ny, nx)
+    errors : ndarray, (frames, ny, nx)
         New standard deviations. Frames with fewer than 2000 usable pixels that far from the star
         keep theirs.
+    ratios : tuple of float
+        f of every frame; NaN where there are too few pixels.
 
     Notes
     -----
@@ -78,30 +80,10 @@ def calibrated_errors(
     >>> import numpy as np
     >>> noise = np.random.default_rng(1).normal(0.0, 0.5, (1, 300, 300))
     >>> ones = np.ones_like(noise)
-    >>> error = calibrated_errors(noise, ones, ones > 0, np.array([[150, 150]]), (0.063, 0.063))
-    >>> bool(abs(error.mean() - 0.5) < 0.01)
-    True
-    """
-    return calibration(data, error, valid, center, pixelscale, name)[0]
-
-
-def calibration(
-    data: Image,
-    error: Image,
-    valid: NDArray[np.bool_],
-    center: Image,
-    pixelscale: tuple[float, float],
-    name: str = "frames",
-) -> tuple[Image, tuple[float, ...]]:
-    """Corrected errors, and the scatter far from the star over the errors that were stated.
-
-    The arguments are those of `calibrated_errors`.
-
-    Returns
-    -------
-    errors : ndarray, (frames, ny, nx)
-    ratios : tuple of float
-        For every frame; NaN where there are too few pixels.
+    >>> center = np.array([[150, 150]])
+    >>> error, (ratio,) = calibrated_errors(noise, ones, ones > 0, center, (0.063, 0.063))
+    >>> bool(abs(error.mean() - 0.5) < 0.01), bool(abs(ratio - 0.5) < 0.01)
+    (True, True)
     """
     corrected, ratios = error.copy(), []
     for k, (ratio, floor) in enumerate(_measured(data, error, valid, center, pixelscale)):
@@ -116,13 +98,33 @@ def calibration(
     return corrected, tuple(ratios)
 
 
+def weighted_mean(
+    data: Image, error: Image, valid: NDArray[np.bool_]
+) -> tuple[Image, Image, NDArray[np.bool_]]:
+    """Mean of frames, (frames, ny, nx), weighted by their inverse variances pixel by pixel.
+
+    Returns
+    -------
+    mean, error : ndarray, (ny, nx)
+        0 and 1 where no frame is valid.
+    valid : ndarray of bool, (ny, nx)
+    """
+    # Masked pixels may have any value if the data were replaced, also NaN.
+    weight = np.where(valid, np.where(valid, error, 1.0) ** -2, 0.0)
+    total = weight.sum(axis=0)
+    covered = total > 0
+    safe = np.where(covered, total, 1.0)
+    mean = (weight * np.where(valid, data, 0.0)).sum(axis=0) / safe
+    return mean, np.where(covered, safe**-0.5, 1.0), covered
+
+
 def why_odd_noise(ratios: Iterable[float]) -> str:
     """Why errors cannot be those of the pixels; empty if they can.
 
     Parameters
     ----------
     ratios : iterable of float
-        See `calibration`.
+        See `calibrated_errors`.
     """
     low, high = _PLAUSIBLE
     for ratio in ratios:

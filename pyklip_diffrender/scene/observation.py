@@ -15,38 +15,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import (
-    IncompatibleSetupError,
     NoValidPixelsError,
     ShapeError,
-    UnitError,
 )
 from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.io.units import (
-    native_float64,
-    require_finite,
-    require_shape,
-    to_arcsec,
-    to_pair,
-    to_unit,
-)
+from pyklip_diffrender.scene.checked_frames import checked_frames
 from pyklip_diffrender.scene.exposure import star_of
-from pyklip_diffrender.scene.integrations import judge_integrations, pointings
+from pyklip_diffrender.scene.integrations import judge_pointings, pointings
 from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints, without_empty
-from pyklip_diffrender.scene.noise import calibration
+from pyklip_diffrender.scene.noise import calibrated_errors, weighted_mean
 from pyklip_diffrender.scene.window import Window
 
 __all__ = ["Observation"]
 
 _log = logging.getLogger(__name__)
-
-
-def _spread(array: NDArray[np.float64], shape: tuple[int, ...], name: str) -> NDArray[np.float64]:
-    """Copy of an array, repeated to a shape."""
-    try:
-        return np.broadcast_to(array, shape).copy()
-    except ValueError as error:
-        raise ShapeError(f"{name}: got shape {array.shape}, expected {shape}") from error
 
 
 @dataclass(frozen=True)
@@ -161,56 +144,16 @@ class Observation:
         NoValidPixelsError
             A frame without valid pixels.
         """
-        name = details.get("name", "observation")
-        try:
-            unit = u.Unit(unit)
-        except (ValueError, TypeError) as reason:
-            raise UnitError(
-                f"{name}: got the unit {unit!r}, expected an astropy unit such as 'MJy/sr'"
-            ) from reason
-        values = to_unit(data, unit, f"{name}: data")
-        values = values[None] if values.ndim == 2 else values
-        if values.ndim != 3 or values.size == 0:
-            raise ShapeError(
-                f"{name}: data: got shape {np.shape(data)}, expected ([frames,] ny, nx)"
-            )
-        sigma = to_unit(error, unit, f"{name}: error")
-        sigma = sigma[None] if sigma.ndim == 2 else sigma
-        require_shape(sigma, values.shape, f"{name}: error", "Give one error for every pixel")
-        good = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
-        if valid is not None:
-            mask = np.asarray(valid, dtype=bool)
-            mask = mask[None] if mask.ndim == 2 else mask
-            require_shape(mask, values.shape, f"{name}: valid", "Give one value for every pixel")
-            good &= mask
-        empty = np.flatnonzero(~good.any(axis=(1, 2)))
-        if len(empty):
-            raise NoValidPixelsError(
-                f"{name}: all {values[0].size} pixels of frame {int(empty[0])} are masked, not "
-                "finite or without an error. Look at its DQ"
-            )
-        if details.get("star_offset") is not None:
-            details["star_offset"] = to_pair(details["star_offset"], u.arcsec, "star_offset")
-        if details.get("position_angles") is not None:
-            angles = to_unit(details["position_angles"], u.deg, "position_angles")
-            details["position_angles"] = _spread(angles, (len(values),), f"{name}: position_angles")
-        frames, ny, nx = values.shape
-        position = native_float64([(nx - 1) / 2, (ny - 1) / 2] if center is None else center)
-        require_finite(position, f"{name}: center")
-        scale = _spread(to_arcsec(pixelscale, "pixelscale"), (2,), f"{name}: pixelscale")
-        if not (np.isfinite(scale) & (scale > 0)).all():
-            raise IncompatibleSetupError(
-                f"{name}: pixelscale: got {pixelscale}, expected a positive number of arcsec per "
-                "pixel, such as 0.0624"
-            )
         return cls(
-            np.where(good, values, 0.0),
-            np.where(good, sigma, 1.0),
-            good,
-            unit,
-            (float(scale[0]), float(scale[1])),
-            _spread(position, (frames, 2), f"{name}: center"),
-            **details,
+            **checked_frames(
+                data,
+                error,
+                valid=valid,
+                unit=unit,
+                pixelscale=pixelscale,
+                center=center,
+                **details,
+            )
         )
 
     @classmethod
@@ -255,7 +198,7 @@ class Observation:
             changes = on_detector_pixels(arguments, observation.center, shifts)
             observation = replace(observation, **changes)
         if observation.is_nircam:
-            error, ratios = calibration(
+            error, ratios = calibrated_errors(
                 observation.data,
                 observation.error,
                 observation.valid,
@@ -269,27 +212,22 @@ class Observation:
 
     def judged(self) -> Observation:
         """Leave out what deviates from the median of the integrations of one pointing."""
-        kept, valid = np.ones(len(self), dtype=bool), self.valid.copy()
-        remarks = list(self.remarks)
-        for group in pointings(self.center, self.position_angles):
-            judgement = judge_integrations(
-                self.data[group], self.error[group], self.valid[group], self.center[group],
-                self.pixelscale,
-            )  # fmt: skip
-            kept[group], valid[group] = judgement.kept, judgement.valid
-            remarks += judgement.remarks
-        if kept.all() and (valid == self.valid).all():
+        judgement = judge_pointings(
+            self.data, self.error, self.valid, self.center, self.position_angles, self.pixelscale
+        )
+        valid = judgement.valid
+        if judgement.kept.all() and (valid == self.valid).all():
             return self
-        for remark in remarks[len(self.remarks) :]:
+        for remark in judgement.remarks:
             _log.warning("%s: %s", self.name, remark)
         cleaned = replace(
             self,
             data=np.where(valid, self.data, 0.0),
             error=np.where(valid, self.error, 1.0),
             valid=valid,
-            remarks=tuple(remarks),
+            remarks=(*self.remarks, *judgement.remarks),
         )
-        return cleaned.part(np.flatnonzero(kept))
+        return cleaned.part(np.flatnonzero(judgement.kept))
 
     def part(self, which: NDArray[np.intp]) -> Observation:
         """Some of the frames, by their indices."""
@@ -500,17 +438,12 @@ class Observation:
 
         Only for frames that see the star at the same place under the same wavefront.
         """
-        # Masked pixels may have any value if the data were replaced, also NaN.
-        weight = np.where(self.valid, np.where(self.valid, self.error, 1.0) ** -2, 0.0)
-        total = weight.sum(axis=0)
-        covered = total > 0
-        safe = np.where(covered, total, 1.0)
-        light = np.where(self.valid, self.data, 0.0)
+        data, error, valid = weighted_mean(self.data, self.error, self.valid)
         return replace(
             self,
-            data=((weight * light).sum(axis=0) / safe)[None],
-            error=np.where(covered, safe**-0.5, 1.0)[None],
-            valid=covered[None],
+            data=data[None],
+            error=error[None],
+            valid=valid[None],
             center=self.center.mean(axis=0, keepdims=True),
             position_angles=None if self.position_angles is None else self.position_angles[:1],
         )
