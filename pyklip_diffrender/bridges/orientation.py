@@ -14,7 +14,7 @@ Matrix = tuple[tuple[int, int], tuple[int, int]]
 
 @dataclass(frozen=True)
 class Orientation:
-    """One of the eight symmetries of the square, as the matrix that acts on positions (x, y).
+    """A symmetry of the square, one of eight, as the matrix that acts on positions (x, y).
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Orientation:
         return turned
 
     def then(self, later: Orientation) -> Orientation:
-        """This change, followed by another."""
+        """Return the change, followed by another."""
         a, b = later.matrix, self.matrix
         rows = [[sum(a[i][k] * b[k][j] for k in (0, 1)) for j in (0, 1)] for i in (0, 1)]
         return Orientation(((rows[0][0], rows[0][1]), (rows[1][0], rows[1][1])))

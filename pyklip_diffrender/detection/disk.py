@@ -330,7 +330,7 @@ class _Sources:
         )
 
     def dark(self) -> _Sources:
-        """The same without light."""
+        """Return the sources without light."""
         light = {k: np.zeros_like(each) for k, each in self.light.items()}
         return replace(self, contrasts=np.zeros_like(self.contrasts), light=light)
 

@@ -95,7 +95,7 @@ class ErrorFactor:
 
     @classmethod
     def constant(cls, factor: float) -> ErrorFactor:
-        """The same factor everywhere, which no scatter was measured for."""
+        """Make a factor that is equal everywhere, for which no scatter was measured."""
         one = np.ones((1, 1))
         return cls(factor * one, np.inf * one, np.zeros((1, 1, 2)))
 
@@ -116,7 +116,7 @@ class ErrorFactor:
         return np.asarray(stats.t.isf(stats.norm.sf(sigmas), self._freedom_of(offsets)))
 
     def threshold_at(self, sigmas: float, separation: ArrayLike) -> Image:
-        """The same at separations, arcsec, from the median of the degrees of freedom."""
+        """Threshold at separations, arcsec, from the median of the degrees of freedom."""
         freedom = _inverse(self._on_circles(1 / self.freedom, separation))
         return np.asarray(stats.t.isf(stats.norm.sf(sigmas), freedom))
 

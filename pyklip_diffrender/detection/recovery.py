@@ -60,7 +60,7 @@ _UNITS = {"separation": u.arcsec, "position_angle": u.deg}
 
 
 class MeasuredPlanet(NamedTuple):
-    """What is measured of a planet.
+    """Measurement of a planet.
 
     Attributes
     ----------
@@ -164,7 +164,7 @@ def with_planets(frames: Sequence[FrameFit], planets: Sequence[Planet]) -> tuple
 
 
 def measured_planet(detection: Detection, place: tuple[float, float]) -> MeasuredPlanet:
-    """What is measured of a planet of which the position is known.
+    """Measure a planet of which the position is known.
 
     Parameters
     ----------

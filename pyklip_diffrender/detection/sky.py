@@ -17,7 +17,7 @@ __all__ = ["Positions", "Sky"]
 
 @dataclass(frozen=True)
 class Sky:
-    """What relates the frames of a detection to the sky.
+    """Relation of the frames of a detection to the sky.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Sky:
 
     @property
     def facts(self) -> dict[str, float | str]:
-        """What is known of epoch and star, for headers."""
+        """Epoch and star, as far as they are known, for headers."""
         known = {"epoch": self.date, "star_flux_density_jy": self.star_jansky}
         return {name: value for name, value in known.items() if value is not None}
 

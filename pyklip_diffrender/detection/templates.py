@@ -192,7 +192,7 @@ class Templates:
             return (self.frames[k].flux * self.image(k, offset)).cpu()
 
     def _with_slopes(self, k: int, offset: Tensor) -> Tensor:
-        """The same with its derivatives, (3, ny, nx).
+        """Light of a planet and its derivatives, (3, ny, nx).
 
         Central differences: a fast path renders single stars, but only without forward-mode
         derivatives, which take three times as long as four more images.

@@ -152,7 +152,7 @@ class WholeFrame:
 
     @cached_property
     def fine_image(self) -> ImagePSF:
-        """The same for photutils, larger and sampled more finely than the pixels."""
+        """The kernel as a model for photutils, larger and sampled more finely than the pixels."""
         from photutils.psf import ImagePSF
 
         fine = np.empty((_FINE * _REACH, _FINE * _REACH))

@@ -139,7 +139,7 @@ class SkyModel:
         return np.asarray(np.maximum(information, 1e-6 * information.max()) ** -0.5)
 
     def light(self) -> Light:
-        """What the frames show beside the star, (1, ny, nx) by frame."""
+        """Light of the frames beside the star, (1, ny, nx) by frame."""
         return [
             {k: linear.frames[k].residual.double()[None] for k in templates.frames}
             for linear, templates in self.groups

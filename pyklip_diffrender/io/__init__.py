@@ -1,4 +1,4 @@
-"""What crosses the package's border: units, files and headers."""
+"""Units, files and headers: everything that crosses the package's border."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 __all__ = ["same_name", "unknown_name"]
 
 _SIMBAD = re.compile(r"(V|NAME|\*+)?\*?[\s_-]+", re.IGNORECASE)
-"""What SIMBAD, and observers after it, write before names: V* AU Mic, V-AU-MIC, * bet Pic."""
+"""Prefixes of names in SIMBAD, and of observers after it: V* AU Mic, V-AU-MIC, * bet Pic."""
 
 
 _SIGN = re.compile(r"\+(?=\s*\d)")

@@ -14,7 +14,7 @@ from pyklip_diffrender.io.html_repr import html_summary
 __all__ = ["FLAT", "OPDMap"]
 
 FLAT = "flat"
-"""What stands for a flat wavefront in place of a map."""
+"""Word for a flat wavefront in place of a map."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,8 @@ _TILT = 0.35
 0.35 for low modes, whose light falls on the occulter."""
 
 _TILT_OF_SLOPES = 0.5
-"""The same for derivatives by other parameters. The position of the star needs accurate ones."""
+"""Error of derivatives by other parameters that followed a shift of the star, per radian of tilt.
+The position of the star needs accurate ones."""
 
 _FOLLOWED = 0.1
 """Error of derivatives that followed another change in the last pupil, per radian: 0.05 within half

@@ -91,7 +91,7 @@ class PupilGrid:
         )
 
     def widened(self, margin: float) -> PupilGrid:
-        """This window with `margin` metres added on every side, inside the full array."""
+        """Return the window with `margin` metres added on every side, inside the full array."""
         extra = int(np.ceil(margin / self.spacing))
         return replace(
             self,

@@ -49,7 +49,7 @@ a companion or background source of that star, or a cosmic ray."""
 
 
 class _Pair(NamedTuple):
-    """The same pixels in frames of two stars, (2, pixels) each."""
+    """Pixels that frames of two stars share, (2, pixels) each."""
 
     light: Image
     left: Image
@@ -90,7 +90,7 @@ def pattern_pedestal(fits: Sequence[Refinement]) -> float:
 
 
 def _pairs_of_stars(fits: Sequence[Refinement]) -> Iterator[_Pair]:
-    """The same pixels of frames of stars whose brightness differs."""
+    """Shared pixels of frames of stars whose brightness differs."""
     for a, b in combinations([frame for fit in fits for frame in fit.frames], 2):
         pixel, star = a.observation.first_pixel, a.observation.target
         if pixel is None or pixel != b.observation.first_pixel or star == b.observation.target:

@@ -1,4 +1,4 @@
-"""What can be checked in a second before minutes of fitting."""
+"""Checks that take a second, before minutes of fitting."""
 
 from __future__ import annotations
 

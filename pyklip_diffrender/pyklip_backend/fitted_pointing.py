@@ -57,7 +57,7 @@ class FittedPointing:
 
     @cached_property
     def box(self) -> Window:
-        """What can be rendered: all valid pixels of the frames, or the fitted square only.
+        """Pixels that can be rendered: all valid ones of the frames, or the fitted square only.
 
         The fitted wavefront is rendered on a larger detector if the model's field of view can be
         changed.
@@ -112,7 +112,7 @@ class FittedPointing:
         return np.asarray(linear.frames[self.index].image(change[:, None])[0].numpy())
 
     def change_in_frames(self, change: Tensor) -> Image:
-        """The same on the pixels of the frames, (Ny, Nx); only background outside the square."""
+        """Change of the star in the frames, (Ny, Nx); only background outside the square."""
         background = sum(
             float(value)
             for unknown, value in zip(self.result.linear.unknowns, change, strict=True)
@@ -122,7 +122,7 @@ class FittedPointing:
         return np.where(np.isnan(star), background, star)
 
     def _last_step(self) -> Image:
-        """What the linear model's solution adds to the star, (Ny, Nx)."""
+        """Change of the star by the linear model's solution, (Ny, Nx)."""
         # Takes a second to import.
         from pyklip_diffrender.refinement import Status
 

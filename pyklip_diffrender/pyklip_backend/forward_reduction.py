@@ -22,7 +22,7 @@ from pyklip_diffrender.pyklip_backend.forward_model import (
 )
 from pyklip_diffrender.pyklip_backend.placement import fill
 from pyklip_diffrender.pyklip_backend.planet_fit import planet_cards
-from pyklip_diffrender.pyklip_backend.reduction import Reduction
+from pyklip_diffrender.pyklip_backend.reduction import DatasetReduction
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.wavefront.opd import OPDMap
@@ -30,8 +30,8 @@ from pyklip_diffrender.wavefront.opd import OPDMap
 __all__ = ["ForwardReduction"]
 
 
-class ForwardReduction(Reduction):
-    """A call of `pyklip.fm.klip_dataset` for this backend; see `Reduction`."""
+class ForwardReduction(DatasetReduction):
+    """A call of `pyklip.fm.klip_dataset` for this backend; see `DatasetReduction`."""
 
     def __init__(self, arguments: Mapping[str, Any], settings: DiffrenderSettings) -> None:
         super().__init__(arguments, settings)

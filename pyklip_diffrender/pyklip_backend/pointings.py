@@ -32,7 +32,7 @@ from the star."""
 
 
 class FrameDetails(NamedTuple):
-    """What the file of one frame says, beyond what an `Observation` of several frames holds."""
+    """Details of one frame, from its file, that an `Observation` of several does not hold."""
 
     name: str
     header: fits.Header

@@ -63,7 +63,7 @@ from pyklip_diffrender.pyklip_backend.throughput import (
 )
 from pyklip_diffrender.wavefront.opd import OPDMap
 
-__all__ = ["RESULTS", "Reduction", "mark_filtered"]
+__all__ = ["RESULTS", "DatasetReduction", "mark_filtered"]
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +73,7 @@ RESULTS = "diffrender_results"
 _FILTERED = "_diffrender_filtered"
 
 
-class Reduction:
+class DatasetReduction:
     """A call of `klip_dataset` with ``algo="diffrender"``.
 
     Parameters

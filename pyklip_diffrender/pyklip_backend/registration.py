@@ -22,7 +22,7 @@ from pyklip_diffrender.pyklip_backend.child import announce, spawned_beside_klip
 from pyklip_diffrender.pyklip_backend.forward_reduction import ForwardReduction
 from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
 from pyklip_diffrender.pyklip_backend.products import ReductionRecord
-from pyklip_diffrender.pyklip_backend.reduction import RESULTS, Reduction, mark_filtered
+from pyklip_diffrender.pyklip_backend.reduction import RESULTS, DatasetReduction, mark_filtered
 from pyklip_diffrender.pyklip_backend.settings import (
     DiffrenderSettings,
     OPDLike,
@@ -46,7 +46,7 @@ ALGORITHM = "diffrender"
 """Value of the argument `algo` of `klip_dataset`."""
 
 BOTH = f"{ALGORITHM}+klip"
-"""The same, for KLIP's products beside those of this backend."""
+"""Name of the algorithm that writes KLIP's products beside those of this backend."""
 
 
 class _Patches:
@@ -338,7 +338,7 @@ def dispatch(*args: Any, **kwargs: Any) -> None:
     if _is_ours(arguments["algo"]):
         settings = _settings_for(arguments["dataset"])
         before = dict(vars(arguments["dataset"]))
-        Reduction(arguments, settings).run(klip_dataset.original)
+        DatasetReduction(arguments, settings).run(klip_dataset.original)
         if _name(arguments["algo"]) == BOTH:
             _run_klip(klip_dataset.original(), arguments, before)
     else:

@@ -157,7 +157,7 @@ class DiffrenderSettings:
     subtractor: Callable[..., Any] | None = None
 
     def over(self, other: DiffrenderSettings) -> DiffrenderSettings:
-        """These settings, completed by those of `other`."""
+        """Complete the settings by those of `other`."""
         merged: dict[str, Any] = {}
         for name in (field.name for field in dataclasses.fields(self)):
             own = getattr(self, name)

@@ -40,7 +40,8 @@ _DENSE = 5
 """Pixels about a companion of the fit within which every pixel is computed."""
 
 _INNER = 15
-"""The same about the star, where interpolation would err by up to 15 %."""
+"""Pixels about the star within which every pixel is computed: interpolation would err there by up
+to 15 %."""
 
 _CORE = 0.5
 """FWHM in lambda/D of the Gaussian with which a source's peak is measured."""

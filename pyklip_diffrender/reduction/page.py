@@ -199,7 +199,7 @@ def _candidates(summary: Mapping[str, Any]) -> str:
 
 
 def _disk(summary: Mapping[str, Any]) -> str:
-    """What was fitted as extended light."""
+    """The extended light that was fitted."""
     disk = summary["disk"]
     axis = (
         ""

@@ -164,23 +164,23 @@ class Preparation:
 class _Run:
     """The steps of a reduction."""
 
-    given: Preparation
+    preparation: Preparation
     progress: bool
 
     def result(self) -> Reduction:
-        options, whole = self.given.options, self.given.whole.science
+        options, whole = self.preparation.options, self.preparation.whole.science
         choice, fit = fit_with_pattern(
-            self.given.sequence.science,
-            self.given.sequence.references,
-            self.given.model,
-            self.given.wavefront,
+            self.preparation.sequence.science,
+            self.preparation.sequence.references,
+            self.preparation.model,
+            self.preparation.wavefront,
             self._first_fit,
             systematics=options.systematics,
             settings=options.settings,
             memory=options.memory,
             progress=self.progress,
         )
-        sequence = replace(self.given.sequence, science=choice.science)
+        sequence = replace(self.preparation.sequence, science=choice.science)
         disk = wide = injections = None
         if options.disk:
             with stage("extended light, and wavefront without it"):
@@ -217,11 +217,11 @@ class _Run:
             return self._fit(choice.science, choice)
 
     def _fit(self, science: Iterable[Observation], choice: PatternChoice) -> Refinement:
-        options = self.given.options
+        options = self.preparation.options
         fit = refine(
-            self.given.model,
+            self.preparation.model,
             tuple(science),
-            self.given.wavefront,
+            self.preparation.wavefront,
             systematics=choice.systematics,
             settings=choice.settings,
             progress=self.progress,
@@ -232,14 +232,14 @@ class _Run:
         return with_star_flux(fit, flux, error, progress=self.progress)
 
     def _search(self, fit: Refinement) -> Detection:
-        return detect(fit, threshold=self.given.options.threshold, progress=self.progress)
+        return detect(fit, threshold=self.preparation.options.threshold, progress=self.progress)
 
     def _inject(self, detection: Detection, choice: PatternChoice) -> QTable | None:
         """Measure injected planets; None, with a message, where that fails."""
         try:
             return recover_planets(
                 detection,
-                self.given.options.injections,
+                self.preparation.options.injections,
                 lambda science: self._search(self._fit(science, choice)),
             )
         except DiffrenderError as error:  # The reduction is complete without it.

@@ -74,7 +74,7 @@ class Reduction:
 
     @property
     def remark(self) -> str:
-        """What to do about a poor fit, or about extended light; else empty."""
+        """Advice about a poor fit, or about extended light; else empty."""
         if self.fit.chi2_per_pixel > _HOPELESS:
             return (
                 "The residual is so far above the noise that something basic is wrong: check that "

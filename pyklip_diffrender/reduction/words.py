@@ -55,7 +55,7 @@ _REFERENCES = (
 
 
 def advice(status: Status, *, patterned: bool, remark: str = "") -> str:
-    """What to do about the status of a fit.
+    """Advice about the status of a fit.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def _compact(summary: Mapping[str, Any]) -> str:
 
 
 def _limit(summary: Mapping[str, Any]) -> Sequence[str]:
-    """What would have been seen, if that is known anywhere."""
+    """The faintest planet that would have been seen, if that is known anywhere."""
     if not summary["limits"]:
         return []
     row = min(summary["limits"], key=lambda each: abs(each["separation_arcsec"] - _SENTENCE_AT))

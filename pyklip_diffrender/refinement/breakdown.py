@@ -1,4 +1,4 @@
-"""What a fit says if its linear algebra breaks down."""
+"""The error of a fit whose linear algebra breaks down."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all refinement methods share: data, noise, the forward model in the data's unit."""
+"""A frame to be fitted: data, noise, and the forward model in the data's unit."""
 
 from __future__ import annotations
 

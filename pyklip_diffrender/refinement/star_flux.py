@@ -28,8 +28,8 @@ is seen, and the prior on the wavefront decides how much of it a star has: fits 
 brighter or fainter explain real frames nearly as well (docs/validation/real_frames.md)."""
 
 _WITHOUT_MAP = 0.4
-"""The same for fits that start from a flat wavefront: two rolls of G 7-34 came out 2 % too faint in
-F444W, and 44 % too bright in F356W."""
+"""Relative error for fits that start from a flat wavefront: two rolls of G 7-34 came out 2 % too
+faint in F444W, and 44 % too bright in F356W."""
 
 _HELD = 0.003
 """Relative deviation of a star's flux from that of a catalogue. The posterior of a fit understates

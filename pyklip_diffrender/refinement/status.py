@@ -32,7 +32,7 @@ class Status(Enum):
 
     @property
     def message(self) -> str:
-        """The same as the value."""
+        """Text of the status: its value."""
         return self.value
 
     @property

@@ -1,4 +1,4 @@
-"""What is observed: stars and planets, observed frames, simulated frames."""
+"""Stars and planets, observed frames, and simulated frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What observations need in common to be fitted together."""
+"""Requirements on observations that are fitted together."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def _candidate(path: Path) -> Candidate:
 
 
 def left(candidates: Iterable[Candidate]) -> list[Candidate]:
-    """Those that are not excluded."""
+    """Files that are not excluded."""
     return [each for each in candidates if not each.reason]
 
 
@@ -159,7 +159,7 @@ def _why_unusable(exposure: Exposure) -> str:
 
 
 def _moment(candidate: Candidate) -> tuple[object, ...] | None:
-    """What the files of one exposure have in common; None if that is not known.
+    """Identity, roll and time, which the files of one exposure share; None if they are not known.
 
     Copies whose headers were given another roll or date are no files of one exposure.
     """

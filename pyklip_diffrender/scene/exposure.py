@@ -1,4 +1,4 @@
-"""What the header of a file says about its exposure.
+"""The exposure of a file, as its header describes it.
 
 No card has a default here: a value that is not stated is None, and whoever needs it has to say so.
 """
@@ -220,7 +220,7 @@ class Exposure:
 
     @property
     def setup(self) -> tuple[str | None, ...]:
-        """What frames that are reduced together have in common."""
+        """Instrument, mask, filter and unit, which frames that are reduced together share."""
         return (self.instrument, self.detector, self.mask, self.stop, self.filter, self.unit)
 
 

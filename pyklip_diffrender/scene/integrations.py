@@ -171,14 +171,15 @@ def judge_pointings(
     angles : ndarray, (frames,), or None
         Position angles, degrees.
     """
-    kept, left, remarks = np.ones(len(data), dtype=bool), valid.copy(), []
+    kept, left = np.ones(len(data), dtype=bool), valid.copy()
+    remarks: tuple[str, ...] = ()
     for group in pointings(center, angles):
         part = judge_integrations(
             data[group], error[group], valid[group], center[group], pixelscale
         )
         kept[group], left[group] = part.kept, part.valid
         remarks += part.remarks
-    return Judgement(kept, left, tuple(remarks))
+    return Judgement(kept, left, remarks)
 
 
 def _median(data: Stack, valid: Mask) -> Stack:

@@ -230,7 +230,7 @@ class Observation:
         return cleaned.part(np.flatnonzero(judgement.kept))
 
     def part(self, which: NDArray[np.intp]) -> Observation:
-        """Some of the frames, by their indices."""
+        """Select frames by their indices."""
         angles, ratios = self.position_angles, self.noise_ratios
         return replace(
             self,

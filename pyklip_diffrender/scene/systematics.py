@@ -1,4 +1,4 @@
-"""What is known of the error of the star model, pixel by pixel."""
+"""The known error of the star model, pixel by pixel: the flat-field pattern."""
 
 from __future__ import annotations
 

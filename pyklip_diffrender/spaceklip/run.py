@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 
 class Database(Protocol):
-    """What `run_obs` uses of a `spaceKLIP.database.Database`.
+    """The part of a `spaceKLIP.database.Database` that `run_obs` uses.
 
     Attributes
     ----------

@@ -114,7 +114,7 @@ class SequenceConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """What a survey is to do.
+    """The configuration of a survey.
 
     Attributes
     ----------
@@ -317,7 +317,7 @@ def _options(table: _Table, default: Options) -> Options:
 
 
 def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
-    """What is wrong with arguments of `GaussNewton.nircam`."""
+    """Mistakes in arguments of `GaussNewton.nircam`."""
     unknown = sorted(set(settings) - set(_SETTINGS))
     if unknown:
         known = ", ".join(_SETTINGS)

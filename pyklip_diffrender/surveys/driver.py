@@ -142,7 +142,7 @@ def _execute(
 
 
 class _Board:
-    """What is known of all jobs, on disk while the survey runs."""
+    """Tables and page of all jobs, on disk while the survey runs."""
 
     def __init__(self, todo: list[Job], output: Path) -> None:
         self.output, self.todo = output, todo

@@ -123,7 +123,7 @@ def write_record(folder: Path, job: Job, record: Mapping[str, Any]) -> Record:
 
 
 def encodable(value: Any) -> Any:
-    """The same nested values with text that UTF-8 can encode.
+    """Make the text in nested values such that UTF-8 can encode it.
 
     Names of files, and messages that quote them, may have bytes of another encoding, which Python
     keeps as surrogates and no table takes.

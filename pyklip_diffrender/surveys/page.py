@@ -1,4 +1,4 @@
-"""What a survey has shown so far, as one HTML page that loads nothing from anywhere."""
+"""The results of a survey so far, as one HTML page that loads nothing from anywhere."""
 
 from __future__ import annotations
 

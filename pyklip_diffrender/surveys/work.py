@@ -65,14 +65,14 @@ def _planet(injection: Injection, north: float) -> Planet:
 
 
 def _recovered(reduction: Reduction, planet: Injection) -> dict[str, Any]:
-    """What is measured of an injected planet: of its candidate, else at its place."""
+    """Measure an injected planet: its candidate, or else the position of the injection."""
     found = reduction.detection
     measured = measured_planet(found, _planet(planet, found.north).offset)._asdict()
     return {key: value if math.isfinite(value) else None for key, value in measured.items()}
 
 
 def _result(summary: dict[str, Any]) -> dict[str, Any]:
-    """What the tables and the page of a survey need of a reduction."""
+    """Facts of a reduction for the tables and the page of a survey."""
     keys = ("target", "filter", "sentence", "limits", "threshold_snr", "left_out")
     search = summary["wide_field"] or summary
     curve = search["contrast_curve"]
