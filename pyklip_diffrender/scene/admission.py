@@ -13,8 +13,8 @@ from astropy.time import Time
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.io.names import same_name, unknown_name
-from pyklip_diffrender.scene.candidates import Candidate, left, require_some
 from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure
+from pyklip_diffrender.scene.frame_files import FrameFile, admissible, require_some
 from pyklip_diffrender.scene.noise import why_odd_noise
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.pixel_checks import (
@@ -40,7 +40,7 @@ EPOCH = 5.0
 """Days between frames that may share a wavefront map."""
 
 
-def choose_filter(candidates: Sequence[Candidate], filter: str | None) -> str:
+def choose_filter(files: Sequence[FrameFile], filter: str | None) -> str:
     """Exclude frames of other filters; returns the one that is left.
 
     Raises
@@ -50,20 +50,20 @@ def choose_filter(candidates: Sequence[Candidate], filter: str | None) -> str:
     NoValidPixelsError
         If no file states its filter.
     """
-    for each in left(candidates):
+    for each in admissible(files):
         if each.exposure.filter is None:
             each.reason = "the header does not say through which FILTER it was taken"
-    require_some(candidates)
-    filter = _the_only("filter", filter, [each.exposure.filter for each in left(candidates)])
-    for each in left(candidates):
+    require_some(files)
+    filter = _the_only("filter", filter, [each.exposure.filter for each in admissible(files)])
+    for each in admissible(files):
         if not same_name(each.exposure.filter, filter):
             each.reason = f"taken through {each.exposure.filter}, not {filter}"
     return filter
 
 
 def choose_target(
-    candidates: Sequence[Candidate], target: str | None
-) -> tuple[list[Candidate], list[Candidate]]:
+    files: Sequence[FrameFile], target: str | None
+) -> tuple[list[FrameFile], list[FrameFile]]:
     """Tell stars apart; returns the frames of the target and those of reference stars.
 
     Raises
@@ -71,7 +71,7 @@ def choose_target(
     IncompatibleSetupError
         If the target cannot be decided, with the choices.
     """
-    usable = left(candidates)
+    usable = admissible(files)
     stars = _by_star(usable)
     for star, frames in stars.items():
         for each in frames:
@@ -98,7 +98,7 @@ def choose_target(
             if not all(each.exposure.reference for each in frames)
         }  # fmt: skip
         if not free:
-            _require_no_lost_target(candidates, stars)
+            _require_no_lost_target(files, stars)
         names = [each.star for frames in (free or stars).values() for each in frames]
         chosen = _the_only("target", None, names)
     else:
@@ -123,16 +123,16 @@ def choose_target(
                 "the header does not say which star it is. Add TARGPROP, TARGNAME, or TARG_RA and "
                 "TARG_DEC, or IS_PSF for a reference star"
             )
-    return stars[chosen], left(references)
+    return stars[chosen], admissible(references)
 
 
 def _require_no_lost_target(
-    candidates: Sequence[Candidate], stars: Mapping[str, Sequence[Candidate]]
+    files: Sequence[FrameFile], stars: Mapping[str, Sequence[FrameFile]]
 ) -> None:
     """Refuse to take a reference star for the target because the target's frames are excluded."""
     marked = [each.exposure.star for frames in stars.values() for each in frames]
     lost = [
-        each for each in candidates
+        each for each in files
         if each.reason and each.exposure.star.is_known and not each.exposure.reference
         and not any(each.exposure.star.is_same(star) for star in marked)
     ]  # fmt: skip
@@ -144,10 +144,10 @@ def _require_no_lost_target(
         )
 
 
-def _by_star(candidates: Sequence[Candidate]) -> dict[str, list[Candidate]]:
+def _by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
     """Group frames by star, by the proposer's name that most of them have."""
-    groups: list[list[Candidate]] = []
-    for each in candidates:
+    groups: list[list[FrameFile]] = []
+    for each in files:
         if not each.exposure.star.is_known:
             continue
         alike = [
@@ -156,7 +156,7 @@ def _by_star(candidates: Sequence[Candidate]) -> dict[str, list[Candidate]]:
         ]  # fmt: skip
         groups = [group for group in groups if group not in alike]
         groups.append([other for group in alike for other in group] + [each])
-    stars: dict[str, list[Candidate]] = {}
+    stars: dict[str, list[FrameFile]] = {}
     for group in groups:
         names = Counter(each.exposure.star.names[:1] for each in group if each.exposure.star.names)
         place = next(
@@ -176,7 +176,7 @@ def _namesake(star: CatalogueStar, target: CatalogueStar) -> str:
     return f"a star of the target's name whose TARG_RA and TARG_DEC are {distance}"
 
 
-def exclude_other_setups(science: Sequence[Candidate], references: Sequence[Candidate]) -> None:
+def exclude_other_setups(science: Sequence[FrameFile], references: Sequence[FrameFile]) -> None:
     """Keep the set-up that most of the target's frames have."""
     counts = Counter(each.exposure.setup for each in science)
     everywhere = Counter(each.exposure.setup for each in (*science, *references))
@@ -201,7 +201,7 @@ def exclude_other_setups(science: Sequence[Candidate], references: Sequence[Cand
             each.reason = f"another set-up than {whose}: {', '.join(different)}"
 
 
-def exclude_unoriented(science: Sequence[Candidate]) -> None:
+def exclude_unoriented(science: Sequence[FrameFile]) -> None:
     """Exclude frames of the target whose roll or date is not known, where there are several.
 
     Raises
@@ -214,7 +214,7 @@ def exclude_unoriented(science: Sequence[Candidate]) -> None:
         ("date (DATE-BEG, or DATE-OBS with TIME-OBS)", lambda each: each.date),
     )
     for fact, value in facts:
-        frames = left(science)
+        frames = admissible(science)
         unknown = [each for each in frames if value(each.exposure) is None]
         if len(frames) < 2 or not unknown:
             continue
@@ -230,16 +230,16 @@ def exclude_unoriented(science: Sequence[Candidate]) -> None:
             )
 
 
-def judge_frames(candidates: Iterable[Candidate], frames: Mapping[int, Observation | None]) -> None:
+def judge_frames(files: Iterable[FrameFile], frames: Mapping[int, Observation | None]) -> None:
     """Exclude frames whose pixels cannot be those of a star behind the mask.
 
     Parameters
     ----------
-    candidates : iterable of Candidate
+    files : iterable of FrameFile
     frames : mapping of int to Observation
-        By the `id` of the candidate.
+        By the `id` of the file.
     """
-    for each in candidates:
+    for each in files:
         observation = frames[id(each)]
         if observation is not None:
             each.reason = (
@@ -250,7 +250,7 @@ def judge_frames(candidates: Iterable[Candidate], frames: Mapping[int, Observati
 
 
 def compare_brightness(
-    candidates: Iterable[Candidate], frames: Mapping[int, Observation | None]
+    files: Iterable[FrameFile], frames: Mapping[int, Observation | None]
 ) -> None:
     """Exclude frames that are much brighter or fainter than the others of their star.
 
@@ -259,7 +259,7 @@ def compare_brightness(
     IncompatibleSetupError
         If half of the frames or more are, and nothing says which are right.
     """
-    usable = left(candidates)
+    usable = admissible(files)
     odd = why_other_brightness([_known(frames[id(each)]) for each in usable])
     if 2 * len(odd) >= len(usable) and odd and not usable[0].exposure.reference:
         names = ", ".join(each.name for each in usable)
@@ -271,17 +271,15 @@ def compare_brightness(
         usable[k].reason = reason
 
 
-def exclude_copies(
-    candidates: Iterable[Candidate], frames: Mapping[int, Observation | None]
-) -> None:
+def exclude_copies(files: Iterable[FrameFile], frames: Mapping[int, Observation | None]) -> None:
     """Exclude frames whose pixels are those of another file, whatever the headers say."""
-    usable = left(candidates)
+    usable = admissible(files)
     for k, j in copies([_known(frames[id(each)]) for each in usable]).items():
         usable[k].reason = f"its pixels are those of {usable[j].name}: a copy of the exposure"
 
 
 def _known(observation: Observation | None) -> Observation:
-    assert observation is not None  # A candidate that could not be read has a reason.
+    assert observation is not None  # A file that could not be read has a reason.
     return observation
 
 

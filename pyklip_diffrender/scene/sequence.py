@@ -25,13 +25,13 @@ from pyklip_diffrender.scene.admission import (
     judge_frames,
 )
 from pyklip_diffrender.scene.admission_table import SHORT, Row, rows_table
-from pyklip_diffrender.scene.candidates import (
-    Candidate,
+from pyklip_diffrender.scene.exposure import Exposure
+from pyklip_diffrender.scene.frame_files import (
+    FrameFile,
     exclude_unusable,
     exposures_in,
     require_some,
 )
-from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["Sequence"]
@@ -178,11 +178,11 @@ class Sequence:
         tuple of Sequence
             In order of time.
         """
-        candidates = exposures_in(files)
-        exclude_unusable(candidates)
-        require_some(candidates)
-        choose_filter(candidates, filter)
-        science, references = choose_target(candidates, target)
+        listed = exposures_in(files)
+        exclude_unusable(listed)
+        require_some(listed)
+        choose_filter(listed, filter)
+        science, references = choose_target(listed, target)
         exclude_other_setups(science, references)
         star = science[0].star
         frames = {
@@ -200,7 +200,7 @@ class Sequence:
         kept = [each for each in science if not each.reason]
         epochs = epochs_of([each.exposure.date for each in kept])
         return tuple(
-            cls._of_epoch(star, [kept[k] for k in epoch], candidates, science, frames)
+            cls._of_epoch(star, [kept[k] for k in epoch], listed, science, frames)
             for epoch in epochs
         )
 
@@ -208,16 +208,16 @@ class Sequence:
     def _of_epoch(
         cls,
         star: str,
-        chosen: list[Candidate],
-        candidates: list[Candidate],
-        science: list[Candidate],
+        chosen: list[FrameFile],
+        listed: list[FrameFile],
+        science: list[FrameFile],
         frames: Mapping[int, Observation | None],
     ) -> Sequence:
         """Make the sequence of one epoch, of which `chosen` are the target's frames."""
         dates = [each.exposure.date for each in chosen if each.exposure.date is not None]
         rows, excluded = [], []
         used: dict[str, list[Observation]] = {"target": [], "reference": []}
-        for each in candidates:
+        for each in listed:
             reason = each.reason
             if not reason and each not in chosen and (each in science or not _near(each, dates)):
                 day = min(dates).isot[:10]
@@ -285,16 +285,16 @@ def _rows(
         yield Row(use, each.target, exposure, each)
 
 
-def _by_star(candidates: Iterable[Candidate]) -> Iterable[list[Candidate]]:
-    stars: dict[str, list[Candidate]] = {}
-    for each in candidates:
+def _by_star(listed: Iterable[FrameFile]) -> Iterable[list[FrameFile]]:
+    stars: dict[str, list[FrameFile]] = {}
+    for each in listed:
         stars.setdefault(each.star, []).append(each)
     return stars.values()
 
 
-def _near(candidate: Candidate, dates: list[Time]) -> bool:
+def _near(file: FrameFile, dates: list[Time]) -> bool:
     """Whether a frame was taken in the epoch of these dates, as far as is known."""
-    date = candidate.exposure.date
+    date = file.exposure.date
     return date is None or not dates or min(abs(date.mjd - each.mjd) for each in dates) <= EPOCH
 
 

@@ -1,4 +1,4 @@
-"""Files that may become part of a sequence, and what of them cannot be used or is there twice."""
+"""Files of frames, and which of them cannot be used or are there twice."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["Candidate", "exclude_unusable", "exposures_in", "left", "require_some"]
+__all__ = ["FrameFile", "admissible", "exclude_unusable", "exposures_in", "require_some"]
 
 _SUFFIXES = (".fits", ".fits.gz")
 
@@ -42,7 +42,7 @@ _OTHER_TYPES = {
 
 
 @dataclass(eq=False)
-class Candidate:
+class FrameFile:
     """A file that may become part of a sequence.
 
     Attributes
@@ -76,7 +76,7 @@ class Candidate:
 
 def exposures_in(
     files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-) -> list[Candidate]:
+) -> list[FrameFile]:
     """Find FITS files and read what their headers say.
 
     Parameters
@@ -101,36 +101,36 @@ def exposures_in(
             paths.append(each)
     if not paths:
         raise NoValidPixelsError("files: got none, expected at least one")
-    return [_candidate(path) for path in paths]
+    return [_frame_file(path) for path in paths]
 
 
-def _candidate(path: Path) -> Candidate:
+def _frame_file(path: Path) -> FrameFile:
     try:
         with open_fits(path) as hdus:
             header, shape = hdus[0].header, ()
             if "SCI" in hdus:
                 header = merged_header(header, hdus["SCI"].header, path.name)
                 shape = np.shape(hdus["SCI"].data)
-            return Candidate(path, Exposure.of(header, path.name, shape))
+            return FrameFile(path, Exposure.of(header, path.name, shape))
     except DiffrenderError as error:
-        return Candidate(path, Exposure(path.name), reason=str(error))
+        return FrameFile(path, Exposure(path.name), reason=str(error))
 
 
-def left(candidates: Iterable[Candidate]) -> list[Candidate]:
+def admissible(files: Iterable[FrameFile]) -> list[FrameFile]:
     """Files that are not excluded."""
-    return [each for each in candidates if not each.reason]
+    return [each for each in files if not each.reason]
 
 
-def exclude_unusable(candidates: Sequence[Candidate]) -> None:
+def exclude_unusable(files: Sequence[FrameFile]) -> None:
     """Exclude files that cannot be frames of a star behind a mask, and duplicates."""
-    for each in left(candidates):
+    for each in admissible(files):
         each.reason = _why_unusable(each.exposure)
-    _exclude_duplicates(left(candidates), lambda each: str(each.path.resolve()), _same_file)
+    _exclude_duplicates(admissible(files), lambda each: str(each.path.resolve()), _same_file)
     # The same file, packed and unpacked.
     _exclude_duplicates(
-        left(candidates), lambda each: str(each.path.resolve()).removesuffix(".gz"), _same_file
+        admissible(files), lambda each: str(each.path.resolve()).removesuffix(".gz"), _same_file
     )
-    _exclude_duplicates(left(candidates), _moment, _same_exposure)
+    _exclude_duplicates(admissible(files), _moment, _same_exposure)
 
 
 def _why_unusable(exposure: Exposure) -> str:
@@ -158,12 +158,12 @@ def _why_unusable(exposure: Exposure) -> str:
     return ""
 
 
-def _moment(candidate: Candidate) -> tuple[object, ...] | None:
+def _moment(file: FrameFile) -> tuple[object, ...] | None:
     """Identity, roll and time, which the files of one exposure share; None if they are not known.
 
     Copies whose headers were given another roll or date are no files of one exposure.
     """
-    exposure = candidate.exposure
+    exposure = file.exposure
     if exposure.identity is None:
         return None
     angle, date = exposure.position_angle, exposure.date
@@ -175,13 +175,13 @@ def _moment(candidate: Candidate) -> tuple[object, ...] | None:
 
 
 def _exclude_duplicates(
-    candidates: Sequence[Candidate],
-    key: Callable[[Candidate], object],
-    reason: Callable[[Candidate], str],
+    files: Sequence[FrameFile],
+    key: Callable[[FrameFile], object],
+    reason: Callable[[FrameFile], str],
 ) -> None:
     """Keep the file of the best level among those with one key."""
-    groups: dict[object, list[Candidate]] = {}
-    for each in candidates:
+    groups: dict[object, list[FrameFile]] = {}
+    for each in files:
         value = key(each)
         if value is not None:
             groups.setdefault(value, []).append(each)
@@ -198,16 +198,16 @@ def _rank(exposure: Exposure) -> int:
     return _USABLE.index(level)
 
 
-def _same_file(best: Candidate) -> str:
+def _same_file(best: FrameFile) -> str:
     return f"the same file as {best.name}"
 
 
-def _same_exposure(best: Candidate) -> str:
+def _same_exposure(best: FrameFile) -> str:
     return f"the same exposure as {best.name} ({best.exposure.identity}), which is used"
 
 
-def require_some(candidates: Sequence[Candidate]) -> None:
+def require_some(files: Sequence[FrameFile]) -> None:
     """Raise `NoValidPixelsError`, with the reasons, if every file is excluded."""
-    if not left(candidates):
-        reasons = "; ".join(f"{each.name}: {each.reason}" for each in candidates)
-        raise NoValidPixelsError(f"none of {len(candidates)} files can be used: {reasons}")
+    if not admissible(files):
+        reasons = "; ".join(f"{each.name}: {each.reason}" for each in files)
+        raise NoValidPixelsError(f"none of {len(files)} files can be used: {reasons}")
