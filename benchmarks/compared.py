@@ -1,4 +1,4 @@
-"""What the benchmarks that compare images have in common: time and difference."""
+"""Time and difference of images, for the benchmarks that compare them."""
 
 from __future__ import annotations
 

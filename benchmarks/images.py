@@ -14,7 +14,6 @@ peaks, raw and after the Gaussian filter of `meas_contrast`, which both products
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import copy
 import io
@@ -31,6 +30,7 @@ from pyklip.klip import meas_contrast
 from pyklip.parallelized import klip_dataset
 
 import pyklip_diffrender as dr
+from benchmarks.real_options import real_frames_parser
 
 Image = NDArray[np.float64]
 
@@ -69,11 +69,7 @@ def limits(image: Image, center: Image, scale: float, fwhm: float, smooth: bool)
 
 def main() -> None:
     """Compare the depths at several separations."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--frames", type=Path, default=Path("../shared/data/gto1184"))
-    parser.add_argument("--opd", type=Path, default=Path("../shared/data/opd_2022-08-14.fits.gz"))
-    parser.add_argument("--target", default="G-7-34")
-    parser.add_argument("--filter", default="F444W")
+    parser = real_frames_parser(__doc__)
     options = parser.parse_args()
     sequence = dr.Sequence.from_files(options.frames, target=options.target, filter=options.filter)
     names = [

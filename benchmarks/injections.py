@@ -11,7 +11,6 @@ what `reduce` recovers of planets that are injected at 1.6 times its limit: bias
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import pyklip_diffrender as dr
+from benchmarks.real_options import real_frames_parser
 from pyklip_diffrender.pyklip_backend.klip import klip_curve
 from pyklip_diffrender.reduction import summarise
 
@@ -28,11 +28,7 @@ SIZE = 80
 
 def main() -> None:
     """Compare limits, then inject."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--frames", type=Path, default=Path("../shared/data/gto1184"))
-    parser.add_argument("--opd", type=Path, default=Path("../shared/data/opd_2022-08-14.fits.gz"))
-    parser.add_argument("--target", default="G-7-34")
-    parser.add_argument("--filter", default="F444W")
+    parser = real_frames_parser(__doc__)
     parser.add_argument("--planets", type=int, default=21)
     parser.add_argument("--output", type=Path, help="folder for the products")
     options = parser.parse_args()

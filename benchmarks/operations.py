@@ -14,11 +14,9 @@ processor.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,6 +25,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 import pyklip_diffrender as dr
+from benchmarks.real_options import real_frames_parser
 from pyklip_diffrender.linear.response import WavefrontResponse
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.wavefront.bases import default_basis
@@ -128,11 +127,7 @@ def counted(work: Callable[[], object]) -> Total:
 
 def main() -> None:
     """Count an image, a response and the fit of a roll."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--frames", type=Path, default=Path("../shared/data/gto1184"))
-    parser.add_argument("--opd", type=Path, default=Path("../shared/data/opd_2022-08-14.fits.gz"))
-    parser.add_argument("--target", default="G-7-34")
-    parser.add_argument("--filter", default="F444W")
+    parser = real_frames_parser(__doc__)
     options = parser.parse_args()
     sequence = dr.Sequence.from_files(options.frames, target=options.target, filter=options.filter)
     sequence = replace(sequence, science=sequence.science[:1], references=()).cutout(80)
