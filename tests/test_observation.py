@@ -331,7 +331,7 @@ def test_a_cutout_that_sticks_out_is_refused(frames: np.ndarray) -> None:
 # -- means -----------------------------------------------------------------------------------
 
 
-def test_combined_is_the_inverse_variance_mean_of_valid_pixels() -> None:
+def test_combined_is_the_mean_of_valid_pixels_weighted_by_frame() -> None:
     data = np.array([[[1.0, 2.0, 3.0]], [[5.0, 8.0, 9.0]]])
     error = np.array([[[1.0, 1.0, 2.0]], [[2.0, 1.0, 2.0]]])
     valid = np.array([[[True, False, False]], [[True, True, False]]])
@@ -339,13 +339,25 @@ def test_combined_is_the_inverse_variance_mean_of_valid_pixels() -> None:
         data, error, valid=valid, pixelscale=0.06, center=[[0.0, 0.0], [1.0, 0.5]],
         position_angles=np.array([10.0, 10.0]),
     ).combined()  # fmt: skip
-    # (1 / 1 + 5 / 4) / (1 / 1 + 1 / 4) = 1.8, (1 + 1 / 4) ** -0.5 = 0.894427191.
-    np.testing.assert_allclose(valid_somewhere.data, [[[1.8, 8.0, 0.0]]], rtol=1e-12)
-    np.testing.assert_allclose(valid_somewhere.error, [[[0.8944271909999159, 1.0, 1.0]]])
+    # Median variances 1 and (4 + 1) / 2: weights 1 and 0.4. (1 + 0.4 x 5) / 1.4 = 15 / 7, and
+    # (1 + 0.16 x 4)^0.5 / 1.4 for its error.
+    np.testing.assert_allclose(valid_somewhere.data, [[[15 / 7, 8.0, 0.0]]], rtol=1e-12)
+    np.testing.assert_allclose(valid_somewhere.error, [[[1.64**0.5 / 1.4, 1.0, 1.0]]], rtol=1e-12)
     np.testing.assert_array_equal(valid_somewhere.valid, [[[True, True, False]]])
     np.testing.assert_allclose(valid_somewhere.center, [[0.5, 0.25]])
     assert valid_somewhere.position_angles is not None
     np.testing.assert_array_equal(valid_somewhere.position_angles, [10.0])
+
+
+def test_the_mean_of_faint_frames_is_not_biased() -> None:
+    """With weights from every pixel's own counts, it is 2.5 standard deviations too low."""
+    counts = np.random.default_rng(7).poisson(5.0, (400, 20, 20)).astype(float)
+    error = np.sqrt(np.maximum(counts, 1.0))
+    mean = Observation.from_arrays(counts, error, pixelscale=0.06).combined()
+    pulls = (mean.data - 5.0) / mean.error
+    # 400 pixels: the mean of the pulls scatters by 0.05.
+    assert abs(pulls.mean()) < 0.15
+    assert 0.9 < pulls.std() < 1.1
 
 
 def test_combined_of_one_frame_is_that_frame(frames: np.ndarray) -> None:

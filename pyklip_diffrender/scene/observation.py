@@ -434,7 +434,7 @@ class Observation:
         return ax
 
     def combined(self) -> Observation:
-        """One frame, the mean of all weighted by their inverse variances pixel by pixel.
+        """Average the frames, each weighted by its inverse median variance.
 
         Only for frames that see the star at the same place under the same wavefront.
         """
