@@ -98,7 +98,7 @@ class Refinement:
         group: about 1 where the prior holds; 1 where too few modes are determined. Empty if the
         scales were fitted.
     effective_parameters : float
-        Number of wavefront parameters that the data determine; NaN if unknown.
+        Number of unknowns that the data determine, see `EvidenceUpdate`; NaN if unknown.
     log_evidence : float
         Logarithm of the evidence of the linearised model, up to a constant of the data. Differences
         compare priors.

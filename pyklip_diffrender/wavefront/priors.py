@@ -149,8 +149,8 @@ class EvidenceUpdate:
         Diagonal of the covariance.
     scales : Tensor, (groups,)
     effective : float
-        Number of wavefront parameters that the data determine (with the scales before the last
-        update, where no errors were asked for).
+        Number of unknowns that the data determine: the sum of 1 minus the ratio of posterior and
+        prior variance (with the scales before the last update, where no errors were asked for).
     log_evidence : float
         Up to a constant that does not depend on the scales.
     """
@@ -309,11 +309,12 @@ def solve_with_evidence(
         if k == iterations and not errors:
             break
         variance = _inverse_of_lower(factor).square_().sum(dim=0)
-        # Number of modes of each group that the data determine, and their scale.
-        determined = 1 - precision[others:] * variance[others:]
-        effective = float(determined.sum())
+        # Share of every unknown that the data determine, and the scale of the modes of each group.
+        share = 1 - precision * variance
+        effective = float(share.sum())
         if k == iterations:
             break
+        determined = share[others:]
         power = (step[others:] / shape) ** 2
         counted = torch.zeros_like(scales).index_add(0, group, determined)
         summed = torch.zeros_like(scales).index_add(0, group, power)
