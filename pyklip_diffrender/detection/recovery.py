@@ -16,7 +16,7 @@ from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["TOGETHER", "measured_planet", "recover_planets", "with_planets"]
+__all__ = ["CLEAR", "TOGETHER", "measured_planet", "recover_planets", "with_planets"]
 
 _STRENGTH = 1.6
 """Contrast of an injected planet over the limit at its separation. At a limit of 5 sigma, nearly
@@ -35,7 +35,7 @@ _FRACTION = 0.618
 _SAME = 0.1
 """A candidate this near to an injected planet is the planet, arcsec."""
 
-_CLEAR = 0.3
+CLEAR = 0.3
 """Distance of injected planets from candidates, arcsec."""
 
 _GOLDEN = 137.5
@@ -199,6 +199,6 @@ def _free_place(detection: Detection, separation: float, angle: float) -> NDArra
     for place in circle:
         away = np.hypot(*np.moveaxis(detection.grid - place, -1, 0))
         covered = np.isfinite(detection.snr[np.unravel_index(away.argmin(), away.shape)])
-        if covered and (np.hypot(*(candidates - place).T) > _CLEAR).all():
+        if covered and (np.hypot(*(candidates - place).T) > CLEAR).all():
             return place
     return circle[0]
