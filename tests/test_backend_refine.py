@@ -332,11 +332,15 @@ def test_products_show_the_sky_of_all_rolls(
     x, y = center + SEPARATION * np.array([-np.sin(turn), np.cos(turn)]) / 0.062424185
     row, column = np.unravel_index(np.nanargmax(changes[0]), changes[0].shape)
     assert np.hypot(row - y, column - x) < 1
-    # A Gaussian instead of the image behind the mask, whose wings the star takes.
-    kept = np.nanmax(changes[0]) / 1e4
-    assert kept == pytest.approx(left[round(y), round(x)], rel=0.25)
-    assert kept > 0.3
-    assert (left[round(y), round(x)] == 1) == (image == "flux")
+    # A Gaussian instead of the image behind the mask, whose wings the star takes, and which has
+    # less light for the same peak.
+    kept, expected = np.nanmax(changes[0]) / 1e4, left[round(y), round(x)]
+    if image == "flux":
+        assert expected == 1
+        assert 0.5 < kept < 1
+    else:
+        assert kept == pytest.approx(expected, rel=0.25)
+        assert kept > 0.3
 
 
 @pytest.mark.parametrize(
