@@ -349,10 +349,12 @@ def test_with_reference_frames_klip_is_shown_beside(tmp_path: Path) -> None:
     sequence = replace(whole.sequence, references=(replace(star, data=star.data + noise),))
     html, data = write_report(replace(whole, sequence=sequence), tmp_path)
     curve = json.loads(data.read_text(encoding="utf-8"))["klip_curve"]
-    assert set(curve) == {"sigmas", "separation_arcsec", "contrast", "modes", "throughput"}
+    assert set(curve) == {
+        "sigmas", "separation_arcsec", "contrast", "small_sample", "modes", "throughput",
+    }  # fmt: skip
     # Farther out than that there is something left of a planet.
     assert min(curve["contrast"][4:]) > 0
-    assert "Squares: KLIP (ADI and RDI)" in html.read_text(encoding="utf-8")
+    assert "Squares: KLIP RDI (1 reference frame, 1 mode)" in html.read_text(encoding="utf-8")
 
 
 @pytest.mark.usefixtures("_few_pictures")
@@ -384,6 +386,31 @@ def test_injected_planets_have_a_section(tmp_path: Path, count: int) -> None:
         assert summary["within_one_error"] == 0.5
         assert summary["pull_deviation"] == pytest.approx(np.std([-6, 2, 10, 18], ddof=1) / 9)
         assert "is 1.10\u00a0±\u00a00.09" in text or "1.10 ± 0.09" in text
+
+
+@pytest.mark.usefixtures("_few_pictures")
+def test_completeness_has_a_section(tmp_path: Path) -> None:
+    fractions = QTable(
+        {
+            "separation": np.repeat([0.4, 0.8], 3) * u.arcsec,
+            "contrast": np.array([1, 2, 4, 1, 2, 4]) * 1e-5,
+            "completeness": [0.0, 0.5, 1.0, 0.2, 0.6, 0.7],
+            "planets": np.full(6, 10),
+        },
+        meta={
+            "threshold": 5.0, "false_alarm": 1e-4, "separation_arcsec": [0.4, 0.8],
+            "contrast_50": [2e-5, 1.75e-5], "contrast_95": [3.8e-5, np.nan],
+        },
+    )  # fmt: skip
+    names = [path.name for path in replace(reduction(), completeness=fractions).write(tmp_path)]
+    assert "completeness.ecsv" in names
+    read = QTable.read(tmp_path / "completeness.ecsv")
+    assert list(read["completeness"]) == list(fractions["completeness"])
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["completeness"]
+    assert summary["contrast_50"] == [2e-5, 1.75e-5]
+    assert summary["contrast_95"] == [3.8e-5, None]
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "has a false candidate in 0.01 % of such fields" in text
 
 
 @pytest.mark.usefixtures("_few_pictures")

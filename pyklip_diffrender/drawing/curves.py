@@ -39,9 +39,9 @@ def contrast_curve(
     candidates : QTable
         Columns separation and contrast, with their errors.
     small_sample : bool
-        Draw the median with the correction for few samples.
+        Draw limits with the correction for few samples: of the median, and of KLIP.
     klip : QTable, optional
-        Separation and contrast of KLIP; `meta` may have a "label".
+        Columns separation, contrast and small_sample of KLIP; `meta` may have a "label".
     """
     separation = curve["separation"].value
     ax.fill_between(
@@ -54,8 +54,11 @@ def contrast_curve(
                     label="median, few samples")  # fmt: skip
     ax.semilogy(separation, curve["known_star"], "--", color=INK, label="star known exactly")
     if klip is not None:
+        label = klip.meta.get("label", "KLIP")
         ax.semilogy(klip["separation"].value, klip["contrast"], "s-", color=_KLIP, ms=3.5,
-                    label=klip.meta.get("label", "KLIP"))  # fmt: skip
+                    label=label)  # fmt: skip
+        ax.semilogy(klip["separation"].value, klip["small_sample"], "s:", color=_KLIP, ms=3.5,
+                    mfc="white", label=f"{label}, few samples")  # fmt: skip
     if len(candidates):
         ax.errorbar(
             candidates["separation"].value, candidates["contrast"], candidates["contrast_error"],
@@ -66,6 +69,42 @@ def contrast_curve(
     ax.set_ylabel(f"contrast at {curve.meta['sigmas']:g} sigma")
     # Limits are high at small separations alone, so that there is room in this corner.
     ax.legend(frameon=False, loc="upper right", fontsize="small")
+
+
+def completeness(
+    ax: Axes, table: QTable, curve: QTable, half: Sequence[float], most: Sequence[float]
+) -> None:
+    """Draw the fraction of planets that are found against separation and contrast.
+
+    Parameters
+    ----------
+    ax : Axes
+    table : QTable
+        Columns separation, contrast and completeness, with as many contrasts at each separation.
+    curve : QTable
+        Columns separation and contrast: the limits at 5 sigma.
+    half, most : sequence of float
+        Contrasts at which 50 and 95 % are found, by separation; may be NaN.
+    """
+    separation = np.unique(table["separation"].value)
+    x, y, fraction = (
+        np.asarray(each).reshape(len(separation), -1)
+        for each in (table["separation"].value, table["contrast"], table["completeness"])
+    )
+    mesh = ax.pcolormesh(x, y, fraction, cmap="cividis", vmin=0, vmax=1, shading="nearest")
+    ax.figure.colorbar(mesh, ax=ax, label="fraction found", fraction=0.046, pad=0.03)
+    ax.plot(separation, most, "-", color="white", label="95 %")
+    ax.plot(separation, half, "--", color="white", label="50 %")
+    ax.plot(curve["separation"].value, curve["contrast"], ":", color="white", label="5 sigma")
+    ax.set_yscale("log")
+    ax.set_xlim(x.min(), x.max())
+    ax.set_ylim(y.min(), y.max())
+    ax.set_box_aspect(1.0)
+    ax.set_xlabel("separation (arcsec)")
+    ax.set_ylabel("contrast")
+    legend = ax.legend(frameon=False, loc="upper right", fontsize="small")
+    for text in legend.get_texts():
+        text.set_color("white")
 
 
 def injected_planets(ax: Axes, planets: QTable) -> None:

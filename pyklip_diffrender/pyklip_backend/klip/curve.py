@@ -85,9 +85,10 @@ def klip_curve(
     Returns
     -------
     QTable
-        Separation, contrast with the small-sample correction (NaN where no light of a planet is
-        left), number of modes, and throughput, the fraction of a planet's image behind the mask
-        that is left.
+        Columns separation; contrast, NaN where no light of a planet is left; contrast with the
+        small-sample correction; number of modes; throughput, the fraction of a planet's image
+        behind the mask that is left. The first columns have the names of those of
+        `Detection.contrast_curve`; ``meta["label"]`` says how the star was subtracted.
 
     Raises
     ------
@@ -131,17 +132,19 @@ def klip_curve(
     useful = (response > 0) & (noise > 0)
     limits = np.divide(_SIGMAS * noise, response, out=np.full_like(noise, np.inf), where=useful)
     best = limits.argmin(axis=0), np.arange(len(separations))
-    corrected = limits[best] * small_sample_factor(separations, resolution, _SIGMAS)
+    limit = np.where(np.isfinite(limits[best]), limits[best], np.nan)
     table = QTable(
         {
             "separation": separations * u.arcsec,
-            "contrast": np.where(np.isfinite(corrected), corrected, np.nan),
+            "contrast": limit,
+            "small_sample": limit * small_sample_factor(separations, resolution, _SIGMAS),
             "modes": best[0] + 1,
             "throughput": response[best] / alone,
         },
-        meta={"sigmas": _SIGMAS, "resolution_arcsec": resolution},
+        meta={"sigmas": _SIGMAS, "resolution_arcsec": resolution, "label": klip.label},
     )
-    for name, form in (("separation", ".3f"), ("contrast", ".2e"), ("throughput", ".2f")):
+    formats = {"separation": ".3f", "contrast": ".2e", "small_sample": ".2e", "throughput": ".2f"}
+    for name, form in formats.items():
         table[name].info.format = form
     return table
 
@@ -264,6 +267,20 @@ class KlipSubtraction:
         self.norm = float(np.sqrt((kernel**2).sum()))
         """Of a planet of contrast 1 in a smoothed image of which nothing was subtracted."""
         self._kernel = kernel[::-1, ::-1] / self.norm
+
+    @property
+    def label(self) -> str:
+        """Observing strategies, number of reference frames and of modes."""
+        strategies = ["ADI"] if any(self._library) else []
+        reference = f"{len(self.references)} reference frame"
+        if self.references:
+            strategies.append("RDI")
+            reference += "" if len(self.references) == 1 else "s"
+        else:
+            reference = "other roll" if len(self.rolls) == 2 else "other rolls"
+        most = self.modes[-1]
+        modes = "1 mode" if most == 1 else f"1 to {most} modes"
+        return f"KLIP {'+'.join(strategies)} ({reference}, {modes})"
 
     def pixel(self, place: Image) -> tuple[int, int]:
         """Row and column of the pixel of the first frame next to x, y in arcsec."""
