@@ -32,6 +32,7 @@ from pyklip_diffrender.pattern import PatternChoice
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     backend,
+    reduction,
     subtract_by_refinement,
 )
 from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
@@ -268,8 +269,11 @@ def test_copies_with_added_sources_are_not_fitted_again(
     small: OpticalSystem,
     frames: NDArray[np.float64],
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A fit of flux and background is linear, so that a new fit would do exactly the same."""
+    # The map of the throughput takes seconds, and has tests of its own.
+    monkeypatch.setattr(reduction, "throughput_map", lambda fit: np.ones((32, 32)))
     made = dataset(frames, small, fit=ALIGNED, error=1e3, plan="off")
     untouched = copy.deepcopy(made)
     pixels = np.indices(frames.shape[1:])
