@@ -135,7 +135,7 @@ class Maps:
         if not len(candidates):
             return self.numerator
         light = [candidates.light(templates) for _, templates in self.groups]
-        return np.asarray(self.numerator - self._change(light)[0])
+        return np.asarray(self.numerator - self.change(light)[0])
 
     def response(self, offsets: Tensor) -> Image:
         """Change of the numerator by a planet of contrast 1 at each position, (k, ny, nx).
@@ -145,10 +145,16 @@ class Maps:
         offsets : Tensor, (k, 2), float64
             x, y from the star, arcsec.
         """
-        return self._change([templates.at(offsets) for _, templates in self.groups])
+        return self.change([templates.at(offsets) for _, templates in self.groups])
 
-    def _change(self, light: Sequence[Mapping[int, Tensor]]) -> Image:
-        """Change of the numerator by images (k, ny, nx), by frame and group, (k, ny, nx)."""
+    def change(self, light: Sequence[Mapping[int, Tensor]]) -> Image:
+        """Change of the numerator by images that are added to the data, (k, ny, nx).
+
+        Parameters
+        ----------
+        light : sequence of mapping of int to Tensor, (k, ny, nx)
+            Images by frame, for each group.
+        """
         cleaned = [linear.clean(part) for (linear, _), part in zip(self.groups, light, strict=True)]
         ny, nx = self.shape
         total = np.zeros((len(cleaned[0][0]), ny * nx))

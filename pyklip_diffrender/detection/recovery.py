@@ -19,8 +19,8 @@ from pyklip_diffrender.scene.observation import Observation
 __all__ = ["CLEAR", "TOGETHER", "measured_planet", "recover_planets", "with_planets"]
 
 _STRENGTH = 1.6
-"""Contrast of an injected planet over the limit at its separation. At a limit of 5 sigma, nearly
-all planets of 8 sigma should be detected."""
+"""Contrast of an injected planet over the limit with the small-sample correction, which is the
+threshold of the search. At a limit of 5 sigma, nearly all planets of 8 sigma should be detected."""
 
 TOGETHER = 7
 """Largest number of planets in the frames at a time."""
@@ -85,7 +85,7 @@ def recover_planets(
     """Add planets to the frames of a detection and search them again.
 
     The planets are spread over all separations and angles, up to seven at a time, and are 1.6 times
-    as bright as the contrast curve's limit at their separations.
+    as bright as the limit with the small-sample correction at their separations.
 
     Parameters
     ----------
@@ -111,7 +111,9 @@ def recover_planets(
         # Other separations in every set, so that sets fill the gaps.
         parts = (np.arange(rings) + (0.5 + _FRACTION * trial) % 1) / rings
         separations = inner + (outer - inner) * parts
-        limits = np.interp(separations, curve["separation"].value, curve["contrast"])
+        limits = np.exp(
+            np.interp(separations, curve["separation"].value, np.log(curve["small_sample"]))
+        )
         places = np.array(
             [
                 _free_place(detection, separation, _GOLDEN * k + _NEXT * trial)
