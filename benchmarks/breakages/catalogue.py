@@ -117,7 +117,7 @@ def _instrument_and_wavefront() -> list[Breakage]:
         ),
         Breakage(
             "flight-struts", "pupil='flight' has the obscurations seen in flight",
-            '"flight": "flight_strut"', '"flight": "strut"', "instrument parity_stpsf",
+            '"flight": "flight_strut"', '"flight": "strut"', "geometry instrument",
         ),
         Breakage(
             "quadrature", "condensed wavelengths keep the integrals of polynomials",
