@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from astropy.io import fits
 from numpy.typing import NDArray
 
@@ -17,6 +19,13 @@ CENTER = (21.25, 24.5)
 RIPPLE = 2e-9 * np.hypot(*np.mgrid[-32:32, -32:32])
 OPD = as_opd_map(RIPPLE)
 BACKGROUND = 3.0
+
+
+def in_place_of_fits(monkeypatch: pytest.MonkeyPatch, subtract: Callable[..., Any]) -> None:
+    """Give the backend another subtractor, which gets the references as the default one does."""
+    monkeypatch.setattr(
+        "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
+    )
 
 
 def psf(x: float, y: float, shape: tuple[int, int] = SHAPE) -> NDArray[np.float64]:
@@ -95,7 +104,7 @@ def calints(
         {
             "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON", "FILTER": "F444W",
             "PUPIL": "MASKRND", "CORONMSK": "MASKA335R", "XOFFSET": 0.0, "YOFFSET": 0.0,
-            "DATE-BEG": "2022-07-30T01:02:03", **cards,
+            "DATE-BEG": "2022-07-30T01:02:03", "TARGPROP": "TARGET", **cards,
         }
     )  # fmt: skip
     science = fits.Header(

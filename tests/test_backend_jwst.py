@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.io import fits
-from backend_scene import CENTER, OPD, SHAPE, calints, planet, psf, render
+from backend_scene import CENTER, OPD, SHAPE, calints, in_place_of_fits, planet, psf, render
 from pyklip import fakes
 from pyklip.instruments import JWST
 from pyklip.instruments.JWST import JWSTData
@@ -56,7 +56,7 @@ def files(tmp_path: Path, rng: np.random.Generator) -> list[str]:
     paths = []
     for i, roll in enumerate((0.0, 10.0, 0.0)):
         path = tmp_path / f"jw0138600{i}_calints.fits"
-        calints(path, rng, roll, NATIVE)
+        calints(path, rng, roll, NATIVE, TARGPROP="TARGET" if i < 2 else "OTHER")
         paths.append(str(path))
     return paths[:2]
 
@@ -129,13 +129,11 @@ def test_filters_are_fitted_one_by_one(
     seen, paths = [], []
 
     def subtract(observation: Any, opd: Any, settings: Any, **context: Any) -> Any:
-        names = [path.name for path in context["references"].files]
+        names = [each.name for each in context["references"]]
         seen.append((observation.filter, list(observation.position_angles), names))
         return render(observation, opd, settings)
 
-    monkeypatch.setattr(
-        "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
-    )
+    in_place_of_fits(monkeypatch, subtract)
     setups = [(roll, name) for roll in (0.0, 10.0) for name in ("F356W", "F444W")]
     for roll, name in setups:
         paths.append(str(tmp_path / f"{name}_{roll:.0f}.fits"))
