@@ -44,7 +44,10 @@ def image_of(settings: DiffrenderSettings, subtraction: Subtraction) -> str:
         If the image that is asked for needs a linear model, and there is none.
     """
     fitted = bool(subtraction.pointings)
-    image = settings.image or "subtracted"
+    real = fitted and all(
+        part.result.frames[part.index].observation.is_nircam for part in subtraction.pointings
+    )
+    image = settings.image or ("cleaned" if real else "subtracted")
     if image != "subtracted" and not fitted:
         raise IncompatibleSetupError(
             f"image: {image!r} needs the linear model of a fit, which a subtractor of "

@@ -102,8 +102,9 @@ class DiffrenderSettings:
         NIRCam frames, else False. Undetected companions still lose light, as much as the
         throughput map says.
     image : {"cleaned", "flux", "subtracted"}, optional
-        Image that the products carry. "subtracted", the default and always that of forward models,
-        is each frame minus its star. "cleaned" is the posterior mean of the sky from all rolls
+        Image that the products carry. "subtracted", always that of forward models and the default
+        but for real NIRCam frames, is each frame minus its star. "cleaned", the default for real
+        NIRCam frames, is the posterior mean of the sky from all rolls
         together, see ``imaging.SkyModel``; every frame has it on its own pixels, so that pyKLIP's
         mean or median of the frames is the same image. "flux" has in each pixel the most probable
         peak of a point source there, from all rolls together with the star marginalised: its noise
