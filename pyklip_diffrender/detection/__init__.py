@@ -9,6 +9,7 @@ is unbiased, and its error includes the uncertainty of the wavefront.
 from __future__ import annotations
 
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.combination import combine_frames
 from pyklip_diffrender.detection.disk import Disk, fit_disk
 from pyklip_diffrender.detection.figure import draw_search
 from pyklip_diffrender.detection.recovery import measured_planet, recover_planets, with_planets
@@ -22,6 +23,7 @@ __all__ = [
     "Detection",
     "Disk",
     "WideField",
+    "combine_frames",
     "contrast_curve",
     "detect",
     "draw_search",

@@ -27,7 +27,7 @@ from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["KlipSubtraction", "klip_curve", "small_sample_factor"]
+__all__ = ["KlipSubtraction", "klip_curve", "klip_image", "small_sample_factor"]
 
 Image = NDArray[np.float64]
 
@@ -139,11 +139,67 @@ def klip_curve(
             "modes": best[0] + 1,
             "throughput": response[best] / alone,
         },
-        meta={"sigmas": _SIGMAS, "resolution_arcsec": resolution},
+        meta={
+            "sigmas": _SIGMAS,
+            "resolution_arcsec": resolution,
+            "label": f"{klip.label}, {_range(best[0] + 1, 'mode')}",
+        },
     )
     for name, form in (("separation", ".3f"), ("contrast", ".2e"), ("throughput", ".2f")):
         table[name].info.format = form
     return table
+
+
+def klip_image(
+    detection: Detection,
+    references: Sequence[Observation] = (),
+    science: Sequence[Observation] | None = None,
+    *,
+    modes: int = _MODES,
+    north: float = 0.0,
+) -> tuple[Image, Image, str]:
+    """Subtract the star from the frames that were searched with KLIP, and combine them.
+
+    Parameters
+    ----------
+    detection : Detection
+    references : sequence of Observation
+        As for `klip_curve`.
+    science : sequence of Observation, optional
+        In place of the frames of the fit, from which a disk may have been subtracted.
+    modes : int
+        Largest number of modes.
+    north : float
+        Degrees by which the image is turned counter-clockwise from the orientation of the first
+        frame: its position angle turns it north up.
+
+    Returns
+    -------
+    image : ndarray, (ny, nx)
+        In the data's unit; NaN close to the star, where nothing is subtracted.
+    grid : ndarray, (ny, nx, 2)
+        x, y of its pixels from the star, arcsec.
+    label : str
+        References and modes.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If a roll has no references.
+    """
+    templates = Templates(detection.fits[0], detection.fits[0].frames[0])
+    resolution = detection.contrast_curve.meta["resolution_arcsec"]
+    klip = KlipSubtraction(templates, references, resolution, science, keep_companions=True)
+    used = min(modes, len(klip.modes))
+    image = klip.residuals(klip.science, north)[used - 1]
+    shown = np.where(klip._zone, image, np.nan)
+    return shown, klip.grid, f"{klip.label}, {_range(np.array([used]), 'mode')}"
+
+
+def _range(numbers: NDArray[np.int64], noun: str) -> str:
+    """Numbers with their noun: 1 mode, 2 to 5 modes."""
+    low, high = numbers.min(), numbers.max()
+    return f"{low} {noun}{'' if low == 1 else 's'}" if low == high else f"{low} to {high} {noun}s"
 
 
 def small_sample_factor(
@@ -188,6 +244,8 @@ class KlipSubtraction:
         lambda/D, arcsec.
     science : sequence of Observation, optional
         In place of the frames of the fit, from which a disk may have been subtracted.
+    keep_companions : bool
+        Leave the light of companions that are part of the fit in the frames.
 
     Attributes
     ----------
@@ -216,6 +274,8 @@ class KlipSubtraction:
         references: Sequence[Observation],
         resolution: float,
         science: Sequence[Observation] | None = None,
+        *,
+        keep_companions: bool = False,
     ) -> None:
         frames = templates.frames
         self.rolls = list(templates.rolls.values())
@@ -231,7 +291,8 @@ class KlipSubtraction:
         self.shifts = self.center - places
         if science is None:
             science = [frame.observation for frame in frames.values()]
-        companions = [frame.companion_image for frame in frames.values()]
+        kept = 0.0 if keep_companions else 1.0
+        companions = [kept * frame.companion_image for frame in frames.values()]
         images = [_filled(a) - b for a, b in zip(science, companions, strict=True)]
         self.science = shift_frames(np.array(images), self.shifts)
         self.references = [
@@ -249,13 +310,13 @@ class KlipSubtraction:
             [j for j, other in enumerate(self.rolls) if abs(other - roll) > _TURN]
             for roll in self.rolls
         ]
-        fewest = min(map(len, self._library)) + len(self.references)
-        if not fewest:
+        self._fewest = min(map(len, self._library)) + len(self.references)
+        if not self._fewest:
             raise IncompatibleSetupError(
                 "klip_curve: got a roll without references, expected frames of reference stars or "
                 f"rolls that differ by more than {_TURN:g} degree"
             )
-        self.modes = np.arange(1, min(_MODES, fewest) + 1)
+        self.modes = np.arange(1, min(_MODES, self._fewest) + 1)
         # Halfway to the edge the mask does not matter.
         row, column = self.pixel(np.array([self.grid[0, -1, 0] / 2, 0.0]))
         image = templates.at_pixels(np.array([row]), np.array([column]))[0][0].double().numpy()
@@ -271,8 +332,19 @@ class KlipSubtraction:
         row, column = np.unravel_index(int(away.argmin()), away.shape)
         return int(row), int(column)
 
-    def residuals(self, science: Image) -> Image:
-        """Frames without the star, turned and averaged, (modes, ny, nx)."""
+    @property
+    def label(self) -> str:
+        """The kind of reference frames, and how many a roll has."""
+        kinds = [name for name, is_used in (("ADI", any(self._library)),
+                                            ("RDI", len(self.references) > 0)) if is_used]
+        count = self._fewest
+        return f"KLIP, {' and '.join(kinds)}, {count} reference{'' if count == 1 else 's'}"
+
+    def residuals(self, science: Image, north: float = 0.0) -> Image:
+        """Frames without the star, turned and averaged, (modes, ny, nx).
+
+        They have the orientation of the first roll, turned counter-clockwise by `north` degrees.
+        """
         total = np.zeros((len(self.modes), *self.distance.shape))
         for frame, roll, others in zip(science, self.rolls, self._library, strict=True):
             frames = [*(science[j] for j in others), *self.references]
@@ -283,7 +355,7 @@ class KlipSubtraction:
             residual[:, self._zone] = klip_math(
                 frame[self._zone], library, self.modes, covar_psfs=covariance
             ).T
-            turned = [rotate(each, -roll, self.center) for each in residual]
+            turned = [rotate(each, -roll - north, self.center) for each in residual]
             total += np.nan_to_num(turned) / len(science)
         return total
 
