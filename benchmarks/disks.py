@@ -112,7 +112,7 @@ def main() -> None:
         for name in ("contrast", "small_sample")
     )
     references = sequence.cutout(SIZE).references
-    theirs = np.asarray(klip_curve(reduction.detection, references, SEPARATIONS)["contrast"])
+    theirs = np.asarray(klip_curve(reduction.detection, references, SEPARATIONS)["small_sample"])
     print("5-sigma limits: ours; with small-sample correction: ours, KLIP, ratio")
     for row in zip(SEPARATIONS, ours, corrected, theirs, theirs / corrected, strict=True):
         print("{:.1f}  {:.2e}  {:.2e}  {:.2e}  {:.2f}".format(*row))

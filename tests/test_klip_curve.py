@@ -162,6 +162,9 @@ def test_two_rolls_alone_and_masked_pixels() -> None:
     curve = curve_of([hole, science[1]], (), [500, 800, 5000] * u.mas)
     assert curve["separation"].to_value(u.arcsec) == pytest.approx(SEPARATIONS)
     assert list(curve["modes"]) == [1, 1]
+    assert curve.meta["label"] == "KLIP ADI (other roll, 1 mode)"
+    correction = small_sample_factor(SEPARATIONS, curve.meta["resolution_arcsec"])
+    assert curve["small_sample"] / curve["contrast"] == pytest.approx(correction)
     assert np.isfinite(curve["contrast"]).all()
     assert (curve["contrast"] < 5 * quiet()).all()
     assert ((curve["throughput"] > 0) & (curve["throughput"] < 1.1)).all()

@@ -349,10 +349,12 @@ def test_with_reference_frames_klip_is_shown_beside(tmp_path: Path) -> None:
     sequence = replace(whole.sequence, references=(replace(star, data=star.data + noise),))
     html, data = write_report(replace(whole, sequence=sequence), tmp_path)
     curve = json.loads(data.read_text(encoding="utf-8"))["klip_curve"]
-    assert set(curve) == {"sigmas", "separation_arcsec", "contrast", "modes", "throughput"}
+    assert set(curve) == {
+        "sigmas", "separation_arcsec", "contrast", "small_sample", "modes", "throughput",
+    }  # fmt: skip
     # Farther out than that there is something left of a planet.
     assert min(curve["contrast"][4:]) > 0
-    assert "Squares: KLIP (ADI and RDI)" in html.read_text(encoding="utf-8")
+    assert "Squares: KLIP RDI (1 reference frame, 1 mode)" in html.read_text(encoding="utf-8")
 
 
 @pytest.mark.usefixtures("_few_pictures")

@@ -39,9 +39,9 @@ def contrast_curve(
     candidates : QTable
         Columns separation and contrast, with their errors.
     small_sample : bool
-        Draw the median with the correction for few samples.
+        Draw limits with the correction for few samples: of the median, and of KLIP.
     klip : QTable, optional
-        Separation and contrast of KLIP; `meta` may have a "label".
+        Columns separation, contrast and small_sample of KLIP; `meta` may have a "label".
     """
     separation = curve["separation"].value
     ax.fill_between(
@@ -54,8 +54,11 @@ def contrast_curve(
                     label="median, few samples")  # fmt: skip
     ax.semilogy(separation, curve["known_star"], "--", color=INK, label="star known exactly")
     if klip is not None:
+        label = klip.meta.get("label", "KLIP")
         ax.semilogy(klip["separation"].value, klip["contrast"], "s-", color=_KLIP, ms=3.5,
-                    label=klip.meta.get("label", "KLIP"))  # fmt: skip
+                    label=label)  # fmt: skip
+        ax.semilogy(klip["separation"].value, klip["small_sample"], "s:", color=_KLIP, ms=3.5,
+                    mfc="white", label=f"{label}, few samples")  # fmt: skip
     if len(candidates):
         ax.errorbar(
             candidates["separation"].value, candidates["contrast"], candidates["contrast_error"],

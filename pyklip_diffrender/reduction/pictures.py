@@ -71,9 +71,9 @@ def search_pictures(
     beside = (
         ""
         if klip is None
-        else " Squares: KLIP (ADI and RDI) on the same frames, in units of the same star, with the "
-        "small-sample correction and the best number of modes at every separation; its noise is "
-        "the scatter in a ring, its throughput that of injected planets."
+        else f" Squares: {klip.meta['label']} on the same frames, in units of the same star, with "
+        "the best number of modes at every separation; its noise is the scatter in a ring, its "
+        "throughput that of injected planets. Dotted: with the small-sample correction."
     )
     return _pictures(
         _search(detection, klip),

@@ -85,9 +85,10 @@ def klip_curve(
     Returns
     -------
     QTable
-        Separation, contrast with the small-sample correction (NaN where no light of a planet is
-        left), number of modes, and throughput, the fraction of a planet's image behind the mask
-        that is left.
+        Columns separation; contrast, NaN where no light of a planet is left; contrast with the
+        small-sample correction; number of modes; throughput, the fraction of a planet's image
+        behind the mask that is left. The first columns have the names of those of
+        `Detection.contrast_curve`; ``meta["label"]`` says how the star was subtracted.
 
     Raises
     ------
@@ -131,21 +132,19 @@ def klip_curve(
     useful = (response > 0) & (noise > 0)
     limits = np.divide(_SIGMAS * noise, response, out=np.full_like(noise, np.inf), where=useful)
     best = limits.argmin(axis=0), np.arange(len(separations))
-    corrected = limits[best] * small_sample_factor(separations, resolution, _SIGMAS)
+    limit = np.where(np.isfinite(limits[best]), limits[best], np.nan)
     table = QTable(
         {
             "separation": separations * u.arcsec,
-            "contrast": np.where(np.isfinite(corrected), corrected, np.nan),
+            "contrast": limit,
+            "small_sample": limit * small_sample_factor(separations, resolution, _SIGMAS),
             "modes": best[0] + 1,
             "throughput": response[best] / alone,
         },
-        meta={
-            "sigmas": _SIGMAS,
-            "resolution_arcsec": resolution,
-            "label": f"{klip.label}, {_range(best[0] + 1, 'mode')}",
-        },
+        meta={"sigmas": _SIGMAS, "resolution_arcsec": resolution, "label": klip.label},
     )
-    for name, form in (("separation", ".3f"), ("contrast", ".2e"), ("throughput", ".2f")):
+    formats = {"separation": ".3f", "contrast": ".2e", "small_sample": ".2e", "throughput": ".2f"}
+    for name, form in formats.items():
         table[name].info.format = form
     return table
 
@@ -193,13 +192,7 @@ def klip_image(
     used = min(modes, len(klip.modes))
     image = klip.residuals(klip.science, north)[used - 1]
     shown = np.where(klip._zone, image, np.nan)
-    return shown, klip.grid, f"{klip.label}, {_range(np.array([used]), 'mode')}"
-
-
-def _range(numbers: NDArray[np.int64], noun: str) -> str:
-    """Numbers with their noun: 1 mode, 2 to 5 modes."""
-    low, high = numbers.min(), numbers.max()
-    return f"{low} {noun}{'' if low == 1 else 's'}" if low == high else f"{low} to {high} {noun}s"
+    return shown, klip.grid, klip.label_of(used)
 
 
 def small_sample_factor(
@@ -310,13 +303,13 @@ class KlipSubtraction:
             [j for j, other in enumerate(self.rolls) if abs(other - roll) > _TURN]
             for roll in self.rolls
         ]
-        self._fewest = min(map(len, self._library)) + len(self.references)
-        if not self._fewest:
+        fewest = min(map(len, self._library)) + len(self.references)
+        if not fewest:
             raise IncompatibleSetupError(
                 "klip_curve: got a roll without references, expected frames of reference stars or "
                 f"rolls that differ by more than {_TURN:g} degree"
             )
-        self.modes = np.arange(1, min(_MODES, self._fewest) + 1)
+        self.modes = np.arange(1, min(_MODES, fewest) + 1)
         # Halfway to the edge the mask does not matter.
         row, column = self.pixel(np.array([self.grid[0, -1, 0] / 2, 0.0]))
         image = templates.at_pixels(np.array([row]), np.array([column]))[0][0].double().numpy()
@@ -326,19 +319,29 @@ class KlipSubtraction:
         """Of a planet of contrast 1 in a smoothed image of which nothing was subtracted."""
         self._kernel = kernel[::-1, ::-1] / self.norm
 
+    @property
+    def label(self) -> str:
+        """Observing strategies, number of reference frames and of modes."""
+        return self.label_of(self.modes[0], self.modes[-1])
+
+    def label_of(self, fewest: int, most: int | None = None) -> str:
+        """The label for a number of modes, or for a range."""
+        most = most or fewest
+        strategies = ["ADI"] if any(self._library) else []
+        reference = f"{len(self.references)} reference frame"
+        if self.references:
+            strategies.append("RDI")
+            reference += "" if len(self.references) == 1 else "s"
+        else:
+            reference = "other roll" if len(self.rolls) == 2 else "other rolls"
+        modes = f"{'' if fewest == most else f'{fewest} to '}{most} mode{'' if most == 1 else 's'}"
+        return f"KLIP {'+'.join(strategies)} ({reference}, {modes})"
+
     def pixel(self, place: Image) -> tuple[int, int]:
         """Row and column of the pixel of the first frame next to x, y in arcsec."""
         away = np.hypot(*np.moveaxis(self._templates.grid - place, -1, 0))
         row, column = np.unravel_index(int(away.argmin()), away.shape)
         return int(row), int(column)
-
-    @property
-    def label(self) -> str:
-        """The kind of reference frames, and how many a roll has."""
-        kinds = [name for name, is_used in (("ADI", any(self._library)),
-                                            ("RDI", len(self.references) > 0)) if is_used]
-        count = self._fewest
-        return f"KLIP, {' and '.join(kinds)}, {count} reference{'' if count == 1 else 's'}"
 
     def residuals(self, science: Image, north: float = 0.0) -> Image:
         """Frames without the star, turned and averaged, (modes, ny, nx).

@@ -1,0 +1,186 @@
+"""Rolls and pairs of rolls of all real stars with the default options, beside KLIP.
+
+Run from the root of the project, with the frames of programmes 1184 and 1386 in ../shared/data::
+
+    python -m benchmarks.real_cases --output results --planets 28
+
+Every case is reduced with `reduce` as a user would, without its reference frames: every roll alone
+and both together, of three stars in two filters, and HIP 65426. Fits, products and one row of the
+table are kept per case, so that a run that was stopped goes on. For two rolls the table has the
+5-sigma contrast limits of `reduce` and of KLIP (`klip_curve`: the other roll and all frames of
+other stars, the best of 1 to 5 modes), both without and with their small-sample corrections, and
+"by ring": those of `reduce` with the noise of KLIP's curve, the scatter of the map of contrasts in
+a ring of width lambda/D with the correction of Mawet et al. (2014). "closed" is the part of the gap
+between KLIP's limit and that of a known star which is closed, (KLIP - ours) / (KLIP - known star)
+without corrections, after Godoy et al. (2024).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from astropy.table import Table, vstack
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.pyklip_backend.klip import klip_curve, small_sample_factor
+from pyklip_diffrender.reduction import summarise
+
+SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])
+SIZE = 80
+STARS = {"G-7-34": "star", "HIP17695": "star", "V-AU-MIC": "disk"}
+FILTERS = ("F444W", "F356W")
+
+
+def cases() -> list[tuple[str, str, str]]:
+    """Star, filter and rolls ("pair", "roll 1", "roll 2"), the most telling first."""
+    pairs = [(star, band, "pair") for star in STARS for band in FILTERS]
+    alone = [(star, band, f"roll {n}") for star in STARS for band in FILTERS for n in (1, 2)]
+    return [*pairs, ("HIP-65426", "F444W", "roll 1"), *alone]
+
+
+def reduce_case(star: str, band: str, rolls: str, data: Path, planets: int, folder: Path) -> None:
+    """Reduce one case and write its products and row."""
+    torch.set_num_threads(1)
+    began = time.process_time()
+    pair = rolls == "pair"
+    injections = planets if pair and STARS.get(star) == "star" else 0
+    if star == "HIP-65426":
+        sequence = dr.Sequence.from_files([data / "hip65426_f444w_calints.fits.gz"])
+        opd = data / "opd_2022-07-30.fits.gz"
+    else:
+        sequence = dr.Sequence.from_files(data / "gto1184", target=star, filter=band)
+        opd = data / "opd_2022-08-14.fits.gz"
+    science = sequence.science if pair else sequence.science[int(rolls[-1]) - 1 :][:1]
+    result = dr.reduce(
+        replace(sequence, science=science, references=()),
+        opd,
+        disk=STARS.get(star) == "disk",
+        injections=injections,
+    )
+    seconds, detection = time.process_time() - began, result.detection
+    distance = np.hypot(detection.grid[..., 0], detection.grid[..., 1])
+    distant = distance > 0.3
+    snr = detection.residual_snr[distant]
+    peak_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    row: dict[str, Any] = {
+        "star": star,
+        "filter": band,
+        "rolls": rolls,
+        "status": result.fit.status.name,
+        "chi2": round(result.fit.chi2_per_pixel, 3),
+        "S/N scatter": round(float(np.nanstd(snr)), 3),
+        "S/N range": f"{np.nanmin(snr):.1f} to {np.nanmax(snr):.1f}",
+        "candidates": " ".join(
+            f"{s:.2f}@{r:.3f},{p:.1f}"
+            for s, r, p in zip(
+                detection.table["snr"],
+                detection.table["separation"].value,
+                detection.table["position_angle"].value,
+                strict=True,
+            )
+        ),
+        "CPU s": round(seconds),
+        "GiB": round(peak_memory, 2),
+    }
+    curve = detection.contrast_curve
+    ours = {
+        name: np.interp(SEPARATIONS, curve["separation"].value, curve[name])
+        for name in ("contrast", "small_sample", "known_star", "error_factor")
+    }
+    resolution = curve.meta["resolution_arcsec"]
+    rings = [np.abs(distance - each) < resolution / 2 for each in SEPARATIONS]
+    scatter = [np.nanstd((detection.residual_snr * detection.error)[ring]) for ring in rings]
+    ours["by_ring"] = 5 * np.array(scatter) * small_sample_factor(SEPARATIONS, resolution)
+    row |= {name: values.tolist() for name, values in ours.items()}
+    if pair:
+        klip = klip_curve(detection, sequence.cutout(SIZE).references, SEPARATIONS)
+        row["KLIP"] = np.asarray(klip["contrast"]).tolist()
+        row["KLIP small sample"] = np.asarray(klip["small_sample"]).tolist()
+        row["modes"] = np.asarray(klip["modes"]).tolist()
+    if result.injections is not None:
+        about = summarise(result)["injections"]
+        row["injections"] = {key: each for key, each in about.items() if key != "planets"}
+    result.write(folder / "products")
+    result.fit.write(folder / "fit.fits")  # With the derivatives, for `benchmarks.false_alarms`.
+    (folder / "row.json").write_text(json.dumps(row))
+
+
+def print_tables(rows: list[dict[str, Any]]) -> None:
+    """Print one row per case, and the limits of the pairs."""
+    short = ("star", "filter", "rolls", "status", "chi2", "S/N scatter", "S/N range",
+             "candidates", "CPU s", "GiB")  # fmt: skip
+    Table([{key: row[key] for key in short} for row in rows]).pprint_all()
+    parts = []
+    for row in rows:
+        if "KLIP" not in row:
+            continue
+        ours, bound, klip = (np.array(row[name]) for name in ("contrast", "known_star", "KLIP"))
+        corrected, theirs = np.array(row["small_sample"]), np.array(row["KLIP small sample"])
+        by_ring = np.array(row["by_ring"])
+        columns = {
+            "arcsec": SEPARATIONS,
+            "ours": ours,
+            "KLIP": klip,
+            "ratio": klip / ours,
+            "ours, corrected": corrected,
+            "KLIP, corrected": theirs,
+            "ratio, corrected": theirs / corrected,
+            "by ring": by_ring,
+            "ratio, by ring": theirs / by_ring,
+            "known star": bound,
+            "ours / known": ours / bound,
+            "closed": (klip - ours) / (klip - bound),
+            "factor": np.array(row["error_factor"]),
+        }
+        for name in columns:
+            plain = name.startswith(("ratio", "ours /", "closed", "factor", "arcsec"))
+            columns[name] = np.round(columns[name], 2) if plain else columns[name]
+        table = Table(columns)
+        for name in ("ours", "KLIP", "ours, corrected", "KLIP, corrected", "by ring", "known star"):
+            table[name].format = ".2e"
+        table.add_column([f"{row['star']} {row['filter']}"] * len(table), 0, "case")
+        parts.append(table)
+        print(row["star"], row["filter"], "median (least) ratios:", end=" ")
+        for name in ("ratio", "ratio, corrected", "ratio, by ring"):
+            print(name, f"{np.median(table[name]):.2f} ({table[name].min():.2f})", end="; ")
+        print("\n", row.get("injections", ""))
+    if parts:
+        vstack(parts).pprint_all()
+
+
+def main() -> None:
+    """Reduce all cases in processes of their own and print the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--planets", type=int, default=28)
+    parser.add_argument("--case", nargs=3, metavar=("STAR", "FILTER", "ROLLS"))
+    options = parser.parse_args()
+    for case in [tuple(options.case)] if options.case else cases():
+        folder = options.output / "_".join(case).replace(" ", "")
+        if (folder / "row.json").exists():
+            continue
+        folder.mkdir(parents=True, exist_ok=True)
+        if options.case:
+            reduce_case(*case, options.data, options.planets, folder)
+        else:  # So that the peak memory is that of the case.
+            rest = ["--data", options.data, "--output", options.output]
+            number = ["--planets", str(options.planets)]
+            command = [sys.executable, "-m", "benchmarks.real_cases", *rest, *number]
+            subprocess.run([*command, "--case", *case], check=False)
+    if not options.case:
+        print_tables([json.loads(path.read_text()) for path in options.output.glob("*/row.json")])
+
+
+if __name__ == "__main__":
+    main()
