@@ -11,7 +11,7 @@ from __future__ import annotations
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.combination import combine_frames
 from pyklip_diffrender.detection.disk import Disk, fit_disk
-from pyklip_diffrender.detection.figure import draw_search
+from pyklip_diffrender.detection.figure import draw_curve, draw_search
 from pyklip_diffrender.detection.recovery import measured_planet, recover_planets, with_planets
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure
@@ -26,6 +26,7 @@ __all__ = [
     "combine_frames",
     "contrast_curve",
     "detect",
+    "draw_curve",
     "draw_search",
     "fit_disk",
     "measure",

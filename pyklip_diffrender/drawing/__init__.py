@@ -7,6 +7,7 @@ colour maps can be distinguished by readers with colour vision deficiencies.
 from pyklip_diffrender.drawing.curves import contrast_curve, injected_planets, survey_limits
 from pyklip_diffrender.drawing.figures import axes_for, new_figure, panel, save, to_png
 from pyklip_diffrender.drawing.images import (
+    SNR_LINEAR,
     light_norm,
     pupil_image,
     signed_image,
@@ -15,9 +16,9 @@ from pyklip_diffrender.drawing.images import (
     wavefront_map,
 )
 from pyklip_diffrender.drawing.marks import compass, halo, unit_label
-from pyklip_diffrender.drawing.search import search
 
 __all__ = [
+    "SNR_LINEAR",
     "axes_for",
     "compass",
     "contrast_curve",
@@ -28,7 +29,6 @@ __all__ = [
     "panel",
     "pupil_image",
     "save",
-    "search",
     "signed_image",
     "snr_map",
     "star_image",

@@ -18,7 +18,15 @@ from pyklip_diffrender.drawing.marks import INK, circles, compass, label_sky
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["SNR_LINEAR", "light_norm", "pupil_image", "signed_image", "snr_map", "star_image", "wavefront_map"]
+__all__ = [
+    "SNR_LINEAR",
+    "light_norm",
+    "pupil_image",
+    "signed_image",
+    "snr_map",
+    "star_image",
+    "wavefront_map",
+]
 
 Image = NDArray[np.float64]
 
@@ -127,10 +135,10 @@ def light_norm(image: Image, noise: Image | None = None) -> Any:
 
 
 def _ticks(linear: float, limit: float) -> list[float]:
-    """0, and 1, 2 or 5 times a power of ten on both sides, from about `linear` to `limit`."""
+    """0, and 1, 2 or 5 times a power of ten on both sides, from half of `linear` to `limit`."""
     decades = 10.0 ** np.arange(np.floor(np.log10(linear)), np.log10(limit) + 1)
     steps = np.outer(decades, [1, 2, 5]).ravel()
-    steps = steps[(steps >= 0.999 * linear) & (steps <= limit)]
+    steps = steps[(steps >= 0.5 * linear) & (steps <= limit)]
     # More of them would overlap.
     steps = steps[:: max(1, len(steps) // 4)]
     return [*(-steps[::-1]).tolist(), 0.0, *steps.tolist()]

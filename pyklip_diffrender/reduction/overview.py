@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.detection import combine_frames
+from pyklip_diffrender.detection import combine_frames, draw_curve
 from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.reduction.result import Reduction
 
@@ -24,9 +24,6 @@ __all__ = ["Klip", "Overview"]
 _log = logging.getLogger(__name__)
 
 Image = NDArray[np.float64]
-
-_LABELLED = 4
-"""Largest number of candidates that are labelled: the labels of more would overlap."""
 
 _LINEAR = 5.0
 """Linear part of the scale for light, standard deviations of the noise."""
@@ -100,8 +97,7 @@ class Overview:
         self._on_frame = self.grid @ to_sky
         table = detection.table
         self._places = np.stack([table["x"].value, table["y"].value], axis=1) @ to_sky.T
-        few = len(table) <= _LABELLED
-        self._labels = [f"S/N {each:.1f}" for each in table["snr"]] if few else []
+        self._labels = [f"S/N {each:.1f}" for each in table["snr"]]
         self.image, self._error = self._combined(reduction)
 
     def _combined(self, reduction: Reduction) -> tuple[Image, Image]:
@@ -152,3 +148,10 @@ class Overview:
             axes[-1], self._snr(), self.grid, self._places, style["north"], title="S/N",
             labels=self._labels,
         )  # fmt: skip
+
+    def figure(self) -> Any:
+        """One figure of all panels and the contrast curve."""
+        figure, axes = drawing.new_figure(1, self.panels + 1)
+        self.draw(axes[0, :-1])
+        draw_curve(axes[0, -1], self._detection, self.klip and self.klip.curve)
+        return figure

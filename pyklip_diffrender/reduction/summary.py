@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
+from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from importlib.metadata import version
 from typing import Any
@@ -55,6 +56,7 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
         "filter": sequence.filter,
         "image_mask": first.header.get("CORONMSK"),
         "program": first.header.get("PROGRAM"),
+        "exposure_s": _exposure(sequence.science),
         "first_date": min(dates).isot if dates else None,
         "last_date": max(dates).isot if dates else None,
         "epoch_mjd": detection.sky.mjd,
@@ -81,7 +83,8 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
         },
         "wavefront_map": _wavefront_map(fit, first),
         "systematics": _systematics(reduction),
-        "candidates": _rows(detection.table),
+        "extended": reduction.extended,
+        "candidates": _candidates(reduction),
         "wide_field": None if reduction.wide is None else _wide_field(reduction.wide),
         "disk": None if reduction.disk is None else _disk(reduction.disk),
         "limits": _limits(detection),
@@ -179,6 +182,14 @@ def _rows(table: QTable) -> list[dict[str, Any]]:
     ]
 
 
+def _candidates(reduction: Reduction) -> list[dict[str, Any]]:
+    """Candidates; those that look like extended light have no false-alarm probability."""
+    rows = _rows(reduction.detection.table)
+    if reduction.extended:
+        rows = [each | {"false_alarm_probability": None} for each in rows]
+    return rows
+
+
 def _wide_field(wide: WideField) -> dict[str, Any]:
     """Candidates and limits in the whole frames."""
     return {"candidates": _rows(wide.table), "contrast_curve": _curve(wide.contrast_curve)}
@@ -232,7 +243,7 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
             for name in ("contrast", "lowest", "highest", "known_star", "small_sample")
         }
         star = detection.sky.star_jansky
-        known = {} if star is None else {"flux_density_Jy": star * values["contrast"]}
+        known = {} if star is None else _photometry(star * values["contrast"])
         rows.append(
             {
                 "separation_arcsec": float(separation_arcsec),
@@ -242,6 +253,10 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def _photometry(jansky: float) -> dict[str, float]:
+    return {"flux_density_Jy": jansky, "ab_mag": (jansky * u.Jy).to_value(u.ABmag)}
 
 
 def _frame(observation: Observation, use: str) -> dict[str, Any]:
@@ -256,6 +271,12 @@ def _frame(observation: Observation, use: str) -> dict[str, Any]:
         "pixels_used": observation.valid.mean(),
         "file": observation.name,
     }
+
+
+def _exposure(frames: Sequence[Observation]) -> float | None:
+    """Exposure time of all frames, s; None where one does not say it."""
+    times = [each.header.get("EFFEXPTM") for each in frames]
+    return None if None in times else sum(times)
 
 
 def _bad_pixels(observation: Observation, fitted: FrameFit) -> list[list[float]]:

@@ -358,7 +358,7 @@ class KlipSubtraction:
             residual[:, self._zone] = klip_math(
                 frame[self._zone], library, self.modes, covar_psfs=covariance
             ).T
-            turned = [rotate(each, -roll - north, self.center) for each in residual]
+            turned = [rotate(each, north - roll, self.center) for each in residual]
             total += np.nan_to_num(turned) / len(science)
         return total
 
