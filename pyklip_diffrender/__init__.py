@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         Detection,
         Disk,
         WideField,
+        completeness,
         contrast_curve,
         detect,
         fit_disk,
@@ -76,6 +77,7 @@ __all__ = [
     "__version__",
     "backend",
     "choose_map",
+    "completeness",
     "contrast_curve",
     "detect",
     "fetch_calints",
@@ -105,7 +107,8 @@ __all__ = [
 _NAMES = {
     "archive": "fetch_calints list_calints",
     "bridges": "from_poppy from_webbpsf",
-    "detection": "Detection Disk WideField contrast_curve detect fit_disk measure wide_field",
+    "detection": "Detection Disk WideField completeness contrast_curve detect fit_disk measure "
+    "wide_field",
     "instrument.nircam": "nircam_coronagraph",
     "instrument.star_flux": "star_flux_density",
     "linear.model": "LinearModel",

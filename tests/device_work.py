@@ -141,8 +141,8 @@ def fit_gradient(device: Any, **changes: object) -> list[Array]:
     """Through the model itself, by everything that a fit may vary."""
     problem = Problem(model_on(device, **changes), frame(), dr.random_opd(1, npix=NPIX))
     solver = Solver([problem], settings(), BASIS, progress=False)
-    layout = solver.first_layout()
-    (point,) = solver.objective.at(layout, layout.initial()).points
+    unknowns = solver.first_unknowns()
+    (point,) = solver.objective.at(unknowns, unknowns.initial()).points
     pixels = solver.objective.residual(0, point)
     return [each.numpy() for each in solver.objective.forwards[0].slopes(point, pixels).values()]
 

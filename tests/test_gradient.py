@@ -60,12 +60,12 @@ def solver_of(frames: int, **changes: object) -> tuple[Solver, State]:
         **changes,
     )
     solver = Solver(problems, settings, BASIS, progress=False)
-    layout = solver.first_layout()
-    vector = layout.initial()
-    deviation = solver.prior_deviation(layout)
+    unknowns = solver.first_unknowns()
+    vector = unknowns.initial()
+    deviation = solver.prior_deviation(unknowns)
     moved = torch.from_numpy(rng.normal(size=len(vector)))
     moves = torch.where(torch.isfinite(deviation), deviation, 0.0).clamp(max=5.0)
-    return solver, solver.objective.at(layout, vector + 0.1 * moves * moved)
+    return solver, solver.objective.at(unknowns, vector + 0.1 * moves * moved)
 
 
 def gradient(solver: Solver, state: State, *, exact: bool) -> Tensor:
@@ -82,20 +82,20 @@ def test_the_gradient_is_that_of_chi_squared(frames: int) -> None:
     """Against differences of chi-squared, which have an error of 1e-7 of it in these steps."""
     solver, state = solver_of(frames)
     assert solver.objective.shares_pattern == (frames > 1)
-    objective, layout = solver.objective, state.joint
+    objective, unknowns = solver.objective, state.unknowns
     weights = objective.errors(state, 0.01, 4.0)
     exact, coarse = (gradient(solver, state, exact=value) for value in (True, False))
-    names = [unknown.name for unknown in layout.unknowns()]
+    names = [unknown.name for unknown in unknowns.labels()]
     assert {*FREE, "amplitude", "modes"} <= set(names)
     rng = np.random.default_rng(5)
-    unit = solver.prior_deviation(layout)
+    unit = solver.prior_deviation(unknowns)
     unit = torch.where(torch.isfinite(unit), unit, state.vector.abs()).clamp(max=1e6)
     for name in (*FREE, "amplitude", "modes"):
         which = torch.tensor([each == name for each in names])
         direction = unit * torch.from_numpy(rng.normal(size=len(names))) * which
         step = 1e-4
         ahead, behind = (
-            objective.chi2(objective.at(layout, state.vector + sign * step * direction), weights)
+            objective.chi2(objective.at(unknowns, state.vector + sign * step * direction), weights)
             for sign in (1, -1)
         )
         slope = -(ahead - behind) / (4 * step)
@@ -120,15 +120,17 @@ def test_the_gradient_by_companions_is_that_of_chi_squared() -> None:
     solver, state = solver_of(2)
     solver = of_the_model_itself(solver)
     objective = solver.objective
-    state = objective.at(*state.joint.with_companions([dr.Planet(3e-3, 0.4, 20.0)], state.vector))
+    state = objective.at(
+        *state.unknowns.with_companions([dr.Planet(3e-3, 0.4, 20.0)], state.vector)
+    )
     weights = objective.errors(state, 0.01, 4.0)
     exact = gradient(solver, state, exact=True)
-    where = state.joint.where("companions")
+    where = state.unknowns.where("companions")
     for place, step in zip(range(where.start, where.stop), (1e-6, 1e-4, 1e-4), strict=True):
-        moved = torch.zeros(state.joint.size, dtype=torch.float64)
+        moved = torch.zeros(state.unknowns.size, dtype=torch.float64)
         moved[place] = step
         ahead, behind = (
-            objective.chi2(objective.at(state.joint, state.vector + sign * moved), weights)
+            objective.chi2(objective.at(state.unknowns, state.vector + sign * moved), weights)
             for sign in (1, -1)
         )
         np.testing.assert_allclose(float(exact[place]), -(ahead - behind) / (4 * step), rtol=1e-3)
@@ -139,7 +141,7 @@ def test_where_the_copy_is_the_model_both_gradients_are_the_same() -> None:
     solver, state = solver_of(1)
     same = of_the_model_itself(solver)
     exact, copied = (gradient(same, state, exact=value) for value in (True, False))
-    scale = same.prior_deviation(state.joint).clamp(max=1e6)
+    scale = same.prior_deviation(state.unknowns).clamp(max=1e6)
     error = ((exact - copied) * scale).norm() / (exact * scale).norm()
     assert error < 1e-4
 
@@ -151,7 +153,7 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> No
     assert solver.objective.shares_pattern == (frames > 1)
     same = of_the_model_itself(solver)
     rng = np.random.default_rng(6)
-    unit = solver.prior_deviation(state.joint)
+    unit = solver.prior_deviation(state.unknowns)
     unit = torch.where(torch.isfinite(unit), unit, state.vector.abs()).clamp(max=1e6)
     step = 0.01 * unit * torch.from_numpy(rng.normal(size=len(unit)))
     curved, products = [], []
@@ -175,15 +177,15 @@ def test_an_accurate_step_ends_where_that_of_the_model_does(
     solver, state = solver_of(1)
     same = of_the_model_itself(solver)
     weights = solver.objective.errors(state, 0.01, 4.0)
-    deviation = solver.prior_deviation(state.joint)
+    deviation = solver.prior_deviation(state.unknowns)
     coarse, fine = (
         linearise(each.objective, state, 0.01, len(BASIS), 4.0) for each in (solver, same)
     )
     derivatives = ModelDerivatives(solver.objective, state, weights)
     # Equations of the starting values precondition as well.
-    start = solver.objective.at(state.joint, state.joint.initial())
+    start = solver.objective.at(state.unknowns, state.unknowns.initial())
     earlier = linearise(solver.objective, start, 0.1, len(BASIS), 4.0)
-    direct = same._solve(state.joint, fine).step - fine.current
+    direct = same._solve(state.unknowns, fine).step - fine.current
     steps = []
     for equations in (coarse, earlier):
         step, settled = accurate_step(
@@ -191,8 +193,8 @@ def test_an_accurate_step_ends_where_that_of_the_model_does(
         )
         assert not settled  # Every iteration lowers it, if only by a little.
         steps.append(step)
-    too_coarse = solver._solve(state.joint, coarse).step - coarse.current
-    errors = same._solve(state.joint, fine, errors=True).variance.sqrt()
+    too_coarse = solver._solve(state.unknowns, coarse).step - coarse.current
+    errors = same._solve(state.unknowns, fine, errors=True).variance.sqrt()
     assert (direct / errors).norm() > 10
     for step in steps:
         assert ((step - direct) / errors).norm() < 0.2
@@ -275,7 +277,7 @@ def test_accurate_steps_keep_their_equations(monkeypatch: pytest.MonkeyPatch) ->
     assert calls[:2] == [0, 0]
     assert len(calls) == 3
     grown = solver.objective.at(
-        *after.joint.with_companions([dr.Planet(1e-4, 0.3, 20.0)], after.vector)
+        *after.unknowns.with_companions([dr.Planet(1e-4, 0.3, 20.0)], after.vector)
     )
     solver._accurate_step(grown, 0.002, len(BASIS))
     assert len(calls) == 4
@@ -319,13 +321,13 @@ def test_other_weights_need_no_new_jacobian(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_derivatives_by_a_frame_become_those_by_all_unknowns() -> None:
-    """The adjoint of `of_frame`, with modes that drift between the frames."""
+    """The adjoint of `of_unknowns`, with modes that drift between the frames."""
     solver, state = solver_of(2, drift=WavefrontPrior(SCALES, fit_scales=False))
     assert solver.priors.drift > 0
     rng = np.random.default_rng(10)
-    joint = torch.from_numpy(rng.normal(size=state.joint.size))
+    joint = torch.from_numpy(rng.normal(size=state.unknowns.size))
     for k in range(2):
         own = torch.from_numpy(rng.normal(size=len(state.points[k].vector)))
-        there = state.joint.of_frame(k, joint) @ own
-        back = joint @ state.joint.onto_unknowns(k, own)
+        there = state.unknowns.rows[k].of_unknowns(joint) @ own
+        back = joint @ state.unknowns.rows[k].onto_unknowns(own, len(joint))
         assert float(there) == pytest.approx(float(back))

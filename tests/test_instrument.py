@@ -13,12 +13,14 @@ from astropy.table import Table
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import (
+    FILTERS,
     ROUND_MASKS,
     ChromaticAberration,
+    detector_place,
     filter_shift,
     filter_throughput,
     internal_wavefront_error,
-    mask_center,
+    is_short_wave,
     nircam_coronagraph,
 )
 from pyklip_diffrender.io import embedded_table
@@ -39,16 +41,24 @@ def opd() -> torch.Tensor:
 
 @pytest.mark.parametrize(
     ("mask", "filter_name"),
-    [("MASK210R", "F210M"), ("MASK335R", "F335M"), ("MASK430R", "F430M"), ("MASK430R", "f444w")],
+    [
+        ("MASK210R", "F210M"),
+        ("MASK335R", "F335M"),
+        ("MASK430R", "F430M"),
+        ("MASK430R", "f444w"),
+        ("MASK335R", "F210M"),
+        ("MASK430R", "F200W"),
+        ("MASK210R", "F444W"),
+    ],
 )
 def test_every_round_mask_hides_the_star_and_lets_a_planet_pass(
     mask: str, filter_name: str, opd: torch.Tensor
 ) -> None:
-    """At 6 lambda/D half of the planet's light passes the mask, ten times further out all of it."""
+    """Where half of a planet's light passes the mask, and beyond it, where all does."""
     model = nircam_coronagraph(filter_name, image_mask=mask, nlambda=3, **SMALL)
     clear = nircam_coronagraph(filter_name, image_mask=None, nlambda=3, **SMALL)
     assert model.planes[0].name == mask
-    scale = ROUND_MASKS[mask].pixelscale
+    scale = detector_place(mask, filter_name).pixelscale
     assert model.detector.pixelscale == (scale, scale)
     unocculted = float(clear(opd).sum())
     assert float(model(opd).sum()) < 0.03 * unocculted
@@ -68,7 +78,9 @@ def test_a_wider_mask_takes_more_of_the_light(opd: torch.Tensor) -> None:
 
 
 def test_another_mask_brings_its_own_aberrations() -> None:
-    tables = {mask: internal_wavefront_error(mask) for mask in ROUND_MASKS}
+    tables = {
+        mask: internal_wavefront_error(mask, short_wave=mask == "MASK210R") for mask in ROUND_MASKS
+    }
     rms = {mask: float(table[3:].norm() * 1e9) for mask, table in tables.items()}
     # The official table's column WFE_RMS, nm: of the lit part of the pupil, not of the circle.
     assert rms == pytest.approx({"MASK210R": 161, "MASK335R": 176, "MASK430R": 171}, rel=0.02)
@@ -95,17 +107,19 @@ def test_focus_is_zero_where_the_table_was_made_and_tilt_at_the_reference() -> N
 
 
 def test_places_on_the_detector_count_from_zero() -> None:
-    assert mask_center("NRCA5_MASK335R") == pytest.approx((149.2, 173.6))
-    full, sub = mask_center("NRCA5_FULL_MASK335R"), mask_center("NRCA5_MASK335R")
-    # The corner of the subarray lies on a whole pixel.
-    assert [a - b for a, b in zip(full, sub, strict=True)] == pytest.approx([491, 1501])
+    """In the subarray of MASK335R, whose corner is at (491, 1501), it is (149.2, 173.6)."""
+    place = detector_place("MASK335R", "F444W")
+    assert place.detector == "NRCA5"
+    assert np.subtract(place.center, (491, 1501)) == pytest.approx((149.2, 173.6))
     assert filter_shift("F335M") == filter_shift("F210M") == (0.0, 0.0)
     assert filter_shift("f444w") == (0.177, -0.205)
 
 
 def test_places_that_are_not_known_are_refused_with_those_that_are() -> None:
-    with pytest.raises(IncompatibleSetupError, match=r"'NRCB5_MASK335R'.*NRCA5_MASK335R"):
-        mask_center("NRCB5_MASK335R")
+    with pytest.raises(IncompatibleSetupError, match=r"'MASKA335R'.*MASK335R"):
+        detector_place("MASKA335R", "F444W")
+    with pytest.raises(IncompatibleSetupError, match=r"'F150W'.*F182M.*F480M"):
+        detector_place("MASK335R", "F150W")
     with pytest.raises(IncompatibleSetupError, match=r"F182M.*F480M, not for 'F277W'"):
         filter_shift("F277W")
 
@@ -174,9 +188,7 @@ def official(shared_data: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    "name", [n for m in ("MASK210R", "MASK335R") for n in ROUND_MASKS[m].filters]
-)
+@pytest.mark.parametrize("name", FILTERS)
 def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(
     official: Path, name: str
 ) -> None:
@@ -196,13 +208,29 @@ def test_filters_stay_as_close_to_the_official_ones_as_their_table_says(
 def test_aberrations_are_those_of_the_official_field_points(official: Path) -> None:
     table = Table.read(official / "si_zernikes_coron_wfe.fits")
     mine = embedded_table("nircam_si_zernikes")
-    for mask in ROUND_MASKS.values():
-        channel = "NIRCamSWA" if mask.short_wave else "NIRCamLWA"
-        point = f"Z{mask.name[4:]}_A"
+    for column in mine.colnames[1:]:
+        channel, mask = column.split()
+        channel, point = f"NIRCam{channel}A", f"Z{mask[4:]}_A"
         (row,) = (
             r
             for r in table
             if r["instrument"].strip() == channel and r["field_point_name"].strip() == point
         )
         truth = np.array([row[f"Zernike_{k}"] for k in range(1, 37)]) * 1e9
-        np.testing.assert_allclose(mine[mask.name], truth, rtol=1e-3, atol=1e-9)
+        np.testing.assert_allclose(mine[column], truth, rtol=1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize("filter_name", ["F210M", "F444W"])
+@pytest.mark.parametrize("mask", ROUND_MASKS)
+def test_pixels_and_places_are_those_of_the_siaf(mask: str, filter_name: str) -> None:
+    pysiaf = pytest.importorskip("pysiaf")
+    place = detector_place(mask, filter_name)
+    assert place.short_wave == is_short_wave(filter_name)
+    aperture = pysiaf.Siaf("NIRCam")[f"{place.detector}_FULL_{mask}"]
+    assert place.siaf_pixelscale == pytest.approx(
+        (aperture.XSciScale, aperture.YSciScale), abs=6e-9
+    )
+    # The places measured in flight are up to 3.4 pixels from those of the SIAF.
+    assert np.add(place.center, 1) == pytest.approx((aperture.XSciRef, aperture.YSciRef), abs=3.5)
+    x, y = aperture.sci_to_idl(aperture.XSciRef + np.array([-40, 40]), np.full(2, aperture.YSciRef))
+    assert place.siaf_shear == pytest.approx(np.diff(y) / np.diff(x), abs=1e-4)

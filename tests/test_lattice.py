@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.instrument import ROUND_MASKS, nircam_coronagraph
+from pyklip_diffrender.instrument import detector_place, nircam_coronagraph
 from pyklip_diffrender.optics import OpticalSystem, Plane, PointSources
 from pyklip_diffrender.wavefront import random_opd
 
 WAVELENGTH = 4.5e-6
-MASK = ROUND_MASKS["MASK335R"]
+MASK = detector_place("MASK335R", "F444W")
 SIAF: dict[str, Any] = {"pixelscale": MASK.siaf_pixelscale, "shear": MASK.siaf_shear}
 MOVED: dict[str, Any] = {
     "detector_shift": (0.011, -0.02),

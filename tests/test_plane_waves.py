@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 import torch
 
-from pyklip_diffrender.instrument import ROUND_MASKS, nircam_coronagraph
+from pyklip_diffrender.instrument import detector_place, nircam_coronagraph
 from pyklip_diffrender.linear import ModeFields
 from pyklip_diffrender.optics import OpticalSystem, PupilGrid, Wavefront
 from pyklip_diffrender.wavefront import FourierModes, JointBasis, SegmentMotions, random_opd
 
 NPIX = 128
-MASK = ROUND_MASKS["MASK335R"]
+MASK = detector_place("MASK335R", "F444W")
 MOVED: dict[str, Any] = {
     "star_offset": (0.02, -0.03),
     "detector_shift": (0.011, -0.02),

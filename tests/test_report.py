@@ -455,6 +455,31 @@ def test_injected_planets_have_a_section(tmp_path: Path, count: int) -> None:
 
 
 @pytest.mark.usefixtures("_few_pictures")
+def test_completeness_has_a_section(tmp_path: Path) -> None:
+    fractions = QTable(
+        {
+            "separation": np.repeat([0.4, 0.8], 3) * u.arcsec,
+            "contrast": np.array([1, 2, 4, 1, 2, 4]) * 1e-5,
+            "completeness": [0.0, 0.5, 1.0, 0.2, 0.6, 0.7],
+            "planets": np.full(6, 10),
+        },
+        meta={
+            "threshold": 5.0, "false_alarm": 1e-4, "separation_arcsec": [0.4, 0.8],
+            "contrast_50": [2e-5, 1.75e-5], "contrast_95": [3.8e-5, np.nan],
+        },
+    )  # fmt: skip
+    names = [path.name for path in replace(reduction(), completeness=fractions).write(tmp_path)]
+    assert "completeness.ecsv" in names
+    read = QTable.read(tmp_path / "completeness.ecsv")
+    assert list(read["completeness"]) == list(fractions["completeness"])
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["completeness"]
+    assert summary["contrast_50"] == [2e-5, 1.75e-5]
+    assert summary["contrast_95"] == [3.8e-5, None]
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "has a false candidate in 0.01 % of such fields" in text
+
+
+@pytest.mark.usefixtures("_few_pictures")
 def test_a_failure_of_klip_does_not_break_the_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

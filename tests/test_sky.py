@@ -25,7 +25,7 @@ from pyklip_diffrender.detection.orbits import write_astrometry
 from pyklip_diffrender.detection.sky import Positions, Sky
 from pyklip_diffrender.detection.tables import candidate_table, measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument import ROUND_MASKS
+from pyklip_diffrender.instrument import detector_place
 from pyklip_diffrender.refinement import FrameFit, jansky_per_unit, require_calibrated, to_jansky
 from pyklip_diffrender.scene import Observation, world_coordinates
 
@@ -87,7 +87,7 @@ def test_the_sky_is_where_the_frames_own_wcs_has_it(
 ) -> None:
     """A flipped axis or a wrong sign is wrong by the whole offset; the scales agree to 0.2 %."""
     got = observation(tmp_path)
-    mask = ROUND_MASKS["MASK335R"]
+    mask = detector_place("MASK335R", "F444W")
     # As in `Templates.grid`: the detector's scales and shear about the star.
     x = pixels[0] * mask.siaf_pixelscale[0]
     y = pixels[1] * mask.siaf_pixelscale[1] + mask.siaf_shear * x

@@ -17,6 +17,7 @@ from astropy.table import QTable, Table, vstack
 from pyklip.instruments import JWST
 from pyklip.parallelized import klip_dataset
 
+from benchmarks.calints_files import calints
 from pyklip_diffrender import spaceklip
 from pyklip_diffrender.detection import Candidates, Detection
 from pyklip_diffrender.detection.error_factor import ErrorFactor
@@ -162,9 +163,9 @@ def test_products_have_spaceklips_keywords_and_curves(tmp_path: Path) -> None:
 def test_a_failure_is_reported_after_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any
 ) -> None:
-    good = concatenation(["a_calints.fits"])
+    good, bad = (concatenation([str(calints(tmp_path / f"{each}_calints.fits"))]) for each in "ab")
     obs = {
-        "bad": concatenation(["b_calints.fits"]),
+        "bad": bad,
         KEY: good,
         "miri": concatenation(["c"], INSTRUME="MIRI", EXP_TYPE="MIR_4QPM"),
         "raw": concatenation(["d"], DATAMODL="STAGE1"),
@@ -173,7 +174,7 @@ def test_a_failure_is_reported_after_the_others(
     }
     database = StandIn(tmp_path, obs)
 
-    def reduced(key: str, table: Table, folder: Path, *others: Any) -> Any:
+    def reduced(key: str, table: Table, frames: QTable, folder: Path, *others: Any) -> Any:
         if key == "bad":
             raise IncompatibleSetupError("no such filter")
         header = {name: good[name][0] for name in good.colnames if len(name) <= 8
@@ -204,6 +205,34 @@ def test_a_failure_is_reported_after_the_others(
     assert list(database.src[KEY][0]["CON"]) == [2e-5, 1e-5]
     with pytest.raises(ExceptionGroup):
         spaceklip.run_obs(database, opd=OPD, restrict_to="bad")
+
+
+def test_files_are_judged_before_any_is_fitted(tmp_path: Path) -> None:
+    rolls = [
+        str(calints(tmp_path / f"{k}_calints.fits", observation=k, roll=70.0 + k)) for k in (1, 2)
+    ]
+    confirmation = calints(tmp_path / "ta.fits", observation=3, cards={"EXP_TYPE": "NRC_TACONFIRM"})
+    own = calints(tmp_path / "own.fits", observation=4, roll=80.0)
+    other = calints(tmp_path / "psf.fits", "HD 2", observation=5)
+    later = calints(tmp_path / "later.fits", observation=6, roll=90.0, date="2023-12-01T06:00:00")
+    table = concatenation([*rolls, str(confirmation), str(own), str(other)])
+    table["TYPE"] = ["SCI"] * 3 + ["REF"] * 2
+    with pytest.warns(DiffrenderWarning) as caught:
+        left, frames = run._admitted(KEY, table)
+    assert list(left["FITSFILE"]) == [*rolls, str(other)]
+    uses = {row["file"]: row["use"] for row in frames}
+    assert uses == {
+        "1_calints.fits": "target", "2_calints.fits": "target", "psf.fits": "reference",
+        "own.fits": "excluded", "ta.fits": "excluded",
+    }  # fmt: skip
+    said = " ".join(str(each.message) for each in caught)
+    assert "ta.fits is left out: EXP_TYPE is NRC_TACONFIRM" in said
+    assert "own.fits is left out: a reference frame that shows the target itself" in said
+    database = StandIn(tmp_path, {KEY: concatenation([rolls[0], str(later)])})
+    with pytest.raises(ExceptionGroup) as failed:
+        spaceklip.run_obs(database, opd=OPD)
+    assert "2 epochs" in str(failed.value.exceptions[0])
+    assert failed.value.exceptions[0].__notes__ == [f"concatenation {KEY}"]
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ from astropy.table import QTable, Table
 from survey_stubs import HOSTILE, configuration, inputs, result, stub
 
 import pyklip_diffrender as dr
+from benchmarks.calints_files import calints
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.detection import with_planets
 from pyklip_diffrender.errors import (
@@ -233,6 +234,30 @@ def test_of_a_folder_of_maps_the_nearest_to_the_target_is_used(tmp_path: Path) -
     (job,) = planned(config)
     assert job.opd == str(maps / "map11.fits")
     assert sorted(job.inputs) == sorted([*map(str, frames.iterdir()), job.opd])
+
+
+def test_epochs_of_a_sequence_are_jobs_of_their_own(tmp_path: Path) -> None:
+    config = inputs(tmp_path, 1)
+    frames = tmp_path / "frames"
+    for k, day in enumerate(("2022-10-03", "2022-10-04", "2023-12-01")):
+        date = f"{day}T06:00:00"
+        calints(frames / f"{k}.fits", observation=k, date=date, roll=70.0 + k)
+    config["sequence"][0] |= {
+        "files": str(frames), "name": "HD 1",
+        "injections": {"contrasts": [1e-4], "separations": [0.5]},
+    }  # fmt: skip
+    jobs = planned(config)
+    assert [each.name for each in jobs] == ["HD 1 2022-10-03"] * 2 + ["HD 1 2023-12-01"] * 2
+    assert len({each.key for each in jobs}) == 4
+    chosen = [
+        [each.name for each in dr.Sequence.from_files(job.files, epoch=job.epoch).science]
+        for job in jobs[::2]
+    ]
+    assert chosen == [["0.fits", "1.fits"], ["2.fits"]]
+    assert jobs[3].epoch == jobs[2].epoch
+    # One epoch is named as before.
+    (frames / "2.fits").unlink()
+    assert [each.name for each in planned(config)] == ["HD 1", "HD 1"]
 
 
 def test_a_sequence_may_have_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -125,8 +125,9 @@ def _instrument_and_wavefront() -> list[Breakage]:
             "nodes.tolist()), tuple(abs(vectors[0]).tolist()))\n\n    @property", "bandpass",
         ),
         Breakage(
-            "drift-sign", "drift goes from the first map to the second",
-            'first + hours / to_number(interval', 'first - hours / to_number(interval', "opd",
+            "drift-size", "random drifts grow with the hours",
+            "unit.data * (9e-9 / 1e-8 * hours / 86.0)",
+            "unit.data * (9e-9 / 1e-8 * 86.0 / hours)", "opd",
         ),
         Breakage(
             "sine-modes", "sums of modes are the modes that derivatives are of",
@@ -145,8 +146,8 @@ def _instrument_and_wavefront() -> list[Breakage]:
         ),
         Breakage(
             "evidence", "scales of a prior are those of the highest evidence",
-            "determined = 1 - precision[others:] * variance[others:]",
-            "determined = precision[others:] * variance[others:]", "refinement recovery",
+            "share = 1 - precision * variance", "share = precision * variance",
+            "refinement recovery",
         ),
         Breakage(
             "prior-weight", "the prior holds back modes that the data do not determine",
@@ -171,7 +172,7 @@ def _frames_and_files() -> list[Breakage]:
             "header-roll", "the position angle of +y follows from ROLL_REF and V3I_YANG",
             'return roll - angle * (-1.0 if parity is None else parity)',
             'return roll + angle * (-1.0 if parity is None else parity)',
-            "observation exposure admission",
+            "observation admission",
         ),
         Breakage(
             "saturated", "saturated pixels are left out",
@@ -205,9 +206,8 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "combined", "frames are averaged with inverse variances",
-            "np.where(self.valid, np.where(self.valid, self.error, 1.0) ** -2, 0.0)",
-            "np.where(self.valid, np.where(self.valid, self.error, 1.0) ** -1, 0.0)",
-            "observation",
+            "weight = valid / np.reshape(typical, (-1, 1, 1))",
+            "weight = valid * np.reshape(typical, (-1, 1, 1))", "observation noise",
         ),
         Breakage(
             "other-mask", "of several set-ups that of most frames is kept",
@@ -297,14 +297,13 @@ def _detection() -> list[Breakage]:
         ),
         Breakage(
             "small-sample", "limits near the star have the small-sample correction",
-            "stats.t.isf(stats.norm.sf(sigmas), self._freedom_at(separation))",
-            "stats.norm.isf(stats.norm.sf(sigmas), 0 * self._freedom_at(separation))",
-            "error_factor detection",
+            "return np.asarray(stats.t.isf(stats.norm.sf(sigmas), freedom))",
+            "return np.asarray(sigmas + 0 * freedom)", "error_factor detection",
         ),
         Breakage(
             "inner", "nothing is searched inside the smallest separation",
-            "(separation_of(grid) >= inner) & far_from(grid, sources, distance)",
-            "far_from(grid, sources, distance)", "detection search",
+            "allowed = allowed & (separation_of(self.grid) >= self.inner)",
+            "allowed = allowed.copy()", "detection search",
         ),
         Breakage(
             "inflation", "errors grow with the square root of chi-squared",

@@ -22,6 +22,7 @@ _SEARCH = 5.0
 _DISK = 0.8
 _TIED = 0.6
 _WIDE = 10.0
+_COMPLETENESS = 90.0
 _WRITE = 5.0
 _FRAMES = 0.88
 _PIXELS = 0.17
@@ -66,6 +67,8 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
         seconds = joint + _SEARCH * area * count
         rounds = math.ceil(options.injections / TOGETHER)
         steps.append((f"{options.injections} injected planets", rounds * seconds))
+    if options.completeness:
+        steps.append(("completeness", _COMPLETENESS * area * count))
     if options.wide:
         steps.append(("search of the whole frames", _WIDE * count))
     steps.append(("products", _WRITE))

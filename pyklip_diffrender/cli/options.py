@@ -229,6 +229,9 @@ search = _all(
            section="Fit and search",
            help="Add N planets slightly brighter than the limits to the frames, and report how "
                 "well they are recovered. Seven take as long as the fit and the search."),
+    option("--completeness", is_flag=True, section="Fit and search",
+           help="Compute the fraction of planets that the search finds, by contrast and "
+                "separation. Takes a few minutes for two rolls."),
     option("--star-flux", metavar="FLUX", section="Fit and search",
            help='Flux density of the star in the filter, such as "0.45 Jy", to which contrasts '
                 "refer; default: what diffracted light says, to 10 %."),

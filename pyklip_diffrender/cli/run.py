@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 _ARGUMENTS = "|".join([
-    "disk", "filter", "injections", "memory", "opd", "program", "size", "star_flux",
+    "completeness", "disk", "filter", "injections", "memory", "opd", "program", "size", "star_flux",
     "star_flux_error", "systematics", "target", "threshold", "wide",
 ])  # fmt: skip
 """Arguments of `reduce` and `fetch_calints` that are options of the command line."""

@@ -134,13 +134,36 @@ class Maps:
         """The numerator after candidates are removed from the data, (ny, nx)."""
         if not len(candidates):
             return self.numerator
-        numerator = self.numerator.flatten()
-        cleaned = [linear.clean(candidates.light(templates)) for linear, templates in self.groups]
+        light = [candidates.light(templates) for _, templates in self.groups]
+        return np.asarray(self.numerator - self.change(light)[0])
+
+    def response(self, offsets: Tensor) -> Image:
+        """Change of the numerator by a planet of contrast 1 at each position, (k, ny, nx).
+
+        Parameters
+        ----------
+        offsets : Tensor, (k, 2), float64
+            x, y from the star, arcsec.
+        """
+        return self.change([templates.at(offsets) for _, templates in self.groups])
+
+    def change(self, light: Sequence[Mapping[int, Tensor]]) -> Image:
+        """Change of the numerator by images that are added to the data, (k, ny, nx).
+
+        Parameters
+        ----------
+        light : sequence of mapping of int to Tensor, (k, ny, nx)
+            Images by frame, for each group.
+        """
+        cleaned = [linear.clean(part) for (linear, _), part in zip(self.groups, light, strict=True)]
+        ny, nx = self.shape
+        total = np.zeros((len(cleaned[0][0]), ny * nx))
         for g, pixels, images in self._batches("candidates"):
             for k, planets in images.items():
-                whitened = (self.groups[g][0].frames[k].weight * cleaned[g][k][0]).float()
-                numerator[pixels] -= torch.tensordot(planets, whitened, dims=2).double().numpy()
-        return numerator.reshape(self.shape)
+                whitened = (self.groups[g][0].frames[k].weight * cleaned[g][k]).float()
+                products = whitened.flatten(1) @ planets.flatten(1).T
+                total[:, pixels] += products.double().numpy()
+        return total.reshape(-1, ny, nx)
 
     def snr(self, numerator: Image | None = None) -> Image:
         """Amplitude over its standard deviation; NaN where there is no information."""

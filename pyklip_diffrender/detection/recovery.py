@@ -16,11 +16,11 @@ from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["TOGETHER", "measured_planet", "recover_planets", "with_planets"]
+__all__ = ["CLEAR", "TOGETHER", "measured_planet", "recover_planets", "with_planets"]
 
 _STRENGTH = 1.6
-"""Contrast of an injected planet over the limit at its separation. At a limit of 5 sigma, nearly
-all planets of 8 sigma should be detected."""
+"""Contrast of an injected planet over the limit with the small-sample correction, which is the
+threshold of the search. At a limit of 5 sigma, nearly all planets of 8 sigma should be detected."""
 
 TOGETHER = 7
 """Largest number of planets in the frames at a time."""
@@ -35,7 +35,7 @@ _FRACTION = 0.618
 _SAME = 0.1
 """A candidate this near to an injected planet is the planet, arcsec."""
 
-_CLEAR = 0.3
+CLEAR = 0.3
 """Distance of injected planets from candidates, arcsec."""
 
 _GOLDEN = 137.5
@@ -85,7 +85,7 @@ def recover_planets(
     """Add planets to the frames of a detection and search them again.
 
     The planets are spread over all separations and angles, up to seven at a time, and are 1.6 times
-    as bright as the contrast curve's limit at their separations.
+    as bright as the limit with the small-sample correction at their separations.
 
     Parameters
     ----------
@@ -111,7 +111,9 @@ def recover_planets(
         # Other separations in every set, so that sets fill the gaps.
         parts = (np.arange(rings) + (0.5 + _FRACTION * trial) % 1) / rings
         separations = inner + (outer - inner) * parts
-        limits = np.interp(separations, curve["separation"].value, curve["contrast"])
+        limits = np.exp(
+            np.interp(separations, curve["separation"].value, np.log(curve["small_sample"]))
+        )
         places = np.array(
             [
                 _free_place(detection, separation, _GOLDEN * k + _NEXT * trial)
@@ -199,6 +201,6 @@ def _free_place(detection: Detection, separation: float, angle: float) -> NDArra
     for place in circle:
         away = np.hypot(*np.moveaxis(detection.grid - place, -1, 0))
         covered = np.isfinite(detection.snr[np.unravel_index(away.argmin(), away.shape)])
-        if covered and (np.hypot(*(candidates - place).T) > _CLEAR).all():
+        if covered and (np.hypot(*(candidates - place).T) > CLEAR).all():
             return place
     return circle[0]

@@ -15,6 +15,7 @@ from pyklip_diffrender.refinement import Refinement, refine_again
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
+    "has_unconfirmed_companions",
     "lacks_candidates",
     "with_companions",
     "without_light",
@@ -44,6 +45,24 @@ def lacks_candidates(fits: Sequence[Refinement], candidates: Candidates) -> bool
     """
     return any(
         len(fit.companions) != len(candidates) or bool((~_confirmed(fit, fits, candidates)).any())
+        for fit in fits
+        if not has_only_reference_stars(fit)
+    )
+
+
+def has_unconfirmed_companions(fits: Sequence[Refinement], candidates: Candidates) -> bool:
+    """Return True if a fit of the target has a companion that is not one of the candidates.
+
+    It is most often an error of the star, and would remain in the star's image, in files and plots.
+
+    Parameters
+    ----------
+    fits : sequence of Refinement
+    candidates : Candidates
+        Positions refer to the first frame of the first fit.
+    """
+    return any(
+        bool((~_confirmed(fit, fits, candidates)).any())
         for fit in fits
         if not has_only_reference_stars(fit)
     )

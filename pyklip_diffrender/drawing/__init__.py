@@ -4,7 +4,12 @@ It knows no class of the package: the `plot` methods, the report and the demo pa
 colour maps can be distinguished by readers with colour vision deficiencies.
 """
 
-from pyklip_diffrender.drawing.curves import contrast_curve, injected_planets, survey_limits
+from pyklip_diffrender.drawing.curves import (
+    completeness,
+    contrast_curve,
+    injected_planets,
+    survey_limits,
+)
 from pyklip_diffrender.drawing.figures import axes_for, new_figure, panel, save, to_png
 from pyklip_diffrender.drawing.images import (
     SNR_LINEAR,
@@ -21,6 +26,7 @@ __all__ = [
     "SNR_LINEAR",
     "axes_for",
     "compass",
+    "completeness",
     "contrast_curve",
     "halo",
     "injected_planets",

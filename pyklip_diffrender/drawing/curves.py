@@ -71,6 +71,42 @@ def contrast_curve(
     ax.legend(frameon=False, loc="upper right", fontsize="small")
 
 
+def completeness(
+    ax: Axes, table: QTable, curve: QTable, half: Sequence[float], most: Sequence[float]
+) -> None:
+    """Draw the fraction of planets that are found against separation and contrast.
+
+    Parameters
+    ----------
+    ax : Axes
+    table : QTable
+        Columns separation, contrast and completeness, with as many contrasts at each separation.
+    curve : QTable
+        Columns separation and contrast: the limits at 5 sigma.
+    half, most : sequence of float
+        Contrasts at which 50 and 95 % are found, by separation; may be NaN.
+    """
+    separation = np.unique(table["separation"].value)
+    x, y, fraction = (
+        np.asarray(each).reshape(len(separation), -1)
+        for each in (table["separation"].value, table["contrast"], table["completeness"])
+    )
+    mesh = ax.pcolormesh(x, y, fraction, cmap="cividis", vmin=0, vmax=1, shading="nearest")
+    ax.figure.colorbar(mesh, ax=ax, label="fraction found", fraction=0.046, pad=0.03)
+    ax.plot(separation, most, "-", color="white", label="95 %")
+    ax.plot(separation, half, "--", color="white", label="50 %")
+    ax.plot(curve["separation"].value, curve["contrast"], ":", color="white", label="5 sigma")
+    ax.set_yscale("log")
+    ax.set_xlim(x.min(), x.max())
+    ax.set_ylim(y.min(), y.max())
+    ax.set_box_aspect(1.0)
+    ax.set_xlabel("separation (arcsec)")
+    ax.set_ylabel("contrast")
+    legend = ax.legend(frameon=False, loc="upper right", fontsize="small")
+    for text in legend.get_texts():
+        text.set_color("white")
+
+
 def injected_planets(ax: Axes, planets: QTable) -> None:
     """Draw recovered over injected contrast against separation.
 

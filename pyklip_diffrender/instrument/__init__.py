@@ -10,7 +10,13 @@ from pyklip_diffrender.instrument.jwst import (
     jwst_segments,
     maskrnd_openings,
 )
-from pyklip_diffrender.instrument.masks import ROUND_MASKS, filter_shift, mask_center
+from pyklip_diffrender.instrument.masks import (
+    FILTERS,
+    ROUND_MASKS,
+    detector_place,
+    filter_shift,
+    is_short_wave,
+)
 from pyklip_diffrender.instrument.nircam import (
     FLIGHT_ALIGNMENT,
     NIRCAM_LW_PIXELSCALE,
@@ -19,20 +25,22 @@ from pyklip_diffrender.instrument.nircam import (
 from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, filter_throughput
 
 __all__ = [
+    "FILTERS",
     "FLIGHT_ALIGNMENT",
     "NIRCAM_LW_PIXELSCALE",
     "ROUND_MASKS",
     "TABULATED_GAP",
     "ChromaticAberration",
     "blackbody",
+    "detector_place",
     "filter_bandpass",
     "filter_shift",
     "filter_throughput",
     "internal_wavefront_error",
     "is_jwst_pupil",
+    "is_short_wave",
     "jwst_pupil",
     "jwst_segments",
-    "mask_center",
     "maskrnd_openings",
     "nircam_coronagraph",
 ]

@@ -48,7 +48,7 @@ class ChromaticAberration:
     reference : float
         Wavelength at which the tilt is zero, m.
     short_wave : bool
-        Whether the mask is in the short-wave channel.
+        Whether it is that of the short-wave channel.
     """
 
     def __init__(self, reference: float, short_wave: bool = False) -> None:
@@ -64,8 +64,10 @@ class ChromaticAberration:
         }
 
 
-def internal_wavefront_error(mask: str = "MASK335R", flip: bool = True) -> Tensor:
-    """NIRCam's internal wavefront error at a round mask.
+def internal_wavefront_error(
+    mask: str = "MASK335R", flip: bool = True, *, short_wave: bool = False
+) -> Tensor:
+    """NIRCam's internal wavefront error at a mask.
 
     Parameters
     ----------
@@ -74,20 +76,23 @@ def internal_wavefront_error(mask: str = "MASK335R", flip: bool = True) -> Tenso
     flip : bool
         Flip the map vertically, as stpsf does from 2.2.0 on, because that matches images in flight
         better. False uses the tabulated orientation, that of the exit pupil, as stpsf did before.
+    short_wave : bool
+        In the short-wave channel, otherwise in the long-wave one.
 
     Returns
     -------
     Tensor, (36,), float64
         Noll coefficients in m, for the entrance-pupil orientation used here.
     """
-    exit_pupil = torch.tensor(_table(mask), dtype=torch.float64) * 1e-9
+    exit_pupil = torch.tensor(_table(mask, short_wave), dtype=torch.float64) * 1e-9
     return exit_pupil if flip else exit_pupil * parity_in_y(len(exit_pupil))
 
 
-@lru_cache(maxsize=3)
-def _table(mask: str) -> tuple[float, ...]:
+@lru_cache(maxsize=4)
+def _table(mask: str, short_wave: bool) -> tuple[float, ...]:
     """The tabulated coefficients, nm; cached because reading them takes longer than an image."""
-    return tuple(embedded_table("nircam_si_zernikes")[mask].tolist())
+    channel = "SW" if short_wave else "LW"
+    return tuple(embedded_table("nircam_si_zernikes")[f"{channel} {mask}"].tolist())
 
 
 def parity_in_y(count: int) -> Tensor:

@@ -1,22 +1,27 @@
-"""NIRCam's round coronagraph masks: profile, filters, pixel scales, places on the detector."""
+"""NIRCam's coronagraph masks: profiles, filters, and places on the detectors."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from scipy.special import j1
 from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.files import embedded_table
 
 __all__ = [
+    "FILTERS",
     "ROUND_MASKS",
+    "DetectorPlace",
     "RoundMask",
+    "detector_place",
     "filter_shift",
-    "mask_center",
+    "is_short_wave",
     "mask_of_header",
-    "require_mask_and_filter",
+    "require_mask",
 ]
 
 _SECOND_ZERO_OF_J1 = 7.015586669815619
@@ -26,11 +31,14 @@ LONG_WAVE = (
     "F250M", "F277W", "F300M", "F322W2", "F335M", "F356W", "F360M", "F410M", "F430M", "F444W",
     "F460M", "F480M",
 )  # fmt: skip
+FILTERS = SHORT_WAVE + LONG_WAVE
+"""Filters that go with a Lyot stop. Those of both channels go with every mask, for the two take
+their frames at once."""
 
 
 @dataclass(frozen=True)
 class RoundMask:
-    """A round occulter of NIRCam's module A and its channel.
+    """A round occulter.
 
     Its amplitude transmission is ``t = 1 - (2 J1(s) / s)^2`` with ``s = sigma r`` up to the second
     zero of J1, and 1 beyond (Krist et al., "The JWST/NIRCam coronagraph: mask design and
@@ -41,29 +49,10 @@ class RoundMask:
     name : str
     sigma : float
         Scale of the profile, per arcsec (stpsf 2.2.0, class ``NIRCam_BandLimitedCoron``).
-    filters : tuple of str
-        Filters of its channel.
-    pixelscale : float
-        arcsec per pixel, the square scale that stpsf 2.2.0 uses before distortion.
-    siaf_pixelscale : tuple of float
-        arcsec per pixel in x and y at the reference point of the mask's aperture (SIAF,
-        PRDOPSSOC-075).
-    siaf_shear : float
-        Growth of the ideal y with the ideal x, from the SIAF polynomial: the mean over +-40
-        pixels about the reference point.
     """
 
     name: str
     sigma: float
-    filters: tuple[str, ...]
-    pixelscale: float
-    siaf_pixelscale: tuple[float, float]
-    siaf_shear: float
-
-    @property
-    def short_wave(self) -> bool:
-        """Whether the mask belongs to the short-wave channel."""
-        return self.filters is SHORT_WAVE
 
     @property
     def radius(self) -> float:
@@ -89,43 +78,124 @@ class RoundMask:
 ROUND_MASKS = {
     mask.name: mask
     for mask in (
-        RoundMask("MASK210R", 5.253, SHORT_WAVE, 0.030673395, (0.03053298, 0.03081381), -0.0074),
-        RoundMask("MASK335R", 3.2927866, LONG_WAVE, 0.062424185, (0.0620165, 0.0628319), -0.0049),
-        RoundMask("MASK430R", 2.58832, LONG_WAVE, 0.06247122, (0.06205534, 0.0628871), -0.0010),
+        RoundMask("MASK210R", 5.253),
+        RoundMask("MASK335R", 3.2927866),
+        RoundMask("MASK430R", 2.58832),
     )
 }
 """The masks of `nircam_coronagraph` by name."""
 
 
-def require_mask_and_filter(mask: str | None, name: str) -> RoundMask:
-    """Check a combination of image mask and filter, and return the mask.
+@dataclass(frozen=True)
+class DetectorPlace:
+    """Where a mask is imaged on a detector, and the pixels there.
+
+    Attributes
+    ----------
+    mask : str
+    detector : str
+        As SIAF names it: NRCA2 or NRCA4 (short wave) or NRCA5 (long wave).
+    center : tuple of float
+        x, y of the mask on the full detector in F335M (short wave: F210M), pixels of the science
+        frame counted from 0 at the middle of the first one. In another filter add `filter_shift`.
+    siaf_pixelscale : tuple of float
+        arcsec per pixel in x and y (SIAF, PRDOPSSOC-075).
+    siaf_shear : float
+        Growth of the ideal y with the ideal x, from the SIAF polynomial: the mean over +-40
+        pixels.
+    """
+
+    mask: str
+    detector: str
+    center: tuple[float, float]
+    siaf_pixelscale: tuple[float, float]
+    siaf_shear: float
+
+    @property
+    def pixelscale(self) -> float:
+        """Scale in arcsec per pixel, the square scale that stpsf 2.2.0 uses before distortion."""
+        return sum(self.siaf_pixelscale) / 2
+
+    @property
+    def short_wave(self) -> bool:
+        """Whether the detector is one of the short-wave channel."""
+        return self.detector != "NRCA5"
+
+
+@lru_cache(maxsize=1)
+def _places() -> dict[tuple[str, bool], DetectorPlace]:
+    places = (
+        DetectorPlace(
+            str(row["mask"]),
+            str(row["detector"]),
+            (float(row["x"]) - 1, float(row["y"]) - 1),
+            (float(row["x_scale"]), float(row["y_scale"])),
+            float(row["shear"]),
+        )
+        for row in embedded_table("nircam_masks")
+        if row["place"] == "-"
+    )
+    return {(place.mask, place.short_wave): place for place in places}
+
+
+def is_short_wave(filter: str) -> bool:
+    """Whether a filter is one of the short-wave channel.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For a filter that does not go with the coronagraph.
+    """
+    if filter.upper() not in FILTERS:
+        raise IncompatibleSetupError(
+            f"filter: got {filter!r}, expected one that goes with the coronagraph: "
+            f"{', '.join(SHORT_WAVE)} (short wave) or {', '.join(LONG_WAVE)} (long wave)"
+        )
+    return filter.upper() in SHORT_WAVE
+
+
+def require_mask(mask: str) -> RoundMask:
+    """Return the mask of this name.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For a name that is not one of `ROUND_MASKS`.
+    """
+    if mask not in ROUND_MASKS:
+        raise IncompatibleSetupError(
+            f"image_mask: got {mask!r}, expected None or one of the round masks "
+            f"{', '.join(ROUND_MASKS)}. Bar masks come through from_webbpsf"
+        )
+    return ROUND_MASKS[mask]
+
+
+def detector_place(mask: str | None, filter: str) -> DetectorPlace:
+    """Where a mask is imaged in a filter, and the pixels there.
 
     Parameters
     ----------
     mask : str or None
-        Image mask. None gives the usual mask of the filter's channel (MASK210R or MASK335R), for
-        its geometry.
-    name : str
+        Image mask. None gives the place of the mask that is made for the filter's channel
+        (MASK210R or MASK335R).
+    filter : str
         Filter, in any case.
 
     Raises
     ------
     IncompatibleSetupError
-        For an unknown mask or filter, and for a mask with a filter of the other channel.
+        For an unknown mask or filter.
+
+    Examples
+    --------
+    >>> from pyklip_diffrender.instrument import detector_place
+    >>> detector_place("MASK335R", "F210M").detector
+    'NRCA2'
     """
-    legal = "; ".join(f"{m.name} with {', '.join(m.filters)}" for m in ROUND_MASKS.values())
-    if mask is not None and mask not in ROUND_MASKS:
-        raise IncompatibleSetupError(
-            f"image_mask: got {mask!r}, expected None or one of the round masks: {legal}. Bar "
-            "masks come through from_webbpsf"
-        )
-    for candidate in (mask,) if mask else ("MASK210R", "MASK335R"):
-        if name.upper() in ROUND_MASKS[candidate].filters:
-            return ROUND_MASKS[candidate]
-    raise IncompatibleSetupError(
-        f"filter: got {name!r} with image mask {mask!r}, which do not go together. Legal "
-        f"combinations are {legal}"
-    )
+    short_wave = is_short_wave(filter)
+    if mask is None:
+        mask = "MASK210R" if short_wave else "MASK335R"
+    return _places()[require_mask(mask).name, short_wave]
 
 
 def mask_of_header(value: object) -> str:
@@ -136,17 +206,8 @@ def mask_of_header(value: object) -> str:
     return str(value).strip().upper().replace("MASKA", "MASK")
 
 
-# J. Leisenring's measurements in flight, as in spaceKLIP's resources crpix_jarron.json and
-# filter_shifts_jarron.json (commit 07eaf7d); the centres count from 1.
-_CENTERS = {
-    "NRCA2_MASK210R": (321.8, 331.5),
-    "NRCA2_FULL_MASK210R": (712.8, 1516.5),
-    "NRCA5_MASK335R": (150.2, 174.6),
-    "NRCA5_FULL_MASK335R": (641.2, 1675.6),
-    "NRCA5_MASK430R": (151.3, 175.2),
-    "NRCA5_FULL_MASK430R": (964.3, 1676.2),
-    "NRCA5_MASKLWB": (151.3, 175.2),
-}
+# J. Leisenring's measurements in flight, as in spaceKLIP's resources filter_shifts_jarron.json
+# (commit 07eaf7d).
 _SHIFTS = {
     "F182M": (-0.071, -1.365),
     "F187N": (-0.108, -1.216),
@@ -165,34 +226,6 @@ _SHIFTS = {
     "F460M": (0.237, -0.766),
     "F480M": (0.226, -0.899),
 }
-
-
-def mask_center(aperture: str) -> tuple[float, float]:
-    """Where a mask's centre is imaged on the detector in F335M (short wave: F210M).
-
-    Parameters
-    ----------
-    aperture : str
-        Aperture as SIAF names it, such as "NRCA5_MASK335R", the 320 x 320 subarray, or
-        "NRCA5_FULL_MASK335R", the full detector.
-
-    Returns
-    -------
-    tuple of float
-        x, y in pixels of the science frame, counted from 0 at the middle of the first pixel.
-        SIAF and FITS (``CRPIX``) count from 1. In another filter add `filter_shift`.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        For an aperture that is not in the table.
-    """
-    if aperture not in _CENTERS:
-        raise IncompatibleSetupError(
-            f"aperture: got {aperture!r}, expected one of {', '.join(_CENTERS)}"
-        )
-    x, y = _CENTERS[aperture]
-    return x - 1, y - 1
 
 
 def filter_shift(name: str) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""NIRCam's round coronagraph from embedded tables, without downloads."""
+"""NIRCam's coronagraph from embedded tables, without downloads."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pyklip_diffrender.instrument.aberrations import (
     parity_in_y,
 )
 from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
-from pyklip_diffrender.instrument.masks import ROUND_MASKS, RoundMask, require_mask_and_filter
+from pyklip_diffrender.instrument.masks import DetectorPlace, detector_place, require_mask
 from pyklip_diffrender.instrument.spectrum import filter_bandpass, filter_throughput
 from pyklip_diffrender.io.units import Bound, to_metres, to_number, to_pair
 from pyklip_diffrender.optics.bandpass import Bandpass
@@ -41,7 +41,7 @@ __all__ = [
     "nircam_coronagraph",
 ]
 
-NIRCAM_LW_PIXELSCALE = ROUND_MASKS["MASK335R"].pixelscale
+NIRCAM_LW_PIXELSCALE = 0.062424185
 """arcsec per pixel at MASK335R, the square scale that stpsf 2.2.0 uses before distortion."""
 
 FLIGHT_ALIGNMENT: dict[str, Any] = {"lyot_shift": (-0.0127, 0.0068), "lyot_rotation": 0.567}
@@ -106,7 +106,8 @@ def nircam_coronagraph(
     Parameters
     ----------
     filter : str
-        A filter of the mask's channel (`ROUND_MASKS`). Its bandpass is used unless
+        A filter of the short-wave channel (F182M, F187N, F200W, F210M, F212N) or of the long-wave
+        one (F250M to F480M), which decides on the detector. Its bandpass is used unless
         `monochromatic` is given.
     fov_pixels : int or (ny, nx), optional
         Detector pixels; default 80.
@@ -122,15 +123,15 @@ def nircam_coronagraph(
         Blackbody temperature in K, or a spectrum, see `spectrum.filter_bandpass`.
     pixelscale : float or (x, y), optional
         arcsec; default the square scale of stpsf at the mask. For real frames, whose pixels are
-        not square on the sky, `RoundMask.siaf_pixelscale`.
+        not square on the sky, ``detector_place(mask, filter).siaf_pixelscale``.
     shear : float
-        See `Detector`; `RoundMask.siaf_shear` for real frames.
+        See `Detector`; ``siaf_shear`` of the same for real frames.
     crosstalk : bool
         Couple neighbouring pixels as in the detector NRCA5 (interpixel capacitance and post-pixel
         coupling), which the pipeline does not remove from calibrated JWST frames.
     image_mask : str or None
-        "MASK335R" or "MASK430R" with long-wave filters, "MASK210R" with short-wave ones, or None
-        for no occulter (a planet far from the star).
+        "MASK210R", "MASK335R" or "MASK430R", each with the filters of both channels, or None for
+        no occulter (a planet far from the star).
     pupil_mask : "MASKRND" or None
     pupil : "design" or "flight"
         Obscurations of the primary mirror, see `jwst_pupil`.
@@ -176,15 +177,15 @@ def nircam_coronagraph(
     (24, 24)
     """
     recipe = _in_plain_numbers(dict(locals()))
-    mask = require_mask_and_filter(image_mask, filter)
-    _require_supported(mask, recipe)
+    place = detector_place(image_mask, filter)
+    _require_supported(place, recipe)
     bandpass = _bandpass(recipe)
-    detector = _detector(mask, recipe)
+    detector = _detector(place, recipe)
     _require_samples(npix, detector, bandpass)
     amplitude = _pupil(npix, recipe["segment_gap"], pupil).to(detector.device)
     return OpticalSystem(
         EntrancePupil(amplitude, JWST_DIAMETER, dtype, name="JWST pupil"),
-        _planes(mask, bandpass, recipe),
+        _planes(place, bandpass, recipe),
         detector,
         bandpass,
         recipe=recipe,
@@ -215,13 +216,13 @@ def _in_plain_numbers(recipe: dict[str, Any]) -> dict[str, Any]:
     return recipe
 
 
-def _require_supported(mask: RoundMask, recipe: Mapping[str, Any]) -> None:
+def _require_supported(place: DetectorPlace, recipe: Mapping[str, Any]) -> None:
     if recipe["pupil_mask"] not in ("MASKRND", None):
         raise IncompatibleSetupError(
             f"pupil_mask: got {recipe['pupil_mask']!r}, expected 'MASKRND' or None. Other stops "
             "come through from_webbpsf"
         )
-    if recipe["crosstalk"] and mask.short_wave:
+    if recipe["crosstalk"] and place.short_wave:
         raise IncompatibleSetupError(
             f"crosstalk: the embedded kernels are those of the long-wave detector NRCA5, and "
             f"{recipe['filter']} is a short-wave filter; use crosstalk=False"
@@ -246,8 +247,8 @@ def _bandpass(recipe: Mapping[str, Any]) -> Bandpass:
     return Bandpass((monochromatic,), (1.0,))
 
 
-def _detector(mask: RoundMask, recipe: Mapping[str, Any]) -> Detector:
-    scale = to_pair(recipe["pixelscale"] or mask.pixelscale, u.arcsec, "pixelscale")
+def _detector(place: DetectorPlace, recipe: Mapping[str, Any]) -> Detector:
+    scale = to_pair(recipe["pixelscale"] or place.pixelscale, u.arcsec, "pixelscale")
     shape = _field_of_view(recipe["fov_pixels"], recipe["fov_arcsec"], scale)
     common = (
         shape,
@@ -275,12 +276,12 @@ def _require_samples(npix: int, detector: Detector, bandpass: Bandpass) -> None:
         )
 
 
-def _planes(mask: RoundMask, bandpass: Bandpass, recipe: Mapping[str, Any]) -> list[Plane]:
+def _planes(place: DetectorPlace, bandpass: Bandpass, recipe: Mapping[str, Any]) -> list[Plane]:
     """The planes between the entrance pupil and the detector: occulter, stop, aberration."""
     dtype, device = recipe["dtype"], torch.device(recipe["device"])
     planes: list[Plane] = []
     if recipe["image_mask"] is not None:
-        sampling = recipe["occulter_sampling"]
+        mask, sampling = require_mask(place.mask), recipe["occulter_sampling"]
         planes.append(
             CompactOcculter(
                 mask.complement, mask.radius, sampling, JWST_DIAMETER, dtype, device, mask.name
@@ -301,20 +302,20 @@ def _planes(mask: RoundMask, bandpass: Bandpass, recipe: Mapping[str, Any]) -> l
         reference = recipe["chromatic_reference"] or bandpass.mean_wavelength
         planes.append(
             InternalAberration(
-                _internal_coefficients(mask, recipe["si_wfe"], recipe["flip_si_wfe"]),
+                _internal_coefficients(place, recipe["si_wfe"], recipe["flip_si_wfe"]),
                 JWST_DIAMETER,
                 dtype,
                 device,
-                ChromaticAberration(reference, mask.short_wave),
+                ChromaticAberration(reference, place.short_wave),
                 name="NIRCam internal WFE",
             )
         )
     return planes
 
 
-def _internal_coefficients(mask: RoundMask, si_wfe: bool | ArrayLike, flip: bool) -> Tensor:
+def _internal_coefficients(place: DetectorPlace, si_wfe: bool | ArrayLike, flip: bool) -> Tensor:
     if si_wfe is True:
-        return internal_wavefront_error(mask.name, flip)
+        return internal_wavefront_error(place.mask, flip, short_wave=place.short_wave)
     coefficients = torch.as_tensor(si_wfe, dtype=torch.float64)
     return coefficients if flip else coefficients * parity_in_y(len(coefficients))
 

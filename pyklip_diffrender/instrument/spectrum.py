@@ -42,7 +42,7 @@ def filter_throughput(name: str) -> tuple[NDArray[np.float64], NDArray[np.float6
         return _throughputs()[name.upper()]
     except KeyError:
         raise IncompatibleSetupError(
-            f"filter: got {name!r}, expected one that goes with a round mask: "
+            f"filter: got {name!r}, expected one that goes with the coronagraph: "
             f"{', '.join(_throughputs())}"
         ) from None
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["LinearFrame", "Unknown", "pixel_pieces"]
+__all__ = ["FrameRows", "LinearFrame", "Unknown", "pixel_pieces"]
 
 _PIXELS = 1024
 """Number of pixels that are processed at a time, where there is a number for every unknown."""
@@ -37,17 +37,11 @@ class Unknown(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LinearFrame:
-    """One frame's part of a linear model.
+class FrameRows:
+    """The unknowns of a fit that the rows of one of its frames belong to.
 
     Attributes
     ----------
-    residual : Tensor, (ny, nx), float64
-        Data minus prediction where the model is linearised.
-    weight : Tensor, (ny, nx), float64
-        1 / standard deviation; 0 for masked pixels.
-    jacobian : Tensor, (rows, ny, nx), float32
-        Derivatives of the pixels with respect to the unknowns, in the data's unit.
     rows : Tensor, (rows,), int64
         Index of the unknown that each row belongs to.
     drift : Tensor, (some,), int64
@@ -55,21 +49,11 @@ class LinearFrame:
         those of the other frames.
     first_mode : int
         Index of the first wavefront mode among the rows.
-    common : Tensor, (ny, nx), float64
-        c of the pattern that the frames share, see `linear.noise`, in the data's unit; 0 without
-        one.
-    light : Tensor, (ny, nx), float64
-        Starlight, in the data's unit, to which the correlated error of the model is proportional.
     """
 
-    residual: Tensor
-    weight: Tensor
-    jacobian: Tensor
     rows: Tensor
     drift: Tensor
     first_mode: int
-    common: Tensor
-    light: Tensor
 
     def onto_unknowns(self, on_rows: Tensor, size: int) -> Tensor:
         """Sum values by row, (rows, k), to values by unknown, (size, k)."""
@@ -83,6 +67,32 @@ class LinearFrame:
         rows = values[self.rows]
         rows[self.first_mode : self.first_mode + len(self.drift)] += values[self.drift]
         return rows
+
+
+@dataclass(frozen=True)
+class LinearFrame(FrameRows):
+    """One frame's part of a linear model.
+
+    Attributes
+    ----------
+    residual : Tensor, (ny, nx), float64
+        Data minus prediction where the model is linearised.
+    weight : Tensor, (ny, nx), float64
+        1 / standard deviation; 0 for masked pixels.
+    jacobian : Tensor, (rows, ny, nx), float32
+        Derivatives of the pixels with respect to the unknowns, in the data's unit.
+    common : Tensor, (ny, nx), float64
+        c of the pattern that the frames share, see `linear.noise`, in the data's unit; 0 without
+        one.
+    light : Tensor, (ny, nx), float64
+        Starlight, in the data's unit, to which the correlated error of the model is proportional.
+    """
+
+    residual: Tensor
+    weight: Tensor
+    jacobian: Tensor
+    common: Tensor
+    light: Tensor
 
     def image(self, values: Tensor) -> Tensor:
         """Change of the image, (..., ny, nx), for changes of the unknowns, (size, ...)."""

@@ -14,15 +14,20 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from pyklip_diffrender.detection.maps import Maps
     from pyklip_diffrender.imaging import SkyModel
     from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
     from pyklip_diffrender.pyklip_backend.subtract import Subtraction
+    from pyklip_diffrender.refinement import FrameFit
 
 __all__ = ["IMAGES", "ProductImages", "image_of"]
 
-IMAGES = ("cleaned", "subtracted")
+IMAGES = ("cleaned", "flux", "subtracted")
 
 Image = NDArray[np.float64]
+
+_BATCH = 320
+"""Number of images of planets that are rendered at a time."""
 
 
 def image_of(settings: DiffrenderSettings, subtraction: Subtraction) -> str:
@@ -49,7 +54,7 @@ def image_of(settings: DiffrenderSettings, subtraction: Subtraction) -> str:
 
 
 class ProductImages:
-    """The sky in the fitted frames of one wavelength.
+    """Images of what is not star in the fitted frames of one wavelength.
 
     Parameters
     ----------
@@ -69,31 +74,87 @@ class ProductImages:
 
         return SkyModel(self.fits)
 
-    def put_into(self, residuals: Image, added: Image | None = None) -> None:
-        """Replace the fitted square of frames, (n, Ny, Nx), by the cleaned image, in place.
+    @cached_property
+    def maps(self) -> Maps:
+        """Inner products of the data with planets."""
+        from pyklip_diffrender.detection.groups import groups_of
+        from pyklip_diffrender.detection.maps import Maps
+
+        return Maps(groups_of(self.fits))
+
+    @cached_property
+    def _peaks(self) -> Image:
+        """Peaks of planets of contrast 1 at the pixels of the first frame, (ny, nx)."""
+        templates, shape = self.maps.groups[0][1], self.maps.shape
+        rows, columns = (axis.ravel() for axis in np.indices(shape))
+        peaks = []
+        for start in range(0, len(rows), _BATCH):
+            row, column = rows[start : start + _BATCH], columns[start : start + _BATCH]
+            images = templates.at_pixels(row, column)
+            first = images[min(images)].double().numpy()
+            peaks.append(first[np.arange(len(row)), row, column])
+        return np.concatenate(peaks).reshape(shape)
+
+    def put_into(self, residuals: Image, image: str, added: Image | None = None) -> None:
+        """Replace the fitted square of frames, (n, Ny, Nx), by an image of the sky, in place.
 
         Parameters
         ----------
         residuals : ndarray, (n, Ny, Nx)
             Frames minus their star.
+        image : {"cleaned", "flux"}
         added : ndarray, (n, Ny, Nx), optional
             Light in copies of the frames that those of the fit do not have.
         """
-        sky = self._cleaned(added)
+        sky = self._cleaned(added) if image == "cleaned" else self._flux(added)
         for part in self.pointings:
-            here = self.sky.in_frame(sky, self.fits.index(part.result), part.index)
-            pasted = part.paste(here, part.window)
+            fit = part.result
+            if image == "cleaned":
+                in_frame = self.sky.in_frame(sky, self.fits.index(fit), part.index)
+            else:
+                in_frame = self._on_frame(sky, fit.frames[part.index])
+            pasted = part.paste(in_frame, part.window)
             frames = residuals[part.pointing.frames]
             # Pixels without a value have none in the image either.
             shown = np.isfinite(pasted) & np.isfinite(frames)
             residuals[part.pointing.frames] = np.where(shown, pasted, frames)
 
+    def _added(self, added: Image) -> list[dict[int, Tensor]]:
+        """Light in copies of the frames by frame of each fit, (1, ny, nx)."""
+        light: list[dict[int, Tensor]] = [{} for _ in self.fits]
+        for part in self.pointings:
+            group, k = self.fits.index(part.result), part.index
+            image = torch.from_numpy(part.mean_light(added))
+            known = part.result.linear.frames[k].weight > 0
+            light[group][k] = torch.where(known, image, 0.0)[None]
+        return light
+
     def _cleaned(self, added: Image | None) -> Image:
+        """Posterior mean of the sky, north up."""
         light: list[dict[int, Tensor]] = [dict(each) for each in self.sky.light()]
         if added is not None:
-            for part in self.pointings:
-                group, k = self.fits.index(part.result), part.index
-                image = torch.from_numpy(part.mean_light(added))
-                known = self.sky.groups[group][0].frames[k].weight > 0
-                light[group][k] = light[group][k] + torch.where(known, image, 0.0)
+            for images, more in zip(light, self._added(added), strict=True):
+                for k, image in more.items():
+                    images[k] = images[k] + image
         return np.asarray(self.sky.estimate(light)[0])
+
+    def _flux(self, added: Image | None) -> Image:
+        """Peak of a point source at each pixel of the first frame, with the star marginalised."""
+        numerator = self.maps.numerator
+        if added is not None:
+            numerator = numerator + self.maps.change(self._added(added))[0]
+        known = self.maps.information > 0
+        contrast = np.divide(
+            numerator, self.maps.information, out=np.zeros_like(numerator), where=known
+        )
+        return np.asarray(contrast * self._peaks)
+
+    def _on_frame(self, flux: Image, frame: FrameFit) -> Image:
+        """A map of the first frame on the pixels of a frame."""
+        from pyklip_diffrender.detection.field import pixels_of
+        from pyklip_diffrender.imaging.interpolation import interpolation_matrix
+
+        first = self.maps.groups[0][1].origin
+        offsets = first.observation.turned(frame.grid.reshape(-1, 2), frame.observation)
+        matrix = interpolation_matrix(pixels_of(first.grid, offsets), flux.shape)
+        return np.asarray(matrix @ flux.ravel()).reshape(frame.grid.shape[:2])

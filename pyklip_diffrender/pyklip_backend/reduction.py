@@ -305,6 +305,8 @@ class DatasetReduction:
         """Fraction of a faint source's peak that the products have, on the first frame's pixels."""
         if record.image == "cleaned":
             return record.images.sky.throughput()
+        if record.image == "flux":
+            return np.ones(result.frames[0].grid.shape[:2])  # It is marginalised over the star.
         return throughput_map(result)
 
     def _image(self, subtraction: Subtraction) -> str:
@@ -376,7 +378,7 @@ class DatasetReduction:
             # The model of the sky is that of the fit, also for copies with added sources.
             original = before[len(self.records)] if before else record
             added = frames.data - original.frames.data if before else None
-            original.images.put_into(residuals, added)
+            original.images.put_into(residuals, image, added)
         self.records.append(record)
         residuals *= frames.factor[:, np.newaxis, np.newaxis]
         if self._filter is not None:

@@ -101,12 +101,14 @@ class DiffrenderSettings:
         model, so that none of their light is subtracted with the star; True by default for real
         NIRCam frames, else False. Undetected companions still lose light, as much as the
         throughput map says.
-    image : {"cleaned", "subtracted"}, optional
+    image : {"cleaned", "flux", "subtracted"}, optional
         Image that the products carry. "subtracted", the default and always that of forward models,
         is each frame minus its star. "cleaned" is the posterior mean of the sky from all rolls
         together, see ``imaging.SkyModel``; every frame has it on its own pixels, so that pyKLIP's
-        mean or median of the frames is the same image. Pixels beyond the fitted square have the
-        frames minus star.
+        mean or median of the frames is the same image. "flux" has in each pixel the most probable
+        peak of a point source there, from all rolls together with the star marginalised: its noise
+        is that of the closed-form limits, and it keeps all light of a source. Pixels beyond the
+        fitted square have the frames minus star.
     max_chi2 : float, optional
         Reduced chi-squared above which a fit is implausible and the reduction stops with a
         `RefinementError`; 100 by default, inf for no limit.
@@ -148,7 +150,7 @@ class DiffrenderSettings:
     systematics: Systematics | Literal["auto", "references", "off"] | None = None
     plan: str | None = None
     keep_detected: bool | None = None
-    image: Literal["cleaned", "subtracted"] | None = None
+    image: Literal["cleaned", "flux", "subtracted"] | None = None
     max_chi2: float | None = None
     injected_into: Any = None
     files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None

@@ -1,10 +1,11 @@
-"""The part of the report on injected planets."""
+"""The parts of the report on injected planets."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from astropy.table import QTable
 
 from pyklip_diffrender import drawing
@@ -12,7 +13,7 @@ from pyklip_diffrender.reduction import html
 from pyklip_diffrender.reduction.html import Picture
 from pyklip_diffrender.reduction.words import plus_minus, scientific
 
-__all__ = ["injections_section"]
+__all__ = ["completeness_section", "injections_section"]
 
 
 def injections_section(summary: Mapping[str, Any], planets: QTable) -> str:
@@ -59,4 +60,37 @@ def injections_section(summary: Mapping[str, Any], planets: QTable) -> str:
         html.note(text),
         html.pictures([picture], "half"),
         html.table(header, rows),
+    )
+
+
+def completeness_section(fractions: QTable, curve: QTable) -> str:
+    """A section with a sentence, a picture and a table."""
+    about = fractions.meta
+    limits = np.exp(
+        np.interp(about["separation_arcsec"], curve["separation"].value, np.log(curve["contrast"]))
+    )
+    rows = [
+        [f"{separation:.2f}", *(scientific(each) if np.isfinite(each) else "-" for each in values)]
+        for separation, *values in zip(
+            about["separation_arcsec"], limits, about["contrast_50"], about["contrast_95"],
+            strict=True,
+        )
+    ]  # fmt: skip
+    text = (
+        f"Planets were added to the frames, {fractions['planets'].max()} at every separation and "
+        "contrast, and the maps were searched as if nothing were known of them, with the threshold "
+        f"of the search, {about['threshold']:g} sigma. In noise without planets it has a false "
+        f"candidate in {100 * about['false_alarm']:.2g} % of such fields."
+    )
+    figure, ax = drawing.panel()
+    drawing.completeness(ax, fractions, curve, about["contrast_50"], about["contrast_95"])
+    picture = Picture(
+        drawing.to_png(figure),
+        "Fraction of planets that the search finds, by contrast and separation in arcsec.",
+        "Fraction of planets that the search finds. Dashed: 50 %; solid: 95 %; dotted: "
+        "the contrast curve at 5 sigma.",
+    )
+    header = ["Separation (arcsec)", "5 sigma", "50 % found", "95 % found"]
+    return html.section(
+        "Completeness", html.note(text), html.pictures([picture], "half"), html.table(header, rows)
     )

@@ -51,6 +51,9 @@ class ReduceOptions:
         Number of planets to add to the fitted frames, slightly brighter than the limits, to see
         how well they are recovered; see `recover_planets`. Seven of them take as long as the
         fit and the search, fewer where the fitted square is smaller than 80 pixels.
+    completeness : bool
+        Compute the fraction of planets that the search finds, by contrast and separation; see
+        `completeness`. Takes a few minutes for two rolls.
     star_flux : float, str or Quantity, optional
         Flux density of the star in the filter, from a catalogue or a model of its spectrum: Jy, or
         an AB magnitude. Contrasts then refer to it, as spaceKLIP's do. By default the light that
@@ -97,6 +100,7 @@ class ReduceOptions:
     wide: bool = False
     disk: bool = False
     injections: int = 0
+    completeness: bool = False
     star_flux: float | str | u.Quantity | None = None
     star_flux_error: float = 0.05
     device: str = "cpu"

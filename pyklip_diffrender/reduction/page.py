@@ -44,7 +44,7 @@ def page(
     wide: Sequence[Picture] = (),
     disk: Sequence[Picture] = (),
     files: Mapping[str, str] | None = None,
-    injections: str = "",
+    planets: Sequence[str] = (),
 ) -> str:
     """The report.
 
@@ -58,8 +58,8 @@ def page(
         One for each frame of the target that is shown.
     files : mapping of str to str, optional
         Names of the files that were written with it, and their content.
-    injections : str
-        A section, see `injections_section`.
+    planets : sequence of str
+        Sections, see `injections_section` and `completeness_section`.
 
     Returns
     -------
@@ -82,7 +82,7 @@ def page(
             if disk
             else []
         ),
-        *filter(None, [injections]),
+        *planets,
         html.section("Star subtraction", *_star(summary, stars)),
         html.section("Wavefront", _wavefront(summary), html.pictures(wavefront)),
         html.section("Frames", _frames(summary), _left_out(summary)),

@@ -10,7 +10,14 @@ from typing import Any
 
 from astropy.table import QTable
 
-from pyklip_diffrender.detection import Detection, detect, fit_disk, recover_planets, wide_field
+from pyklip_diffrender.detection import (
+    Detection,
+    completeness,
+    detect,
+    fit_disk,
+    recover_planets,
+    wide_field,
+)
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -67,8 +74,8 @@ def reduce(
         Options of the reduction, in place of `keywords`.
     **keywords
         Fields of `ReduceOptions`: ``size``, ``systematics``, ``settings``, ``threshold``,
-        ``wide``, ``disk``, ``injections``, ``star_flux``, ``star_flux_error``, ``device`` and
-        ``memory``.
+        ``wide``, ``disk``, ``injections``, ``completeness``, ``star_flux``, ``star_flux_error``,
+        ``device`` and ``memory``.
 
     Returns
     -------
@@ -181,7 +188,7 @@ class _Run:
             progress=self.progress,
         )
         sequence = replace(self.preparation.sequence, science=choice.science)
-        disk = wide = injections = None
+        disk = wide = injections = fractions = None
         if options.disk:
             with stage("extended light, and wavefront without it"):
                 disk = fit_disk(fit, progress=self.progress)
@@ -199,6 +206,9 @@ class _Run:
         if options.injections and len(detection.contrast_curve):
             with stage(f"{options.injections} injected planets"):
                 injections = self._inject(detection, choice)
+        if options.completeness and len(detection.contrast_curve):
+            with stage("completeness"):
+                fractions = completeness(detection, progress=self.progress)
         return Reduction(
             sequence,
             fit,
@@ -209,6 +219,7 @@ class _Run:
             wide,
             disk,
             injections,
+            fractions,
         )
 
     def _first_fit(self, choice: PatternChoice, again: bool) -> Refinement:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.io.files import replacing
-from pyklip_diffrender.reduction.injections import injections_section
+from pyklip_diffrender.reduction.injections import completeness_section, injections_section
 from pyklip_diffrender.reduction.overview import Klip, Overview
 from pyklip_diffrender.reduction.page import page
 from pyklip_diffrender.reduction.pictures import (
@@ -38,6 +38,7 @@ PRODUCTS = {
     "wide_field_contrast.ecsv": "contrast curve to the edge of the frames",
     "disk.fits": "the extended light: frames without the star, and its sources",
     "injections.ecsv": "injected planets, and what was measured of them",
+    "completeness.ecsv": "fraction of planets that the search finds, by contrast and separation",
     "fit.fits": "the fit, for Refinement.read",
     "systematics.fits": "the flat-field pattern, for other reductions",
 }
@@ -79,10 +80,12 @@ def write_products(
         written.append(reduction.disk.write(folder))
     if reduction.systematics is not None:
         written.append(reduction.systematics.write(folder / "systematics.fits"))
-    if reduction.injections is not None:
-        written.append(folder / "injections.ecsv")
-        with replacing(written[-1]) as temporary:
-            reduction.injections.write(temporary, format="ascii.ecsv", overwrite=True)
+    tables = {"injections": reduction.injections, "completeness": reduction.completeness}
+    for name, table in tables.items():
+        if table is not None:
+            written.append(folder / f"{name}.ecsv")
+            with replacing(written[-1]) as temporary:
+                table.write(temporary, format="ascii.ecsv", overwrite=True)
     overview = Overview(reduction, Klip.of(reduction))
     written.append(folder / "detection.png")
     drawing.save(overview.figure(), written[-1])
@@ -114,18 +117,24 @@ def _write_report(
     reduction: Reduction, overview: Overview, folder: Path, files: Iterable[Path]
 ) -> list[Path]:
     html, data = (folder / name for name in ("report.html", "summary.json"))
-    summary = summarise(reduction, overview.klip and overview.klip.curve)
+    klip = overview.klip and overview.klip.curve
+    summary = summarise(reduction, klip)
+    injections, fractions = reduction.injections, reduction.completeness
+    curve = reduction.detection.contrast_curve
     frames = range(min(len(reduction.detection.fits[0].frames), MOST_FRAMES))
     text = page(
         summary,
         overview_pictures(overview, summary),
-        curve_pictures(reduction, summary, overview.klip and overview.klip.curve),
+        curve_pictures(reduction, summary, klip),
         [star_pictures(reduction, frame) for frame in frames],
         wavefront_pictures(reduction, summary),
         [] if reduction.wide is None else wide_pictures(reduction.wide),
         [] if reduction.disk is None else disk_pictures(reduction.disk),
         {path.name: PRODUCTS.get(path.name, "") for path in (*files, html, data)},
-        "" if reduction.injections is None else injections_section(summary, reduction.injections),
+        [
+            *([] if injections is None else [injections_section(summary, injections)]),
+            *([] if fractions is None else [completeness_section(fractions, curve)]),
+        ],
     )
     written = {html: text, data: json.dumps(summary, indent=2, allow_nan=False) + "\n"}
     for path, content in written.items():

@@ -50,6 +50,8 @@ class Reduction:
         Extended light about the star, if it was asked for.
     injections : QTable or None
         Measurements of injected planets, see `recover_planets`, if they were asked for.
+    completeness : QTable or None
+        Fraction of planets that the search finds, see `completeness`, if it was asked for.
 
     Examples
     --------
@@ -70,6 +72,7 @@ class Reduction:
     wide: WideField | None = None
     disk: Disk | None = None
     injections: QTable | None = None
+    completeness: QTable | None = None
 
     @property
     def remark(self) -> str:

@@ -91,6 +91,7 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
         "contrast_curve": _curve(detection.contrast_curve),
         "klip_curve": None if klip is None else _curve(klip),
         "injections": None if reduction.injections is None else _injected(reduction.injections),
+        "completeness": _completeness(reduction),
         "frames": [
             *(
                 _frame(each, "target") | {"bad_pixels": _bad_pixels(each, fitted)}
@@ -222,6 +223,11 @@ def _injected(planets: QTable) -> dict[str, Any]:
         "within_one_error": np.mean(np.abs(pull) < 1),
         "planets": _rows(planets),
     }
+
+
+def _completeness(reduction: Reduction) -> dict[str, Any] | None:
+    """Contrasts at which 50 and 95 % of planets are found, None where there are none."""
+    return None if reduction.completeness is None else dict(reduction.completeness.meta)
 
 
 def _curve(curve: QTable) -> dict[str, Any]:

@@ -55,7 +55,7 @@ class ModelDerivatives:
     def product(self, step: Tensor) -> Tensor:
         """Product of the curvature with a step, (unknowns,)."""
         state = self._state
-        ahead = self._objective.at(state.joint, state.vector + _DIFFERENCE * step)
+        ahead = self._objective.at(state.unknowns, state.vector + _DIFFERENCE * step)
         images = {
             k: (after.total - before.total) / _DIFFERENCE
             for k, (after, before) in enumerate(zip(ahead.points, state.points, strict=True))
@@ -64,20 +64,20 @@ class ModelDerivatives:
 
     def _pull(self, images: Mapping[int, Tensor]) -> Tensor:
         """Product of the whitened Jacobian with images of all frames, which it whitens as well."""
-        objective, joint = self._objective, self._state.joint
-        total = torch.zeros(joint.size, dtype=torch.float64)
+        objective, unknowns = self._objective, self._state.unknowns
+        total = torch.zeros(unknowns.size, dtype=torch.float64)
         whitened = self._noise.inverse(images)
         for k, (forward, point) in enumerate(
             zip(objective.forwards, self._state.points, strict=True)
         ):
             pixels = self._noise.weight[k] * whitened[k]
-            layout, levels = point.unknowns, self._levels[k]
+            where, levels = point.unknowns.slices, self._levels[k]
             of_frame = torch.zeros(len(point.vector), dtype=torch.float64)
-            last = layout.where("companions").stop
+            last = where["companions"].stop
             of_frame[last - len(levels) : last] = levels.flatten(1) @ pixels.cpu().flatten()
             for name, slopes in forward.slopes(point, pixels).items():
-                of_frame[layout.where(name)] = slopes
-            total += joint.onto_unknowns(k, of_frame)
+                of_frame[where[name]] = slopes
+            total += unknowns.rows[k].onto_unknowns(of_frame, unknowns.size)
         return total
 
 

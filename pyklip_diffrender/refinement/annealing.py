@@ -156,9 +156,9 @@ class Annealing:
         self.solver = Solver(problems, settings, basis, progress)
         self.objective = self.solver.objective
         self._few_modes = count_modes_below(basis, _FEW_CYCLES)
-        layout = self.solver.first_layout()
+        unknowns = self.solver.first_unknowns()
         self._begin = self.objective.at(
-            layout, layout.initial() if warm is None else layout.warm(warm)
+            unknowns, unknowns.initial() if warm is None else unknowns.warm(warm)
         )
         self._is_warm = warm is not None
         self._first_scales = self.solver.priors.scales
@@ -377,7 +377,7 @@ class Annealing:
 
     def _room(self, course: _Course) -> int:
         """Number of companions that may still be added."""
-        return self.settings.max_companions - len(course.state.joint.frames[0].companions)
+        return self.settings.max_companions - len(course.state.unknowns.frames[0].companions)
 
     def _significant(self, course: _Course) -> list[Planet]:
         """Companions in the residual of the alignment."""
@@ -400,4 +400,4 @@ class Annealing:
 
     def _with_companions(self, state: State, added: Sequence[Planet]) -> State:
         _log.info("companions given parameters of their own: %s", added)
-        return self.objective.at(*state.joint.with_companions(added, state.vector))
+        return self.objective.at(*state.unknowns.with_companions(added, state.vector))

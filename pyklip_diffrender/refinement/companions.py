@@ -48,15 +48,15 @@ def bright_companions(
     list of Planet
         Highest S/N first, at the positions of pixels, in the orientation of the first frame.
     """
-    has_companions = [layout.shows_companions for layout in state.joint.frames]
+    has_companions = [each.shows_companions for each in state.unknowns.frames]
     if most < 1 or True not in has_companions:
         return []
     k = has_companions.index(True)
     point, forward = state.points[k], objective.forwards[k]
-    layout, problem, model = point.unknowns, forward.problem, forward.coarse
+    unknowns, problem, model = point.unknowns, forward.problem, forward.coarse
     residual = torch.where(problem.valid, problem.data - point.total, 0.0).cpu().numpy()
     sigma = torch.where(problem.valid, objective.sigma(k, point, kappa), math.inf).cpu().numpy()
-    values = layout.values(point.vector)
+    values = unknowns.values(point.vector)
     star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu()
     axis = values.get("detector_shift", torch.zeros(2, dtype=torch.float64)).cpu()
     # The template is an image in the middle of the array of a source beyond the occulter.
@@ -68,7 +68,7 @@ def bright_companions(
     }
     with torch.no_grad():
         image = model(forward.coarse_opd(point), **centred).double().cpu().numpy()
-    template = layout.level("flux", point.vector) * image[::-1, ::-1]
+    template = unknowns.level("flux", point.vector) * image[::-1, ::-1]
     weight = sigma**-2.0
     numerator = fftconvolve(residual * weight, template, mode="same")
     information = fftconvolve(weight, template**2, mode="same")
@@ -84,14 +84,14 @@ def bright_companions(
         )
     )
     allowed = (np.hypot(x, y) > _INNER) & np.isfinite(sigma)
-    positions = layout.sources(point.vector)[:, 1:] @ layout.turn.T
+    positions = unknowns.sources(point.vector)[:, 1:] @ unknowns.turn.T
     for x_known, y_known in positions.tolist():
         allowed &= np.hypot(x - x_known, y - y_known) > _APART
     scatter = 1.4826 * float(np.median(np.abs(snr[allowed] - np.median(snr[allowed]))))
     return [
         Planet.from_offset(
             float(numerator[peak] / information[peak]), float(x[peak]), float(y[peak])
-        ).rotated(-layout.roll)
+        ).rotated(-unknowns.roll)
         for peak in local_maxima(snr, allowed, threshold * scatter, size=7)[:most]
     ]
 

@@ -51,16 +51,16 @@ def conclude(
         status = Status.PRIOR_MISMATCH
     frames = []
     for k, (problem, point) in enumerate(zip(problems, state.points, strict=True)):
-        layout = point.unknowns
-        own = deviation[state.joint.rows(k)[: len(linear.frames[k].rows)]]
-        values = {n: v.cpu().numpy() for n, v in layout.values(point.vector).items()}
+        unknowns = point.unknowns
+        own = deviation[state.unknowns.rows[k].rows[: len(linear.frames[k].rows)]]
+        values = {n: v.cpu().numpy() for n, v in unknowns.values(point.vector).items()}
         levels = ("flux", "background", *(["pedestal"] if problem.systematics else []))
         for name in levels:
-            values[name] = layout.start[name].numpy()
+            values[name] = unknowns.start[name].numpy()
         errors = {name: math.nan * value for name, value in values.items()}
-        for name in layout.ordered:
-            values[name] = point.vector[layout.where(name)].numpy()
-            errors[name] = own[layout.where(name)].numpy()
+        for name in unknowns.ordered:
+            values[name] = point.vector[unknowns.where(name)].numpy()
+            errors[name] = own[unknowns.where(name)].numpy()
         frames.append(
             FrameFit(
                 model=problem.model,
@@ -72,12 +72,11 @@ def conclude(
                 values=values,
                 errors=errors,
                 gain=problem.gain.cpu().numpy(),
-                coefficients=point.vector[layout.where("modes")].numpy(),
+                coefficients=point.vector[unknowns.where("modes")].numpy(),
             )
         )
     first = state.points[0]
-    sources = first.unknowns.where("companions")
-    rows = state.joint.rows(0)[sources]
+    companions = state.unknowns.where("companions")
     return Refinement(
         frames=tuple(frames),
         initial=problems[0].initial,
@@ -87,7 +86,7 @@ def conclude(
         chi2_per_pixel=solver.objective.chi2_per_pixel(state),
         model_error=kappa,
         companions=first.unknowns.sources(first.vector).numpy(),
-        companion_errors=deviation[rows].reshape(-1, 3).numpy(),
+        companion_errors=deviation[companions].reshape(-1, 3).numpy(),
         scales=dict(zip(priors.names, priors.scales.tolist(), strict=True)),
         prior_ratios=ratios,
         effective_parameters=update.effective,

@@ -12,8 +12,8 @@ from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.linear.response import coarse_copy, downsample
 from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.optics.grid import PupilGrid
-from pyklip_diffrender.refinement.frame_layout import FrameLayout
 from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.unknowns import FrameUnknowns
 
 __all__ = ["Forward", "Point"]
 
@@ -27,7 +27,7 @@ class Point:
 
     Attributes
     ----------
-    unknowns : FrameLayout
+    unknowns : FrameUnknowns
     vector : Tensor
     opd : Tensor, (npix, npix)
         m; complex where the pupil's amplitude is free.
@@ -44,7 +44,7 @@ class Point:
         With the companions.
     """
 
-    unknowns: FrameLayout
+    unknowns: FrameUnknowns
     vector: Tensor
     opd: Tensor
     fields: list[Tensor]
@@ -75,7 +75,7 @@ class Forward:
         self.coarse = coarse_copy(problem.model, responses.npix)
         self._starting_opd = problem.starting_opd(self.model.npix)
 
-    def opd(self, unknowns: FrameLayout, vector: Tensor) -> Tensor:
+    def opd(self, unknowns: FrameUnknowns, vector: Tensor) -> Tensor:
         """Return the wavefront, (npix, npix), m; complex if the pupil's amplitude is free."""
         grid = PupilGrid.full(self.model.npix, self.model.diameter)
         opd = self._starting_opd
@@ -95,7 +95,7 @@ class Forward:
         """The wavefront on the coarse copy's grid."""
         return downsample(point.opd, self.coarse.npix)
 
-    def at(self, unknowns: FrameLayout, vector: Tensor) -> Point:
+    def at(self, unknowns: FrameUnknowns, vector: Tensor) -> Point:
         """Render a point."""
         values, opd = unknowns.values(vector), self.opd(unknowns, vector)
         flux = unknowns.level("flux", vector)

@@ -96,9 +96,8 @@ def linearise(
     jacobians : sequence of Tensor, optional
         Jacobians of all frames at this state, if they are known.
     """
-    joint = state.joint
-    size = joint.unknowns_with(modes)
-    current = (state.vector - joint.initial())[:size]
+    size = state.unknowns.with_modes(modes)
+    current = (state.vector - state.unknowns.initial())[:size]
     curvature = torch.zeros(size, size, dtype=torch.float64)
     gradient = torch.zeros(size, dtype=torch.float64)
     frames = []
@@ -110,10 +109,10 @@ def linearise(
             each.cpu() for each in (residuals[k], noise.weight[k], noise.common[k], noise.light[k])
         )
         rendered = jacobians[k] if jacobians else forward.jacobian(point, modes)
-        first = point.unknowns.where("modes").start
-        rows = joint.rows(k)[: len(rendered)]
-        drift = joint.drift_rows(k) if modes else torch.zeros(0, dtype=torch.int64)
-        frames.append(LinearFrame(residual, weight, rendered, rows, drift, first, common, light))
+        part = state.unknowns.rows[k]
+        rows, drift = part.rows[: len(rendered)], part.drift if modes else part.drift[:0]
+        first = part.first_mode
+        frames.append(LinearFrame(rows, drift, first, residual, weight, rendered, common, light))
         product, pulled = _accumulate(
             rendered.flatten(1), weight.flatten(), whitened[k].cpu().flatten()
         )

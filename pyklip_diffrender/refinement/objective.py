@@ -11,8 +11,8 @@ from torch import Tensor
 
 from pyklip_diffrender.linear.noise import UNCORRELATED, Noise
 from pyklip_diffrender.refinement.forward import Forward, Point
-from pyklip_diffrender.refinement.joint_layout import JointLayout
 from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.unknowns import Unknowns
 
 __all__ = ["Objective", "State"]
 
@@ -27,13 +27,13 @@ class State:
 
     Attributes
     ----------
-    joint : JointLayout
-    vector : Tensor, (joint unknowns,)
+    unknowns : Unknowns
+    vector : Tensor, (unknowns,)
     points : tuple of Point
         One for each frame.
     """
 
-    joint: JointLayout
+    unknowns: Unknowns
     vector: Tensor
     points: tuple[Point, ...]
 
@@ -73,13 +73,15 @@ class Objective:
         """Number of pixels of all frames that are fitted."""
         return sum(forward.problem.pixels for forward in self.forwards)
 
-    def at(self, joint: JointLayout, vector: Tensor) -> State:
+    def at(self, unknowns: Unknowns, vector: Tensor) -> State:
         """Render all frames."""
         points = tuple(
-            forward.at(unknowns, joint.of_frame(k, vector))
-            for k, (forward, unknowns) in enumerate(zip(self.forwards, joint.frames, strict=True))
+            forward.at(frame, rows.of_unknowns(vector))
+            for forward, frame, rows in zip(
+                self.forwards, unknowns.frames, unknowns.rows, strict=True
+            )
         )
-        return State(joint, vector, points)
+        return State(unknowns, vector, points)
 
     def sigma(self, frame: int, point: Point, kappa: float) -> Tensor:
         """Noise and, in quadrature, a model error of the fraction `kappa` of the star."""

@@ -59,10 +59,10 @@ def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -
     star_only = linear.without("companions", companions)
     outliers = []
     for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
-        layout = point.unknowns
-        grid = torch.from_numpy(pixel_grid(forward.model, layout.values(point.vector)))
+        unknowns = point.unknowns
+        grid = torch.from_numpy(pixel_grid(forward.model, unknowns.values(point.vector)))
         scale = torch.tensor(forward.model.detector.pixelscale, dtype=torch.float64)
-        companions_at = layout.sources(point.vector)[:, 1:] @ layout.turn.T
+        companions_at = unknowns.sources(point.vector)[:, 1:] @ unknowns.turn.T
         steps = torch.linspace(-1.0, 1.0, 5, dtype=torch.float64)
         beside = torch.cartesian_prod(steps, steps) * scale
         mask = torch.zeros(grid.shape[:2], dtype=torch.bool)

@@ -22,13 +22,12 @@ from pyklip_diffrender.linear.noise import CorrelatedError, Noise
 from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.refinement.accurate_step import ModelDerivatives, accurate_step
 from pyklip_diffrender.refinement.forward import Forward
-from pyklip_diffrender.refinement.frame_layout import FrameLayout
-from pyklip_diffrender.refinement.joint_layout import JointLayout
 from pyklip_diffrender.refinement.mode_priors import ModePriors
 from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
 from pyklip_diffrender.refinement.objective import Objective, State
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.settings import GaussNewton
+from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate, solve_with_evidence
 
@@ -122,18 +121,18 @@ class Solver:
         self._equations: NormalEquations | None = None
         self._has_poor_equations = False
 
-    def first_layout(self) -> JointLayout:
-        """Layout of the unknowns, with starting values, before companions are added."""
+    def first_unknowns(self) -> Unknowns:
+        """The unknowns, with starting values, before companions are added."""
         problems = [forward.problem for forward in self.objective.forwards]
         origin = problems[0].observation
         frames = tuple(
-            self._frame_layout(problem, forward, problem.observation.roll_from(origin))
+            self._unknowns_of(problem, forward, problem.observation.roll_from(origin))
             for problem, forward in zip(problems, self.objective.forwards, strict=True)
         )
         own = (*self.settings.own, "pedestal") if len(frames) > 1 else ()
-        return JointLayout(frames, own, self.priors.drift)
+        return Unknowns(frames, own, self.priors.drift)
 
-    def _frame_layout(self, problem: Problem, forward: Forward, roll: float) -> FrameLayout:
+    def _unknowns_of(self, problem: Problem, forward: Forward, roll: float) -> FrameUnknowns:
         free, deviations = self.settings.free, dict(self.settings.deviations)
         start = problem.optical_start(tuple(n for n in free if n in problem.model.parameters))
         if problem.has_free_pedestal:
@@ -142,16 +141,16 @@ class Solver:
         zero = torch.zeros(1, dtype=torch.float64)
         levels = {"flux": zero, "background": zero, "pedestal": zero + problem.pedestal}
         # The unknowns and their algebra stay on the CPU, wherever the model renders.
-        layout = FrameLayout(
+        unknowns = FrameUnknowns(
             free,
             {**{n: v.cpu() for n, v in start.items()}, **levels},
             len(self.basis),
             len(self.priors.amplitude),
-            list(self.settings.companions),
+            self.settings.companions,
             roll,
             not problem.observation.reference,
         )
-        image = forward.at(layout, layout.initial()).image
+        image = forward.at(unknowns, unknowns.initial()).image
         # With photon-noise weights the faint pixels would dominate this first estimate.
         flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
         is_known = "flux" in deviations
@@ -160,18 +159,17 @@ class Solver:
                 "deviations has 'flux', but start does not: how bright is the star? Give "
                 "start={'flux': ...} in the unit of the frames"
             )
-        unknown = tuple(n for n in self.settings.free if not (is_known and n == "flux"))
-        flux, level = problem.flux_and_background(problem.gain * image, flat, unknown)
+        names = tuple(n for n in self.settings.free if not (is_known and n == "flux"))
+        flux, level = problem.flux_and_background(problem.gain * image, flat, names)
         if is_known:
             deviations["flux"] *= flux
-        layout.deviations = deviations
-        layout.start["flux"] = torch.tensor([flux], dtype=torch.float64)
-        layout.start["background"] = torch.tensor([level], dtype=torch.float64)
-        return layout
+        levels["flux"] = torch.tensor([flux], dtype=torch.float64)
+        levels["background"] = torch.tensor([level], dtype=torch.float64)
+        return replace(unknowns, start={**unknowns.start, **levels}, deviations=deviations)
 
-    def prior_deviation(self, layout: JointLayout) -> Tensor:
+    def prior_deviation(self, unknowns: Unknowns) -> Tensor:
         """Prior standard deviations of all unknowns."""
-        return torch.cat([layout.prior_deviation(), self.priors.deviation])
+        return torch.cat([unknowns.prior_deviation(), self.priors.deviation])
 
     def step(self, state: State, kappa: float, modes: int) -> tuple[State, float]:
         """Take one damped step.
@@ -207,7 +205,7 @@ class Solver:
         self, state: State, kappa: float, modes: int, may_repeat: bool
     ) -> tuple[State, float] | None:
         """Take a step with the derivatives that there are; None if it needs better ones."""
-        layout, objective = state.joint, self.objective
+        unknowns, objective = state.unknowns, self.objective
         equations = self._linearise(
             state, kappa, modes, objective.robust, self.settings.relinearise
         )
@@ -216,9 +214,9 @@ class Solver:
         noise = objective.errors(state, kappa, objective.robust)
         fits_scales = self.settings.prior.fit_scales
         damping = 0.0 if fits_scales else self.damping
-        update = self._solve(layout, equations, fit_scales=fits_scales, damping=damping)
+        update = self._solve(unknowns, equations, fit_scales=fits_scales, damping=damping)
         self.priors.scales = update.scales
-        expected = self._predicted_gain(layout, equations, update.step)
+        expected = self._predicted_gain(unknowns, equations, update.step)
         if expected < self.settings.tolerance * objective.pixels:
             # The gain is too small for another linearisation.
             return None if may_repeat else (state, expected / objective.pixels)
@@ -226,8 +224,8 @@ class Solver:
         for _ in range(_TRIES):
             if self.damping != damping:
                 damping = self.damping
-                update = self._solve(layout, equations, damping=self.damping)
-                expected = self._predicted_gain(layout, equations, update.step)
+                update = self._solve(unknowns, equations, damping=self.damping)
+                expected = self._predicted_gain(unknowns, equations, update.step)
             trial = self._moved(state, update.step - equations.current)
             after = self._cost(trial, noise)
             if after < before:
@@ -248,8 +246,8 @@ class Solver:
         noise = objective.errors(state, kappa, objective.robust)
         before = self._cost(state, noise)
         derivatives = ModelDerivatives(objective, state, noise)
-        offset = state.vector - state.joint.initial()
-        deviation = self.prior_deviation(state.joint)
+        offset = state.vector - state.unknowns.initial()
+        deviation = self.prior_deviation(state.unknowns)
         enough = self.settings.tolerance * objective.pixels / 2
         # Equations of an earlier state precondition nearly as well, and new ones take longer than
         # the step itself.
@@ -280,7 +278,7 @@ class Solver:
             and not self._has_poor_equations
             and not equations.kappa > _SIMILAR * kappa  # It is NaN where weights have changed.
             and self._responses.farthest <= _ACCURATE
-            and len(equations.current) == state.joint.unknowns_with(modes)
+            and len(equations.current) == state.unknowns.with_modes(modes)
         )
 
     def _linearise(
@@ -293,7 +291,7 @@ class Solver:
             equations is not None
             and equations.state is state
             and self._responses.farthest <= allowed
-            and len(equations.current) == state.joint.unknowns_with(modes)
+            and len(equations.current) == state.unknowns.with_modes(modes)
         ):
             jacobians = [frame.jacobian for frame in equations.frames]
         else:
@@ -307,7 +305,7 @@ class Solver:
         """The state after a step of the leading unknowns, within the bounds of all parameters."""
         vector = state.vector.clone()
         vector[: len(step)] += step
-        return self.objective.at(state.joint, state.joint.clamped(vector))
+        return self.objective.at(state.unknowns, state.unknowns.clamped(vector))
 
     def set_correlated_error(self, error: CorrelatedError) -> None:
         """Include an error of the model that neighbouring pixels share from now on."""
@@ -343,8 +341,8 @@ class Solver:
         final : bool
             Whether errors will be computed from it, for which derivatives must be accurate.
         """
-        layout, equations = state.joint, self._equations
-        count = layout.unknowns_with(modes)
+        unknowns, equations = state.unknowns, self._equations
+        count = unknowns.with_modes(modes)
         allowed = _FINAL if final else _ACCURATE
         allowed = allowed if self.settings.accurate_steps else self.settings.relinearise
         if (
@@ -357,11 +355,11 @@ class Solver:
             del equations
             equations = self._linearise(state, kappa, modes, robust, allowed)
         return LinearModel(
-            unknowns=layout.unknowns()[:count],
+            unknowns=unknowns.labels()[:count],
             frames=equations.frames,
             vector=state.vector[:count],
-            mean=layout.initial()[:count],
-            deviation=self.prior_deviation(layout)[:count],
+            mean=unknowns.initial()[:count],
+            deviation=self.prior_deviation(unknowns)[:count],
             curvature=equations.curvature,
             correlated=self.objective.correlated,
         )
@@ -370,11 +368,11 @@ class Solver:
         """Return the errors of all unknowns of the last linear model, which is about `state`."""
         assert self._equations is not None
         assert self._equations.state is state
-        return self._solve(state.joint, self._equations, errors=True)
+        return self._solve(state.unknowns, self._equations, errors=True)
 
     def _solve(
         self,
-        layout: JointLayout,
+        unknowns: Unknowns,
         equations: NormalEquations,
         *,
         damping: float = 0.0,
@@ -383,8 +381,8 @@ class Solver:
     ) -> EvidenceUpdate:
         """Most probable unknowns of the linearised model, minus their starting values."""
         curvature = equations.curvature
-        modes = max(0, len(curvature) - layout.where("modes").start)
-        fixed = layout.prior_deviation()
+        modes = max(0, len(curvature) - unknowns.where("modes").start)
+        fixed = unknowns.prior_deviation()
         if modes:
             fixed = torch.cat([fixed, self.priors.amplitude])
         # Unknowns differ by many powers of ten, so the system is solved in scaled units.
@@ -410,14 +408,14 @@ class Solver:
         With weights that were made robust about the state before a step, a step that lowers it also
         lowers Cauchy's loss.
         """
-        offset = (state.vector - state.joint.initial()) / self.prior_deviation(state.joint)
+        offset = (state.vector - state.unknowns.initial()) / self.prior_deviation(state.unknowns)
         return self.objective.chi2(state, noise) + float((offset**2).sum())
 
     def _predicted_gain(
-        self, layout: JointLayout, equations: NormalEquations, step: Tensor
+        self, unknowns: Unknowns, equations: NormalEquations, step: Tensor
     ) -> float:
         """Decrease of the penalised chi-squared if the model were linear."""
-        precision = self.prior_deviation(layout)[: len(step)] ** -2
+        precision = self.prior_deviation(unknowns)[: len(step)] ** -2
         curvature, current = equations.curvature, equations.current
 
         def quadratic(x: Tensor) -> float:

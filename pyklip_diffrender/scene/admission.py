@@ -123,7 +123,10 @@ def choose_target(
                 "the header does not say which star it is. Add TARGPROP, TARGNAME, or TARG_RA and "
                 "TARG_DEC, or IS_PSF for a reference star"
             )
-    return stars[chosen], admissible(references)
+    for each in stars[chosen]:
+        if each.for_reference:
+            each.reason = "a reference frame that shows the target itself"
+    return admissible(stars[chosen]), admissible(references)
 
 
 def _require_no_lost_target(

@@ -21,7 +21,7 @@ from scipy.ndimage import (
 from scipy.signal import fftconvolve
 
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
-from pyklip_diffrender.instrument.masks import filter_shift, mask_center
+from pyklip_diffrender.instrument.masks import detector_place, filter_shift
 from pyklip_diffrender.io.headers import header_number, header_text
 from pyklip_diffrender.io.units import native_float64, require_finite
 from pyklip_diffrender.scene.exposure import detector_of, image_mask
@@ -150,8 +150,11 @@ def mask_place(header: fits.Header, name: str) -> NDArray[np.float64] | None:
     if detector is None or mask is None:
         return None
     try:
-        passband = filter_shift(header_text(header, "FILTER", name) or "")
-        return np.add(mask_center(f"{_APERTURES.get(detector, detector)}_FULL_{mask}"), passband)
+        passband = header_text(header, "FILTER", name) or ""
+        place = detector_place(mask, passband)
+        if place.detector != _APERTURES.get(detector, detector):
+            return None
+        return np.add(place.center, filter_shift(passband))
     except IncompatibleSetupError:
         return None
 

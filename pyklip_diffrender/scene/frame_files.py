@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,12 +53,15 @@ class FrameFile:
         Name of its star, the same for all files of the star.
     reason : str
         Why the file is excluded; empty for those that are not.
+    for_reference : bool
+        Whether it was asked for as a file of a reference star, whatever its header says.
     """
 
     path: Path
     exposure: Exposure
     star: str = ""
     reason: str = field(default="", repr=False)
+    for_reference: bool = False
 
     @property
     def name(self) -> str:
@@ -76,6 +79,7 @@ class FrameFile:
 
 def exposures_in(
     files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    references: Iterable[str | os.PathLike[str]] = (),
 ) -> list[FrameFile]:
     """Find FITS files and read what their headers say.
 
@@ -83,6 +87,8 @@ def exposures_in(
     ----------
     files : path or sequence of path
         Files, or folders of them.
+    references : iterable of path
+        Files of reference stars. Files that are all marked as such, too, are then of the target.
 
     Raises
     ------
@@ -101,7 +107,15 @@ def exposures_in(
             paths.append(each)
     if not paths:
         raise NoValidPixelsError("files: got none, expected at least one")
-    return [_frame_file(path) for path in paths]
+    listed = [_frame_file(path) for path in paths]
+    marked = [_frame_file(Path(path)) for path in references]
+    if marked and all(file.exposure.reference for file in listed):
+        for file in listed:
+            file.exposure = replace(file.exposure, reference=False)
+    for file in marked:
+        file.exposure = replace(file.exposure, reference=True)
+        file.for_reference = True
+    return listed + marked
 
 
 def _frame_file(path: Path) -> FrameFile:

@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.masks import ROUND_MASKS, detector_place
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.io.headers import header_text
@@ -33,8 +33,8 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
     """Make the model of the coronagraph for an observation.
 
     Frames whose header says NIRCam get the detector's scale and shear from the SIAF and the Lyot
-    stop where it is in flight, which is where a fit starts. A model that was made before is used
-    again.
+    stop where it is in flight (short wave: where it should be), which is where a fit starts. A
+    model that was made before is used again.
 
     Parameters
     ----------
@@ -94,20 +94,21 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
                 f"{observation.name}: these frames have image mask {mask_name}, expected one of "
                 f"{', '.join(ROUND_MASKS)}. Other masks come through from_webbpsf"
             )
-        mask = ROUND_MASKS[name]
+        place = detector_place(name, observation.filter)
         shortest = float(filter_throughput(observation.filter)[0][0])
-        (ny, nx), (x, y) = observation.shape, mask.siaf_pixelscale
+        (ny, nx), (x, y) = observation.shape, place.siaf_pixelscale
         npix = _NPIX
         while npix < samples_for_field(max(nx * x, ny * y), shortest):
             npix *= 2
         arguments |= {
             "image_mask": name,
-            "pixelscale": mask.siaf_pixelscale,
-            "shear": mask.siaf_shear,
+            "pixelscale": place.siaf_pixelscale,
+            "shear": place.siaf_shear,
             "nlambda": 7,
             "npix": npix,
             "occulter_sampling": _CELLS,
-            "defaults": FLIGHT_ALIGNMENT,
+            # That of the stop of the short-wave channel is not published.
+            "defaults": None if place.short_wave else FLIGHT_ALIGNMENT,
         }
     arguments |= overrides
     defaults = arguments.pop("defaults", None)

@@ -105,6 +105,7 @@ class Sequence:
         target: str | None = None,
         filter: str | None = None,
         epoch: str | Time | None = None,
+        references: Iterable[str | os.PathLike[str]] = (),
     ) -> Sequence:
         """Sort JWST coronagraphic files into target and reference stars.
 
@@ -125,6 +126,8 @@ class Sequence:
         epoch : str or Time, optional
             Date in the epoch to use, such as "2022-10-03", if the target was observed in several.
             Frames of one epoch are at most 5 days apart, and share a wavefront.
+        references : iterable of path
+            Further files, of reference stars even if their headers do not say so.
 
         Returns
         -------
@@ -139,7 +142,7 @@ class Sequence:
         NoValidPixelsError
             If no frame of the target is left.
         """
-        sequences = cls.by_epoch(files, target=target, filter=filter)
+        sequences = cls.by_epoch(files, target=target, filter=filter, references=references)
         if epoch is not None:
             date = Time(epoch)
             near = [
@@ -167,6 +170,7 @@ class Sequence:
         *,
         target: str | None = None,
         filter: str | None = None,
+        references: Iterable[str | os.PathLike[str]] = (),
     ) -> tuple[Sequence, ...]:
         """Sort files as `from_files` does, into one sequence for each epoch.
 
@@ -178,20 +182,18 @@ class Sequence:
         tuple of Sequence
             In order of time.
         """
-        listed = exposures_in(files)
+        listed = exposures_in(files, references)
         exclude_unusable(listed)
         require_some(listed)
         choose_filter(listed, filter)
-        science, references = choose_target(listed, target)
-        exclude_other_setups(science, references)
+        science, others = choose_target(listed, target)
+        exclude_other_setups(science, others)
         star = science[0].star
-        frames = {
-            id(each): each.read() for each in (*science, *references) if not each.reason
-        }  # fmt: skip
-        together = [*science, *references]
+        together = [*science, *others]
+        frames = {id(each): each.read() for each in together if not each.reason}
         judge_frames([each for each in together if not each.reason], frames)
         exclude_copies(together, frames)
-        for group in (science, *_by_star(references)):
+        for group in (science, *_by_star(others)):
             compare_brightness(group, frames)
         exclude_unoriented(science)
         if all(each.reason for each in science):

@@ -11,14 +11,19 @@ from typing import Any, Protocol
 
 import numpy as np
 from astropy import units as u
-from astropy.table import Table
+from astropy.table import QTable, Table
 
 from pyklip_diffrender.detection import Detection, detect
-from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
+from pyklip_diffrender.errors import (
+    DiffrenderError,
+    DiffrenderWarning,
+    IncompatibleSetupError,
+)
 from pyklip_diffrender.instrument.masks import ROUND_MASKS, mask_of_header
 from pyklip_diffrender.io.units import require_bound
 from pyklip_diffrender.pyklip_backend.jwst_files import reduce_jwst_files
 from pyklip_diffrender.refinement import to_jansky, with_star_flux
+from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.spaceklip.products import (
     complete_header,
     write_contrast,
@@ -73,6 +78,7 @@ def run_obs(
     All rolls of a concatenation are fitted together. References (TYPE is REF) are used only where
     the library has no flat-field pattern for the pixels, or with ``systematics="references"``; none
     are needed. The products are added to ``database.red`` and the candidates to ``database.src``.
+    Every file is judged before the first fit as `pyklip_diffrender.Sequence.from_files` judges it.
 
     Parameters
     ----------
@@ -117,7 +123,7 @@ def run_obs(
     Warns
     -----
     DiffrenderWarning
-        For every concatenation that is skipped.
+        For every concatenation that is skipped, and every file that is left out, with the reason.
 
     Examples
     --------
@@ -133,6 +139,7 @@ def run_obs(
     products: dict[str, Path] = {}
     detections: dict[str, Detection] = {}
     failures: list[Exception] = []
+    admitted: dict[str, tuple[Table, QTable]] = {}
     for key, table in database.obs.items():
         if restrict_to is not None and restrict_to not in key:
             continue
@@ -140,11 +147,18 @@ def run_obs(
         if reason:
             warnings.warn(f"{key} is skipped: {reason}", DiffrenderWarning, stacklevel=2)
             continue
+        try:
+            admitted[key] = _admitted(key, table)
+        except DiffrenderError as error:
+            error.add_note(f"concatenation {key}")
+            failures.append(error)
+    for key, (table, frames) in admitted.items():
         logger.info("concatenation %s", key)
         try:
             products[key], detections[key] = _reduced(
                 key,
                 table,
+                frames,
                 folder,
                 threshold,
                 save_rolls,
@@ -198,9 +212,35 @@ def why_unsupported(table: Table) -> str | None:
     return None
 
 
+def _admitted(key: str, table: Table) -> tuple[Table, QTable]:
+    """Rows of a concatenation whose files are used, and what every file is used for and why.
+
+    Raises
+    ------
+    DiffrenderError
+        See `Sequence.from_files`.
+
+    Warns
+    -----
+    DiffrenderWarning
+        For every file that is left out.
+    """
+    is_target = np.array(table["TYPE"], dtype=str) == "SCI"
+    files = [Path(str(path)) for path in table["FITSFILE"]]
+    sequence = Sequence.from_files(
+        [path for path, chosen in zip(files, is_target, strict=True) if chosen],
+        references=[path for path, chosen in zip(files, is_target, strict=True) if not chosen],
+    )
+    for name, reason in sequence.excluded:
+        warnings.warn(f"{key}: {name} is left out: {reason}", DiffrenderWarning, stacklevel=3)
+    used = {row.exposure.name for row in sequence.rows if row.use != "excluded"}
+    return table[np.array([path.name in used for path in files])], sequence.table
+
+
 def _reduced(
     key: str,
     table: Table,
+    frames: QTable,
     folder: Path,
     threshold: float,
     save_rolls: bool,
@@ -209,7 +249,8 @@ def _reduced(
 ) -> tuple[Path, Detection]:
     """Reduce one concatenation and write its files; the path of the product.
 
-    `star_flux` is the flux density, Jy, and its relative error.
+    `frames` is the table of admission, and `star_flux` the flux density, Jy, and its relative
+    error.
     """
     kinds = np.array(table["TYPE"], dtype=str)
     files = np.array(table["FITSFILE"], dtype=object)
@@ -234,6 +275,7 @@ def _reduced(
     source_table(detection, product).write(
         folder / f"{prefix}-results.ecsv", format="ascii.ecsv", overwrite=True
     )
+    frames.write(folder / f"{prefix}-frames.ecsv", format="ascii.ecsv", overwrite=True)
     write_database(folder / f"{key}.dat", table)
     write_mask(folder / f"{key}_psfmask.fits", table)
     return product, detection

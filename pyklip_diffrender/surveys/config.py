@@ -40,8 +40,9 @@ class Options:
     threshold : float
     systematics : str
         "auto", "references", "off", or the path of a file of `Systematics.write`.
-    wide, disk : bool
-        Search the whole frames as well, or fit extended light together with the star.
+    wide, disk, completeness : bool
+        Search the whole frames as well, fit extended light together with the star, and compute the
+        fraction of planets that the search finds.
     star_flux : float or None
         Flux density of the star, Jy.
     star_flux_error : float
@@ -55,6 +56,7 @@ class Options:
     systematics: str = "auto"
     wide: bool = False
     disk: bool = False
+    completeness: bool = False
     star_flux: float | None = None
     star_flux_error: float = 0.05
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -294,8 +296,9 @@ def _options(table: _Table, default: Options) -> Options:
         "systematics", default.systematics,
         "'auto', 'references', 'off' or a systematics.fits that exists", systematics,
     )  # fmt: skip
-    wide, disk = (
-        table.take(key, getattr(default, key), "true or false", _flag) for key in ("wide", "disk")
+    wide, disk, completeness = (
+        table.take(key, getattr(default, key), "true or false", _flag)
+        for key in ("wide", "disk", "completeness")
     )
     if wide and disk:
         table.complain("", "wide = true and disk = true", "one of them")
@@ -313,7 +316,7 @@ def _options(table: _Table, default: Options) -> Options:
     where = f"{table.place}: settings"
     table.problems += [f"{where}: {each}" for each in wrong]
     allowed = default.settings if wrong else settings
-    return Options(size, threshold, pattern, wide, disk, star, star_error, allowed)
+    return Options(size, threshold, pattern, wide, disk, completeness, star, star_error, allowed)
 
 
 def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:

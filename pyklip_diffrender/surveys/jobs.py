@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -50,7 +50,7 @@ class Job:
     key : str
         Hash of the package's version, the content of the input files, and the options.
     name : str
-        That of the sequence.
+        That of the sequence, with the date of the epoch if it has several.
     files : tuple of str
         Frames.
     opd : str
@@ -58,6 +58,8 @@ class Job:
     inputs : dict of str to str
         SHA-256 of every file that is read.
     target, filter : str or None
+    epoch : str or None
+        Date in the epoch, of a sequence that has several.
     options : Options
     injection : Injection or None
     base : str or None
@@ -73,6 +75,7 @@ class Job:
     inputs: Mapping[str, str]
     target: str | None = None
     filter: str | None = None
+    epoch: str | None = None
     options: Options = field(default_factory=Options)
     injection: Injection | None = None
     base: str | None = None
@@ -117,12 +120,50 @@ def jobs_of(config: Config) -> list[Job]:
 
 def _jobs(sequence: SequenceConfig, digest: Callable[[Path], str]) -> list[Job]:
     files = _files(sequence.files)
-    opd, is_flat = sequence.opd, str(sequence.opd) == FLAT
-    if not is_flat and opd.is_dir():
-        opd = _nearest(opd, sequence)
+    planets = sequence.injections
+    jobs = []
+    for opd, epoch in _epochs(sequence, files):
+        plain = _job(sequence, files, opd, epoch, digest)
+        injected = [
+            _with_planet(plain, Injection(contrast, separation, angle))
+            for contrast in planets.contrasts
+            for separation in planets.separations
+            for angle in planets.angles
+        ]
+        jobs += [plain, *injected]
+    return jobs
+
+
+def _epochs(sequence: SequenceConfig, files: list[Path]) -> list[tuple[Path, str | None]]:
+    """Wavefront map and date of every epoch; without a date if there is just one."""
+    of_folder = str(sequence.opd) != FLAT and sequence.opd.is_dir()
+    try:
+        epochs = Sequence.by_epoch(files, target=sequence.target, filter=sequence.filter)
+    except DiffrenderError:
+        if of_folder:
+            raise
+        return [(sequence.opd, None)]  # The job will fail, and its row says why.
+    opd = sequence.opd
+    return [
+        (
+            # As `reduce` chooses it: the one nearest to the target's frames.
+            opd / wavefront_for(opd, each.date).name if of_folder else opd,
+            each.date.isot if len(epochs) > 1 and each.date is not None else None,
+        )
+        for each in epochs
+    ]
+
+
+def _job(
+    sequence: SequenceConfig,
+    files: list[Path],
+    opd: Path,
+    epoch: str | None,
+    digest: Callable[[Path], str],
+) -> Job:
     pattern, star = sequence.options.systematics, sequence.options.star_flux
     known = [] if pattern in ("auto", "references", "off") else [Path(pattern)]
-    maps = [] if is_flat else [opd]
+    maps = [] if str(opd) == FLAT else [opd]
     inputs = {str(path): digest(path) for path in (*files, *maps, *known)}
     facts = {
         "version": __version__,
@@ -137,41 +178,24 @@ def _jobs(sequence: SequenceConfig, digest: Callable[[Path], str]) -> list[Job]:
         # Only where they are used, so that jobs of configurations without them keep their names.
         **{name: True for name in ("wide", "disk") if getattr(sequence.options, name)},
         **({} if star is None else {"star_flux": [star, sequence.options.star_flux_error]}),
+        **({} if epoch is None else {"epoch": epoch}),
     }
-    plain = Job(
+    return Job(
         _hash(facts),
-        sequence.name,
+        sequence.name if epoch is None else f"{sequence.name} {epoch[:10]}",
         tuple(map(str, files)),
         str(opd),
         inputs,
         sequence.target,
         sequence.filter,
+        epoch,
         sequence.options,
     )
-    planets = sequence.injections
-    injected = [
-        _with_planet(plain, Injection(contrast, separation, angle))
-        for contrast in planets.contrasts
-        for separation in planets.separations
-        for angle in planets.angles
-    ]
-    return [plain, *injected]
 
 
 def _with_planet(base: Job, planet: Injection) -> Job:
     key = _hash({"base": base.key, "planet": [planet.contrast, planet.separation, planet.angle]})
-    return Job(
-        key,
-        base.name,
-        base.files,
-        base.opd,
-        base.inputs,
-        base.target,
-        base.filter,
-        base.options,
-        planet,
-        base.key,
-    )
+    return replace(base, key=key, injection=planet, base=base.key)
 
 
 def _hash(facts: Mapping[str, Any]) -> str:
@@ -186,10 +210,3 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
     if not inside:
         raise CorruptFileError(f"{paths[0]}: the folder has no FITS files")
     return inside
-
-
-def _nearest(folder: Path, sequence: SequenceConfig) -> Path:
-    """The map that `reduce` would take from a folder: the one nearest to the target's frames."""
-    files = sequence.files[0] if len(sequence.files) == 1 else sequence.files
-    frames = Sequence.from_files(files, target=sequence.target, filter=sequence.filter)
-    return folder / wavefront_for(folder, frames.date).name

@@ -35,7 +35,7 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
         sequence = Sequence(first.target, science)
         options |= {"systematics": fit.systematics or "off", "wide": False}
     else:
-        sequence = Sequence.from_files(job.files, target=job.target, filter=job.filter)
+        sequence = _sequence(job)
     if job.options.settings:
         name = sequence.science[0].filter
         options["settings"] = GaussNewton.nircam(name, **job.options.settings)
@@ -47,12 +47,15 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
     return result
 
 
+def _sequence(job: Job) -> Sequence:
+    return Sequence.from_files(job.files, target=job.target, filter=job.filter, epoch=job.epoch)
+
+
 def _with_disk(frames: abc.Sequence[FrameFit], job: Job) -> list[FrameFit]:
     """The frames of a fit, with the extended light that was subtracted from them."""
     if not job.options.disk:
         return list(frames)
-    files = Sequence.from_files(job.files, target=job.target, filter=job.filter)
-    original = files.cutout(job.options.size).science
+    original = _sequence(job).cutout(job.options.size).science
     return [
         replace(frame, observation=replace(frame.observation, data=each.combined().data))
         for frame, each in zip(frames, original, strict=True)

@@ -1,0 +1,260 @@
+"""The unknowns of a fit: their order, starting values and priors.
+
+The vector of a frame has its optical parameters, levels, companions, amplitude and wavefront. The
+vector of all frames begins with the unknowns that differ between frames, frame by frame. Then come
+the shared ones in the order of a frame's vector, with the wavefront modes last. At its end are
+the differences of the leading modes of each frame from the shared modes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.io.geometry import rotation_matrix
+from pyklip_diffrender.linear.frames import FrameRows, Unknown
+from pyklip_diffrender.parameters import LEVELS, parameter
+from pyklip_diffrender.scene.objects import Planet
+
+__all__ = ["COMPANION_PRIOR", "FrameUnknowns", "Unknowns"]
+
+_LINEAR = tuple(p.name for p in LEVELS)
+
+COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
+"""Prior standard deviations of a companion's contrast, x and y (arcsec) about its start."""
+
+
+@dataclass(frozen=True)
+class FrameUnknowns:
+    """The unknowns of one frame.
+
+    Units are those of the parameter table; a companion is (contrast, x, y) with x, y in arcsec
+    from the star, image orientation; modes are in nm.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Free optical parameters and levels: flux, background and pedestal.
+    start : mapping of str to Tensor
+        Values of all optical parameters that are not at their defaults, free or not, and of
+        the levels.
+    modes : int
+        Wavefront modes.
+    amplitude_modes : int
+        Amplitude modes of the pupil.
+    companions : tuple of Planet
+        Starting values of companions.
+    roll : float
+        Degrees by which the sky is turned, counter-clockwise, relative to the first frame.
+    shows_companions : bool
+        False for a reference star.
+    deviations : mapping of str to float
+        Prior standard deviations that replace those of the parameter table.
+    """
+
+    names: tuple[str, ...]
+    start: Mapping[str, Tensor]
+    modes: int
+    amplitude_modes: int = 0
+    companions: tuple[Planet, ...] = ()
+    roll: float = 0.0
+    shows_companions: bool = True
+    deviations: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def optical(self) -> tuple[str, ...]:
+        """Free parameters of the model."""
+        return tuple(name for name in self.names if name not in _LINEAR)
+
+    @property
+    def linear(self) -> tuple[str, ...]:
+        """Levels that are free, in the order of the parameter table."""
+        return tuple(name for name in _LINEAR if name in self.names)
+
+    @property
+    def ordered(self) -> tuple[str, ...]:
+        """Names in the order of the vector."""
+        return (*self.optical, *self.linear)
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Places of the parameters, and of "companions", "amplitude" and "modes"."""
+        sizes = {each: parameter(each).size for each in self.ordered}
+        sizes["companions"] = 3 * len(self.companions)
+        sizes["amplitude"], sizes["modes"] = self.amplitude_modes, self.modes
+        ends = itertools.accumulate(sizes.values())
+        return {
+            name: slice(end - size, end)
+            for (name, size), end in zip(sizes.items(), ends, strict=True)
+        }
+
+    def where(self, name: str) -> slice:
+        """Place of a parameter, or of "companions", "amplitude" or "modes"."""
+        return self.slices[name]
+
+    def initial(self) -> Tensor:
+        """The starting vector."""
+        named = [self.start[name] for name in self.ordered]
+        planets = [
+            torch.tensor([p.contrast, *p.offset], dtype=torch.float64) for p in self.companions
+        ]
+        zeros = torch.zeros(self.amplitude_modes + self.modes, dtype=torch.float64)
+        return torch.cat([*named, *planets, zeros])
+
+    def values(self, vector: Tensor) -> dict[str, Tensor]:
+        """All optical parameters as the model takes them."""
+        values = {name: value for name, value in self.start.items() if name not in _LINEAR}
+        return {**values, **{name: vector[self.where(name)] for name in self.optical}}
+
+    def level(self, name: str, vector: Tensor) -> float:
+        """Flux, background or pedestal."""
+        value = vector[self.where(name)] if name in self.linear else self.start[name]
+        return float(value[0])
+
+    def sources(self, vector: Tensor) -> Tensor:
+        """Contrast, x and y of companions in the first frame, (companions, 3)."""
+        return vector[self.where("companions")].reshape(-1, 3)
+
+    @property
+    def turn(self) -> Tensor:
+        """Matrix from positions in the first frame to positions in this one, (2, 2)."""
+        return torch.from_numpy(rotation_matrix(self.roll))
+
+    def prior_deviation(self) -> Tensor:
+        """Prior standard deviations of all unknowns before the amplitude and the modes."""
+        named = [
+            torch.full(
+                (parameter(name).size,),
+                self.deviations.get(name, parameter(name).prior),
+                dtype=torch.float64,
+            )
+            for name in self.ordered
+        ]
+        planets = torch.tensor(COMPANION_PRIOR, dtype=torch.float64).repeat(len(self.companions))
+        return torch.cat([*named, planets])
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """The unknowns of all frames.
+
+    Attributes
+    ----------
+    frames : tuple of FrameUnknowns
+        They differ in their starting values, roll and companions' visibility only.
+    own : tuple of str
+        Names of the parameters that differ between frames.
+    drift : int
+        Number of leading modes that may differ between frames.
+    """
+
+    frames: tuple[FrameUnknowns, ...]
+    own: tuple[str, ...] = ()
+    drift: int = 0
+
+    @cached_property
+    def _own_size(self) -> int:
+        """Number of unknowns of every frame that are its own."""
+        slices = self.frames[0].slices
+        return sum(slices[n].stop - slices[n].start for n in self.frames[0].names if n in self.own)
+
+    @cached_property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.where("modes").stop + len(self.frames) * self.drift
+
+    def where(self, name: str) -> slice:
+        """Place of "companions", "amplitude" or "modes", which frames share."""
+        first = self.frames[0].where(name)
+        before = (len(self.frames) - 1) * self._own_size
+        return slice(first.start + before, first.stop + before)
+
+    def with_modes(self, modes: int) -> int:
+        """Number of unknowns if only the first `modes` modes are free; 0 for the alignment only."""
+        if modes == 0:
+            return self.where("companions").stop
+        every = self.where("modes")
+        return self.size if modes == every.stop - every.start else every.start + modes
+
+    @cached_property
+    def rows(self) -> tuple[FrameRows, ...]:
+        """Which unknowns the entries of every frame's vector are."""
+        return tuple(self._rows(k) for k in range(len(self.frames)))
+
+    def _rows(self, frame: int) -> FrameRows:
+        own, shared = frame * self._own_size, len(self.frames) * self._own_size
+        rows = torch.empty(self.frames[frame].where("modes").stop, dtype=torch.int64)
+        for name, where in self.frames[frame].slices.items():
+            begin, count = own if name in self.own else shared, where.stop - where.start
+            rows[where] = torch.arange(begin, begin + count)
+            own, shared = (own + count, shared) if name in self.own else (own, shared + count)
+        drift = shared + frame * self.drift + torch.arange(self.drift)
+        return FrameRows(rows, drift, self.frames[frame].where("modes").start)
+
+    def labels(self) -> tuple[Unknown, ...]:
+        """Label every unknown, in order."""
+        labels = [Unknown("", 0)] * self.size
+        for frame, part in reversed(list(enumerate(self.rows))):
+            for name, where in self.frames[frame].slices.items():
+                owner = frame if name in self.own else -1
+                for k, place in enumerate(part.rows[where].tolist()):
+                    labels[place] = Unknown(name, k, owner)
+            for k, place in enumerate(part.drift.tolist()):
+                labels[place] = Unknown("drift", k, frame)
+        return tuple(labels)
+
+    def _joined(self, vectors: Iterable[Tensor]) -> Tensor:
+        """The vector of all frames from theirs; shared unknowns are those of the first frame."""
+        joined = torch.zeros(self.size, dtype=torch.float64)
+        for part, vector in reversed(list(zip(self.rows, vectors, strict=True))):
+            joined[part.rows[: len(vector)]] = vector
+        return joined
+
+    def initial(self) -> Tensor:
+        """The starting vector: the mean of the prior."""
+        return self._joined(frame.initial() for frame in self.frames)
+
+    def warm(self, values: Mapping[Unknown, float]) -> Tensor:
+        """Return the starting vector with the final values of an earlier fit.
+
+        Parameters
+        ----------
+        values : mapping of Unknown to float
+            Those that are not unknowns here are ignored, and missing ones keep their starting
+            values. The bases may differ in length if they begin with the same modes. Companions
+            keep their starting values.
+        """
+        vector = self.initial()
+        for place, unknown in enumerate(self.labels()):
+            if unknown.name != "companions" and unknown in values:
+                vector[place] = values[unknown]
+        return vector
+
+    def prior_deviation(self) -> Tensor:
+        """Prior standard deviations of all unknowns before the amplitude and the modes."""
+        joined = self._joined(frame.prior_deviation() for frame in self.frames)
+        return joined[: self.where("amplitude").start]
+
+    def clamped(self, vector: Tensor) -> Tensor:
+        """Clip every parameter to its bounds."""
+        vector = vector.clone()
+        for unknowns, part in zip(self.frames, self.rows, strict=True):
+            for name in unknowns.ordered:
+                entry, places = parameter(name), part.rows[unknowns.where(name)]
+                vector[places] = vector[places].clamp(entry.lower, entry.upper)
+        return vector
+
+    def with_companions(self, added: Sequence[Planet], vector: Tensor) -> tuple[Unknowns, Tensor]:
+        """Return unknowns with more companions, and the vector of the same state."""
+        frames = [replace(each, companions=(*each.companions, *added)) for each in self.frames]
+        grown = replace(self, frames=tuple(frames))
+        moved = grown.initial()
+        before, after = self.where("companions").stop, grown.where("companions").stop
+        moved[:before] = vector[:before]
+        moved[after:] = vector[before:]
+        return grown, moved
