@@ -419,8 +419,9 @@ def test_images_have_north_up() -> None:
             (PLANET.offset, *wrong)
         )  # fmt: skip
         assert light > 2 * np.abs(others).max()
+    # Four standard deviations.
     (circled,) = overview._places
-    assert np.hypot(*(circled - PLANET.offset)) < 0.02
+    assert np.hypot(*(circled - PLANET.offset)) < 0.05
 
 
 @pytest.mark.usefixtures("_few_pictures")
