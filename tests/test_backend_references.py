@@ -6,7 +6,6 @@ import copy
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from pyklip_diffrender.errors import (
     MissingOPDError,
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.pattern import PatternChoice, choose_systematics
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     observation_from_dataset,
@@ -33,9 +31,7 @@ from pyklip_diffrender.pyklip_backend import (
 )
 from pyklip_diffrender.pyklip_backend.frames import frames_of
 from pyklip_diffrender.pyklip_backend.references import References
-from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import Systematics
 
 CARDS = {"SUBSTRT1": 492, "SUBSTRT2": 1502, "DETECTOR": "NRCALONG"}
 TARGET = {"TARGPROP": "TARGET", "IS_PSF": False, **CARDS}
@@ -221,117 +217,11 @@ def frame(target: str, **details: Any) -> Observation:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("requested", "library", "fitted", "label", "used"),
-    [
-        ("auto", True, [], "library (OTHER)", 0),
-        ("auto", False, ["REF"], "references (REF)", 4),
-        ("references", True, ["REF"], "references (REF), library (OTHER)", 4),
-        ("off", True, [], "none", 0),
-        ("mine", True, [], "given (mine)", 0),
-    ],
-)
-def test_which_pattern_is_used(
-    requested: Any, library: bool, fitted: list[str], label: str, used: int,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    stars: list[str] = []
-
-    def refine(model: Any, frames: Any, opd: Any, **options: Any) -> Any:
-        stars.append(frames[0].target)
-        return SimpleNamespace(frames=[SimpleNamespace(observation=each) for each in frames])
-
-    def known(observation: Observation, references: Any = (), **options: Any) -> Any:
-        known_stars = library and options.get("library", True)
-        names = ["REF"] * bool(references) + ["OTHER"] * known_stars
-        flat = np.zeros(observation.shape)
-        made = Systematics(flat, flat + 0.1, (15.5, 15.5), 0.1, provenance={"stars": names})
-        return made if names else None
-
-    choosing = "pyklip_diffrender.pattern.choice"
-    monkeypatch.setattr(f"{choosing}.refine", refine)
-    monkeypatch.setattr(f"{choosing}.known_systematics", known)
-    zeros = np.zeros((32, 32))
-    mine = Systematics(zeros, zeros, (15.5, 15.5), 0.1, name="mine")
-    model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
-    read: list[str] = []
-
-    def references() -> list[Observation]:
-        read.append("references")
-        return [frame("REF"), frame("REF")]
-
-    def choose(**options: Any) -> PatternChoice:
-        # Two rolls, which would share a pattern of their own if nothing else were known.
-        science, request = [frame("TARGET")] * 2, mine if requested == "mine" else requested
-        return choose_systematics(science, references, model, OPD, systematics=request, **options)
-
-    chosen = choose()
-    assert stars == fitted
-    assert bool(read) == bool(fitted)
-    assert (chosen.label, chosen.reference_frames) == (label, used)
-    assert (chosen.systematics is None) == (label == "none")
-    if label != "none":
-        # The pattern's own error takes the place of most of the model's.
-        assert chosen.settings == GaussNewton.nircam(min_model_error=0.002)
-    assert "library" not in choose(library=False).label
-
-
-def test_a_library_of_another_flat_field_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The fit is repeated with what there is besides the library."""
-    patterns: list[str] = []
-    zeros = np.zeros((32, 32))
-
-    def chosen(*_: Any, library: bool = True, **options: Any) -> PatternChoice:
-        name = "library" if library else "the rolls themselves"
-        pattern = Systematics(zeros, zeros + 0.1, (15.5, 15.5), 0.1, name=name)
-        origin: Any = "library" if library else "rolls"
-        return PatternChoice((simulated,), pattern, settings.fit, origin=origin)
-
-    def lacks(fit: Refinement) -> bool:
-        assert fit.systematics is not None
-        patterns.append(fit.systematics.name)
-        return True
-
-    simulated = replace(frame("TARGET"), header=fits.Header())
-    model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
-    fit = GaussNewton(free=("flux", "background"), wavefront=False)
-    settings = DiffrenderSettings(model=model, fit=fit, max_chi2=np.inf)
-    monkeypatch.setattr("pyklip_diffrender.pattern.fit.choose_systematics", chosen)
-    monkeypatch.setattr("pyklip_diffrender.pattern.choice.lacks_pattern", lacks)
-    told: list[str] = []
-    with pytest.warns(DiffrenderWarning):  # The star is not one of this model.
-        result = subtract_by_refinement(simulated, OPD, settings, tell=told.append)
-    assert result.systematics == "the rolls themselves"
-    assert patterns == ["library"]
-    assert "the frames do not show the pattern of the library" in told
-
-
 def test_references_that_are_asked_for_must_be_there() -> None:
     model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
     settings = DiffrenderSettings(systematics="references")
     with pytest.raises(IncompatibleSetupError, match=r"psflib_filepaths after register\(\)"):
         subtract_by_refinement(frame("TARGET"), OPD, replace(settings, model=model))
-
-
-@pytest.mark.parametrize(("cards", "expected"), [({}, "off"), ({"INSTRUME": "NIRCAM"}, "auto")])
-def test_simulations_use_no_pattern_by_default(
-    cards: dict[str, str], expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    requests: list[str] = []
-
-    class Stop(Exception):
-        pass
-
-    def chosen(*_: Any, systematics: str, **options: Any) -> PatternChoice:
-        requests.append(systematics)
-        raise Stop
-
-    monkeypatch.setattr("pyklip_diffrender.pattern.fit.choose_systematics", chosen)
-    model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
-    star = replace(frame("TARGET"), header=fits.Header(cards))
-    with pytest.raises(Stop):
-        subtract_by_refinement(star, OPD, DiffrenderSettings(model=model))
-    assert requests == [expected]
 
 
 # Which wavefront map is used
@@ -398,14 +288,8 @@ def test_a_map_needs_a_folder_and_the_frames_a_date(
 )
 def test_mistakes_are_found_before_the_fit(
     settings: dict[str, Any], call: dict[str, Any], message: str, files: list[str],
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:  # fmt: skip
-    def subtract(*args: Any, **kw: Any) -> None:
-        raise AssertionError("fitted for nothing")
-
-    monkeypatch.setattr(
-        "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
-    )
     unregister()
     register(opd=OPD, **settings)
     dataset = JWSTData(files[:2])
