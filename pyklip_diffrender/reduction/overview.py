@@ -152,6 +152,6 @@ class Overview:
     def figure(self) -> Any:
         """One figure of all panels and the contrast curve."""
         figure, axes = drawing.new_figure(1, self.panels + 1)
-        self.draw(axes[0, :-1])
+        self.draw(list(axes[0, :-1]))
         draw_curve(axes[0, -1], self._detection, self.klip and self.klip.curve)
         return figure

@@ -125,7 +125,7 @@ def wavefronts(fit: Refinement) -> tuple[NDArray[np.float64], NDArray[np.float64
     """
     lit = fit.model.entrance.lit.cpu().numpy()
     before = resample(fit.initial.data, len(fit.wavefront))
-    maps = [1e9 * np.real(opd) for opd in (before, fit.wavefront)]
+    maps = [1e9 * opd for opd in (before, fit.wavefront)]
     before, after = (np.where(lit, each - each[lit].mean(), np.nan) for each in maps)
     return before, after
 
