@@ -30,7 +30,6 @@ from pyklip_diffrender.pyklip_backend import (
     unregister,
 )
 from pyklip_diffrender.pyklip_backend.frames import frames_of
-from pyklip_diffrender.pyklip_backend.references import References
 from pyklip_diffrender.scene.observation import Observation
 
 CARDS = {"SUBSTRT1": 492, "SUBSTRT2": 1502, "DETECTOR": "NRCALONG"}
@@ -73,9 +72,9 @@ def reduce(dataset: Any, folder: Path, **kw: Any) -> fits.Header:
     return fits.getheader(folder / "x-KLmodes-all.fits")
 
 
-def gathered(dataset: Any) -> Any:
+def gathered(dataset: Any, library: Any = ()) -> Any:
     every = np.arange(len(dataset.input))
-    return frames_of(dataset, every, np.asarray(dataset.input), DiffrenderSettings())
+    return frames_of(dataset, every, np.asarray(dataset.input), DiffrenderSettings(), library)
 
 
 # Which frames are which
@@ -155,30 +154,81 @@ def test_a_dithered_star_is_behind_the_mask_where_the_header_says(files: list[st
 @pytest.mark.parametrize(
     ("cards", "message"),
     [
-        ({"FILTER": "F356W"}, "with FILTER F356W, the target with F444W"),
-        ({"CORONMSK": "MASKA430R"}, "with CORONMSK MASKA430R"),
+        ({"FILTER": "F356W"}, "taken through F356W, not F444W"),
+        ({"CORONMSK": "MASKA430R"}, "mask is MASK430R, not MASK335R"),
+        # A star's own planets would become part of the pattern.
+        ({"TARGPROP": "target"}, "a reference frame that shows the target itself"),
+        ({"EXP_TYPE": "NRC_TACQ"}, "EXP_TYPE is NRC_TACQ"),
+        ({"DATE-BEG": "2023-07-30T01:02:03"}, "of another epoch"),
     ],
 )
-def test_references_of_another_set_up_are_refused(
+def test_references_that_do_not_belong_are_left_out(
     cards: dict[str, Any], message: str, files: list[str], tmp_path: Path, rng: Any
 ) -> None:
     other = tmp_path / "other_calints.fits"
     calints(other, rng, **{**REFERENCE, **cards})
-    dataset = JWSTData(files[:2], [files[2], str(other)])
-    with pytest.raises(IncompatibleSetupError, match=f"other_calints.fits was taken {message}"):
-        reduce(dataset, tmp_path / "out")
-    # A library that the call does not use does not matter.
-    reduce(dataset, tmp_path / "out", mode="ADI")
-    badfile = np.array([str(name).startswith("other") for name in dataset.psflib.master_filenames])
-    dataset.psflib.prepare_library(dataset, badfiles=badfile)
-    reduce(dataset, tmp_path / "out")
+    library = [Path(files[2]), other]
+    dataset = JWSTData(files[:2])
+    with pytest.warns(DiffrenderWarning, match=f"other_calints.fits: is not used: .*{message}"):
+        frames = gathered(dataset, library)
+    assert [each.name for each in frames.references] == [library[0].name]
+    assert frames.usable.all()
+
+
+@pytest.mark.parametrize(
+    ("cards", "message"),
+    [
+        ({"EXP_TYPE": "NRC_TACONFIRM"}, "EXP_TYPE is NRC_TACONFIRM"),
+        ({"CORONMSK": "MASKA430R"}, "another set-up than most of the target's frames"),
+        ({"BKGDTARG": True}, "without a star"),
+        ({"XOFFSET": 20.0}, "milliarcseconds"),
+    ],
+)
+def test_frames_that_do_not_belong_stay_out(
+    cards: dict[str, Any], message: str, files: list[str], tmp_path: Path, rng: Any
+) -> None:
+    other = tmp_path / "other_calints.fits"
+    calints(other, rng, 20.0, **{**TARGET, **cards})
+    with pytest.warns(DiffrenderWarning, match=f"other_calints.fits: is not used: .*{message}"):
+        frames = gathered(JWSTData([str(other), *files[:2]]))
+    np.testing.assert_array_equal(frames.usable, [False, False, True, True, True, True])
+    assert len(frames.pointings) == 2
+
+
+def test_epochs_are_refused_before_the_fit(files: list[str], tmp_path: Path, rng: Any) -> None:
+    other = tmp_path / "other_calints.fits"
+    calints(other, rng, 20.0, **{**TARGET, "DATE-BEG": "2023-07-30T01:02:03"})
+    with pytest.raises(IncompatibleSetupError, match="2 epochs"):
+        reduce(JWSTData([*files[:2], str(other)]), tmp_path / "out", mode="ADI")
+
+
+def test_a_file_that_is_there_twice_is_used_once(files: list[str]) -> None:
+    with pytest.warns(DiffrenderWarning, match="2 frames are in the dataset twice"):
+        frames = gathered(JWSTData([*files[:2], files[0]]))
+    np.testing.assert_array_equal(frames.usable, [True, True, True, True, False, False])
+
+
+def test_a_deviating_integration_stays_out(files: list[str], tmp_path: Path, rng: Any) -> None:
+    """One that is flagged entirely, or dim, costs neither its file's errors nor the star's flux."""
+    path = tmp_path / "cube_calints.fits"
+    calints(path, rng, 20.0, nints=8, **TARGET)
+    with fits.open(path, mode="update") as hdus:
+        hdus["DQ"].data[2] = 1
+        hdus["SCI"].data[5] *= 0.6
+    with pytest.warns(DiffrenderWarning) as caught:
+        frames = gathered(JWSTData([str(path), *files[:2]]))
+    (remark,) = {str(each.message) for each in caught}
+    assert "integration 3 of 8 is left out" in remark
+    assert "0.60 times as bright" in remark
+    np.testing.assert_array_equal(np.flatnonzero(~frames.usable), [2, 5])
+    assert frames.noise == "ERR"
 
 
 def test_the_files_of_the_library_reach_the_fit(
     files: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    seen: list[References] = []
+    seen: list[Any] = []
 
     def subtract(observation: Any, opd: Any, settings: Any, **context: Any) -> Any:
         seen.append(context["references"])
@@ -193,15 +243,12 @@ def test_the_files_of_the_library_reach_the_fit(
     register(opd=OPD)
     dataset = copy.deepcopy(JWSTData(files[:2], files[2:]))
     header = reduce(dataset, tmp_path / "out")
-    assert [path.name for path in seen[0].files] == [Path(files[2]).name]
-    (cut,) = seen[0].cut((20, 20), frame("TARGET"))
-    assert (cut.target, cut.shape, cut.reference) == ("REF", (20, 20), True)
-    # A star's own planets would become part of the pattern.
-    assert seen[0].cut((20, 20), frame("ref")) == []
+    ((used,), *_) = seen
+    assert (used.name, used.target, used.reference) == (Path(files[2]).name, "REF", True)
     assert (header["DRSYST"], header["DRREFS"]) == ("references (REF)", 2)
     assert "at work" not in capsys.readouterr().out
     reduce(dataset, tmp_path / "out", mode="ADI", verbose=True)
-    assert seen[1] is None
+    assert seen[1] == ()
     assert "diffrender: at work\n" in capsys.readouterr().out
 
 
