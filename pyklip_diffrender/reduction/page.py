@@ -377,7 +377,7 @@ def _provenance(summary: Mapping[str, Any], files: Mapping[str, str]) -> str:
         ("Seed", str(summary["seed"])),
         ("Chi-squared per pixel", number(summary["fit"]["chi2_per_pixel"])),
     ]
-    settings = ", ".join(f"{name} {value}" for name, value in summary["settings"].items())
+    settings = "; ".join(f"{name}: {value}" for name, value in summary["settings"].items())
     long = [
         ("Chi-squared per pixel, by separation", _by_ring(summary["fit"]["rings"])),
         ("Software", versions),
