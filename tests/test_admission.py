@@ -16,7 +16,8 @@ from astropy.time import Time
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints, starlight
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure, beginning, image_mask
+from pyklip_diffrender.scene.catalogue_star import CatalogueStar
+from pyklip_diffrender.scene.exposure import Exposure, beginning, image_mask
 
 
 @pytest.fixture
@@ -92,6 +93,10 @@ def test_the_table_says_what_every_file_is(folder: Path) -> None:
         ("mas.fits", {"XOFFSET": 15.0, "YOFFSET": -10.0, "OBSERVTN": "009"}, "milliarcseconds"),
         ("pup.fits", {"PUPIL": "CLEAR", "OBSERVTN": "009"}, "PUPIL is CLEAR"),
         ("two.fits", {"CORONMSK": "MASKA430R", "OBSERVTN": "009"}, "name different masks"),
+        ("area.fits", {"PIXAR_A2": 0.00096, "OBSERVTN": "009"}, "^by PIXAR_A2 .*0.063 in NRCALONG"),
+        ("old.fits", {"DATE-BEG": "0001-01-01", "OBSERVTN": "009"}, "^the exposure.*the launch"),
+        ("mid.fits", {"EXPMID": 59000.5, "OBSERVTN": "009"}, "EXPMID is 59000.5, expected about"),
+        ("sum.fits", {"PA_APER": 12.0, "OBSERVTN": "009"}, "PA_APER is 12.0, expected 70.050"),
     ],
 )  # fmt: skip
 def test_what_is_no_frame_of_this_setup_is_excluded(
@@ -104,6 +109,16 @@ def test_what_is_no_frame_of_this_setup_is_excluded(
     assert list(reasons(sequence)) == [name]
     assert re.search(words, reasons(sequence)[name])
     assert uses(sequence)[name] == "excluded"
+
+
+def test_cards_that_say_the_same_or_nothing_change_nothing(tmp_path: Path) -> None:
+    cards = {"BUNIT": "MJy sr-1", "EXPMID": 0.0, "INSTRUME": None, "PA_APER": 430.05}
+    calints(tmp_path / "a.fits", cards=cards)
+    calints(tmp_path / "b.fits", observation=2, roll=80.0)
+    first, second = dr.Sequence.from_files(tmp_path).science
+    assert first.mid_date is None
+    assert first.is_nircam
+    assert first.unit == second.unit
 
 
 def test_one_exposure_is_used_once(folder: Path) -> None:

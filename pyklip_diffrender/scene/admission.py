@@ -13,7 +13,8 @@ from astropy.time import Time
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.io.names import same_name, unknown_name
-from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure
+from pyklip_diffrender.scene.catalogue_star import CatalogueStar
+from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.frame_files import FrameFile, admissible, require_some
 from pyklip_diffrender.scene.noise import why_odd_noise
 from pyklip_diffrender.scene.observation import Observation
