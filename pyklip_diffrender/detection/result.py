@@ -399,9 +399,9 @@ class Detection:
         Parameters
         ----------
         path : path
-        format : "orbitize" or "orvara"
-            The CSV file of orbitize! (MJD, mas, degrees), or the text file with relative
-            astrometry of orvara (JD, arcsec, degrees).
+        format : "orbitize", "backtracks", "octofitter" or "orvara"
+            The CSV file of orbitize! (MJD, mas, degrees), backtracks or Octofitter (MJD, mas), or
+            the text file with relative astrometry of orvara (JD, arcsec, degrees).
 
         Raises
         ------
