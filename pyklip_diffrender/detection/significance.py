@@ -145,13 +145,12 @@ class Significance:
         if not math.isfinite(sigmas):
             return 0.0
         valid = np.isfinite(self.starlight) & (separation_of(self.grid) >= self.inner)
-        # Second derivatives of the autocorrelation, per pixel^2.
+        # Negative second derivatives of the autocorrelation in the middle, per pixel^2.
         middle = self.correlation.shape[0] // 2
-        row, column = self.correlation[middle], self.correlation[:, middle]
-        across, up = (2 * _curvature(each, middle) for each in (row, column))
-        diagonal = np.diagonal(self.correlation)
-        other = np.diagonal(self.correlation[:, ::-1])
-        mixed = (_curvature(diagonal, middle) - _curvature(other, middle)) / 2
+        slope, curvature = _derivatives(middle)
+        across = -float(curvature @ self.correlation[middle])
+        up = -float(curvature @ self.correlation[:, middle])
+        mixed = -float(slope @ self.correlation @ slope)
         density = math.sqrt(max(across * up - mixed**2, 0.0))
         ny, nx = valid.shape
         edge = nx * math.sqrt(across) + ny * math.sqrt(up)
@@ -164,9 +163,15 @@ class Significance:
         return -math.expm1(-expected)
 
 
-def _curvature(profile: Image, middle: int) -> float:
-    """Half the negative second derivative at the middle, from values within two pixels."""
-    # 1 - c x^2 + d x^4 through the values at one and two pixels.
-    first = 1 - (profile[middle - 1] + profile[middle + 1]) / 2
-    second = 1 - (profile[middle - 2] + profile[middle + 2]) / 2
-    return float((16 * first - second) / 12)
+def _derivatives(reach: int) -> tuple[Image, Image]:
+    """Weights of samples -reach, ..., reach whose sums are the derivatives in the middle.
+
+    First and second derivatives of a function without frequencies beyond those of its samples,
+    which is the sum of sinc functions.
+    """
+    places = np.arange(-reach, reach + 1)
+    away = np.where(places == 0, 1, places)
+    signs = np.where(places % 2 == 0, 1.0, -1.0)
+    slope = np.where(places == 0, 0.0, -signs / away)
+    curvature = np.where(places == 0, -(math.pi**2) / 3, -2 * signs / away**2)
+    return slope, curvature
