@@ -6,10 +6,11 @@ change by H^-1 G p, where G is the whitened Jacobian and H the curvature of the 
 chi-squared (see `linear.model`), and the star by the image of that change.
 
 Self-subtraction is larger in a source's wings than in its core, so that the fraction that is left
-depends on how the source is measured. Here it is the fraction of the peak: 1 - g . change / g . p with a
-Gaussian g of half the width of the source. `pyklip.fakes.gaussfit2d`, by which pyKLIP and spaceKLIP
-measure injected sources, adapts its Gaussian to the narrower core that is left, and agrees with
-this within 2 % (1 sigma) on NIRCam frames; a fit of the whole image would have about 18 % less.
+depends on how the source is measured. Here it is the fraction of the peak: 1 - g . change / g . p
+with a Gaussian g of half the width of the source. `pyklip.fakes.gaussfit2d`, by which pyKLIP and
+spaceKLIP measure injected sources, adapts its Gaussian to the narrower core that is left, and
+agrees with this within 2 % (1 sigma) on NIRCam frames; a fit of the whole image would have about 18
+% less.
 """
 
 from __future__ import annotations
