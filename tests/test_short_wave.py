@@ -1,0 +1,122 @@
+"""The short-wave arm: frames like those of MAST, from reading to the planet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+from astropy.io import fits
+
+from pyklip_diffrender.instrument import detector_place, filter_shift, nircam_coronagraph
+from pyklip_diffrender.reduction import reduce
+from pyklip_diffrender.refinement import GaussNewton, settings_for
+from pyklip_diffrender.scene import Observation, Planet, Sequence, model_for
+from pyklip_diffrender.wavefront import random_opd
+
+SIZE = 40
+PLANET = Planet(3e-4, 0.45, 60.0)
+PHOTONS = 1e10  # Of the star, in a frame.
+NOISE = 30.0
+STAR = (0.002, -0.002)  # arcsec from the middle of the mask.
+
+
+def calints(
+    folder: Path, roll: float, *, filter: str = "F210M", mask: str = "MASK335R", seed: int = 0
+) -> Path:
+    """A simulated frame of 64 x 64 pixels of NRCA2, with a planet, as MAST delivers it."""
+    place = detector_place(mask, filter)
+    star = np.array([31.3, 32.6])
+    model = nircam_coronagraph(
+        filter,
+        image_mask=mask,
+        npix=256,
+        nlambda=5,
+        fov_pixels=64,
+        pixelscale=place.siaf_pixelscale,
+        shear=place.siaf_shear,
+        # Not where the fit starts.
+        defaults={"lyot_shift": (-0.006, 0.004), "lyot_rotation": 0.2},
+    )
+    opd = random_opd(1, npix=256).data + random_opd(2, npix=256, rms=5e-9).data
+    moved = {"detector_shift": tuple((star - 31.5) * place.siaf_pixelscale)}
+    planet = PLANET.rotated(-roll).offset
+    with torch.no_grad():
+        light = model(opd, STAR, **moved)
+        light += PLANET.contrast * model(opd, tuple(np.add(STAR, planet)), **moved)
+    counts = PHOTONS * light.numpy()
+    sigma = np.sqrt(counts + NOISE**2)
+    counts = counts + sigma * np.random.default_rng(seed).normal(size=sigma.shape)
+    corner = np.round(np.add(place.center, filter_shift(filter)) - star) + 1
+    primary = {
+        "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON", "CHANNEL": "SHORT",
+        "DETECTOR": place.detector, "MODULE": "A", "FILTER": filter, "PUPIL": "MASKRND",
+        "CORONMSK": mask.replace("MASK", "MASKA"), "SUBARRAY": f"SUB320A{mask[4:]}",
+        "APERNAME": f"{place.detector}_{mask}", "TARGPROP": "HD 1",
+        "SUBSTRT1": int(corner[0]), "SUBSTRT2": int(corner[1]),
+        "DATE-BEG": f"2024-03-0{seed + 1}T00:00:00",
+    }  # fmt: skip
+    science = {
+        "BUNIT": "MJy/sr", "PIXAR_A2": float(np.prod(place.siaf_pixelscale)),
+        "PIXAR_SR": float(np.prod(place.siaf_pixelscale)) * 2.35e-11,
+        "CRPIX1": star[0] + 1, "CRPIX2": star[1] + 1, "ROLL_REF": roll, "V3I_YANG": 0.0,
+        "VPARITY": -1,
+    }  # fmt: skip
+    hdus = fits.HDUList(
+        [
+            fits.PrimaryHDU(header=fits.Header(primary)),
+            fits.ImageHDU(counts[None] / 1e3, fits.Header(science), name="SCI"),
+            fits.ImageHDU(sigma[None] / 1e3, name="ERR"),
+            fits.ImageHDU(np.zeros((1, 64, 64), "i4"), name="DQ"),
+        ]
+    )
+    path = folder / f"jw01000001001_03106_0000{seed + 1}_{place.detector.lower()}_calints.fits"
+    hdus.writeto(path)
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("filter", "mask"), [("F210M", "MASK335R"), ("F200W", "MASK430R"), ("F182M", "MASK210R")]
+)
+def test_a_planet_is_where_it_is_and_nothing_else(tmp_path: Path, filter: str, mask: str) -> None:
+    """Two rolls, a map that is 5 nm rms off, a star and a stop off their places, no pattern."""
+    files = [
+        calints(tmp_path, roll, filter=filter, mask=mask, seed=seed)
+        for seed, roll in enumerate((0.0, 10.0))
+    ]
+    settings = GaussNewton.nircam(filter, cycles=(9.0,), max_iterations=15)
+    result = reduce(files, random_opd(1, npix=256), size=SIZE, settings=settings)
+    assert result.systematics is None
+    (found,) = result.detection.candidates
+    table = result.detection.table
+    print(table)
+    assert table["separation"][0].to_value(u.arcsec) == pytest.approx(PLANET.separation, abs=0.01)
+    assert table["position_angle"][0].to_value(u.deg) == pytest.approx(60.0, abs=1.5)
+    error = float(table["contrast_error"][0])
+    assert float(table["contrast"][0]) == pytest.approx(PLANET.contrast, abs=3 * error)
+    assert error < 0.2 * PLANET.contrast
+    assert found is not None
+
+
+def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path: Path) -> None:
+    (frame,) = Sequence.from_files([calints(tmp_path, 0.0)]).science
+    assert frame.first_pixel is not None  # The star is where the mask is on NRCA2.
+    model = model_for(frame, SIZE)
+    place = detector_place("MASK335R", "F210M")
+    assert model.setup["filter"] == "F210M"
+    assert model.detector.pixelscale == place.siaf_pixelscale
+    assert model.planes[0].name == "MASK335R"
+    assert not model.defaults
+    long = GaussNewton.nircam("F444W")
+    short = settings_for(frame)
+    assert short.cycles == long.cycles == (18.0,)
+    assert short.deviations["lyot_shift"] > 2 * long.deviations["lyot_shift"]
+    wide = Observation.from_arrays(
+        np.ones((160, 160)), np.ones((160, 160)), pixelscale=0.031, filter="F182M",
+        header=fits.Header({"INSTRUME": "NIRCAM"}),
+    )  # fmt: skip
+    # 44 cycles reach the edge; memory and time set the bound.
+    assert settings_for(wide).cycles == (32.0,)
