@@ -95,7 +95,7 @@ def calints(
         {
             "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON", "FILTER": "F444W",
             "PUPIL": "MASKRND", "CORONMSK": "MASKA335R", "XOFFSET": 0.0, "YOFFSET": 0.0,
-            "DATE-BEG": "2022-07-30T01:02:03", **cards,
+            "DATE-BEG": "2022-07-30T01:02:03", "TARGPROP": "TARGET", **cards,
         }
     )  # fmt: skip
     science = fits.Header(

@@ -492,10 +492,17 @@ def test_integrations_of_a_moving_star_are_kept(tmp_path: Path) -> None:
     assert got.valid.mean() > 0.9995
 
 
-def test_every_integration_can_be_kept(tmp_path: Path) -> None:
-    path = calints(tmp_path / "x.fits", integrations=4, change=zero)
-    assert len(dr.Observation.from_fits(path, every_integration=True)) == 4
-    assert len(dr.Observation.from_fits(path)) == 3
+def test_every_integration_can_keep_its_place(tmp_path: Path) -> None:
+    def change(arrays: dict[str, np.ndarray]) -> None:
+        arrays["SCI"][0] = 0.0
+        dim(arrays)
+
+    path = calints(tmp_path / "x.fits", integrations=6, change=change)
+    every, used = (dr.Observation.from_fits(path, every_integration=e) for e in (True, False))
+    kept = every.valid.any(axis=(1, 2))
+    assert kept.tolist() == [False, True, False, True, True, True]
+    np.testing.assert_array_equal(every.data[kept], used.data)
+    assert every.remarks == used.remarks
 
 
 def test_a_cube_of_several_rolls_is_split(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def files(tmp_path: Path, rng: np.random.Generator) -> list[str]:
     paths = []
     for i, roll in enumerate((0.0, 10.0, 0.0)):
         path = tmp_path / f"jw0138600{i}_calints.fits"
-        calints(path, rng, roll, NATIVE)
+        calints(path, rng, roll, NATIVE, TARGPROP="TARGET" if i < 2 else "OTHER")
         paths.append(str(path))
     return paths[:2]
 
@@ -129,7 +129,7 @@ def test_filters_are_fitted_one_by_one(
     seen, paths = [], []
 
     def subtract(observation: Any, opd: Any, settings: Any, **context: Any) -> Any:
-        names = [path.name for path in context["references"].files]
+        names = [each.name for each in context["references"]]
         seen.append((observation.filter, list(observation.position_angles), names))
         return render(observation, opd, settings)
 

@@ -6,7 +6,6 @@ import copy
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from pyklip_diffrender.errors import (
     MissingOPDError,
 )
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.pattern import PatternChoice, choose_systematics
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     observation_from_dataset,
@@ -32,10 +30,7 @@ from pyklip_diffrender.pyklip_backend import (
     unregister,
 )
 from pyklip_diffrender.pyklip_backend.frames import frames_of
-from pyklip_diffrender.pyklip_backend.references import References
-from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import Systematics
 
 CARDS = {"SUBSTRT1": 492, "SUBSTRT2": 1502, "DETECTOR": "NRCALONG"}
 TARGET = {"TARGPROP": "TARGET", "IS_PSF": False, **CARDS}
@@ -77,9 +72,9 @@ def reduce(dataset: Any, folder: Path, **kw: Any) -> fits.Header:
     return fits.getheader(folder / "x-KLmodes-all.fits")
 
 
-def gathered(dataset: Any) -> Any:
+def gathered(dataset: Any, library: Any = ()) -> Any:
     every = np.arange(len(dataset.input))
-    return frames_of(dataset, every, np.asarray(dataset.input), DiffrenderSettings())
+    return frames_of(dataset, every, np.asarray(dataset.input), DiffrenderSettings(), library)
 
 
 # Which frames are which
@@ -159,30 +154,81 @@ def test_a_dithered_star_is_behind_the_mask_where_the_header_says(files: list[st
 @pytest.mark.parametrize(
     ("cards", "message"),
     [
-        ({"FILTER": "F356W"}, "with FILTER F356W, the target with F444W"),
-        ({"CORONMSK": "MASKA430R"}, "with CORONMSK MASKA430R"),
+        ({"FILTER": "F356W"}, "taken through F356W, not F444W"),
+        ({"CORONMSK": "MASKA430R"}, "mask is MASK430R, not MASK335R"),
+        # A star's own planets would become part of the pattern.
+        ({"TARGPROP": "target"}, "a reference frame that shows the target itself"),
+        ({"EXP_TYPE": "NRC_TACQ"}, "EXP_TYPE is NRC_TACQ"),
+        ({"DATE-BEG": "2023-07-30T01:02:03"}, "of another epoch"),
     ],
 )
-def test_references_of_another_set_up_are_refused(
+def test_references_that_do_not_belong_are_left_out(
     cards: dict[str, Any], message: str, files: list[str], tmp_path: Path, rng: Any
 ) -> None:
     other = tmp_path / "other_calints.fits"
     calints(other, rng, **{**REFERENCE, **cards})
-    dataset = JWSTData(files[:2], [files[2], str(other)])
-    with pytest.raises(IncompatibleSetupError, match=f"other_calints.fits was taken {message}"):
-        reduce(dataset, tmp_path / "out")
-    # A library that the call does not use does not matter.
-    reduce(dataset, tmp_path / "out", mode="ADI")
-    badfile = np.array([str(name).startswith("other") for name in dataset.psflib.master_filenames])
-    dataset.psflib.prepare_library(dataset, badfiles=badfile)
-    reduce(dataset, tmp_path / "out")
+    library = [Path(files[2]), other]
+    dataset = JWSTData(files[:2])
+    with pytest.warns(DiffrenderWarning, match=f"other_calints.fits: is not used: .*{message}"):
+        frames = gathered(dataset, library)
+    assert [each.name for each in frames.references] == [library[0].name]
+    assert frames.usable.all()
+
+
+@pytest.mark.parametrize(
+    ("cards", "message"),
+    [
+        ({"EXP_TYPE": "NRC_TACONFIRM"}, "EXP_TYPE is NRC_TACONFIRM"),
+        ({"CORONMSK": "MASKA430R"}, "another set-up than most of the target's frames"),
+        ({"BKGDTARG": True}, "without a star"),
+        ({"XOFFSET": 20.0}, "milliarcseconds"),
+    ],
+)
+def test_frames_that_do_not_belong_stay_out(
+    cards: dict[str, Any], message: str, files: list[str], tmp_path: Path, rng: Any
+) -> None:
+    other = tmp_path / "other_calints.fits"
+    calints(other, rng, 20.0, **{**TARGET, **cards})
+    with pytest.warns(DiffrenderWarning, match=f"other_calints.fits: is not used: .*{message}"):
+        frames = gathered(JWSTData([str(other), *files[:2]]))
+    np.testing.assert_array_equal(frames.usable, [False, False, True, True, True, True])
+    assert len(frames.pointings) == 2
+
+
+def test_epochs_are_refused_before_the_fit(files: list[str], tmp_path: Path, rng: Any) -> None:
+    other = tmp_path / "other_calints.fits"
+    calints(other, rng, 20.0, **{**TARGET, "DATE-BEG": "2023-07-30T01:02:03"})
+    with pytest.raises(IncompatibleSetupError, match="2 epochs"):
+        reduce(JWSTData([*files[:2], str(other)]), tmp_path / "out", mode="ADI")
+
+
+def test_a_file_that_is_there_twice_is_used_once(files: list[str]) -> None:
+    with pytest.warns(DiffrenderWarning, match="2 frames are in the dataset twice"):
+        frames = gathered(JWSTData([*files[:2], files[0]]))
+    np.testing.assert_array_equal(frames.usable, [True, True, True, True, False, False])
+
+
+def test_a_deviating_integration_stays_out(files: list[str], tmp_path: Path, rng: Any) -> None:
+    """One that is flagged entirely, or dim, costs neither its file's errors nor the star's flux."""
+    path = tmp_path / "cube_calints.fits"
+    calints(path, rng, 20.0, nints=8, **TARGET)
+    with fits.open(path, mode="update") as hdus:
+        hdus["DQ"].data[2] = 1
+        hdus["SCI"].data[5] *= 0.6
+    with pytest.warns(DiffrenderWarning) as caught:
+        frames = gathered(JWSTData([str(path), *files[:2]]))
+    (remark,) = {str(each.message) for each in caught}
+    assert "integration 3 of 8 is left out" in remark
+    assert "0.60 times as bright" in remark
+    np.testing.assert_array_equal(np.flatnonzero(~frames.usable), [2, 5])
+    assert frames.noise == "ERR"
 
 
 def test_the_files_of_the_library_reach_the_fit(
     files: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    seen: list[References] = []
+    seen: list[Any] = []
 
     def subtract(observation: Any, opd: Any, settings: Any, **context: Any) -> Any:
         seen.append(context["references"])
@@ -197,15 +243,12 @@ def test_the_files_of_the_library_reach_the_fit(
     register(opd=OPD)
     dataset = copy.deepcopy(JWSTData(files[:2], files[2:]))
     header = reduce(dataset, tmp_path / "out")
-    assert [path.name for path in seen[0].files] == [Path(files[2]).name]
-    (cut,) = seen[0].cut((20, 20), frame("TARGET"))
-    assert (cut.target, cut.shape, cut.reference) == ("REF", (20, 20), True)
-    # A star's own planets would become part of the pattern.
-    assert seen[0].cut((20, 20), frame("ref")) == []
+    ((used,), *_) = seen
+    assert (used.name, used.target, used.reference) == (Path(files[2]).name, "REF", True)
     assert (header["DRSYST"], header["DRREFS"]) == ("references (REF)", 2)
     assert "at work" not in capsys.readouterr().out
     reduce(dataset, tmp_path / "out", mode="ADI", verbose=True)
-    assert seen[1] is None
+    assert seen[1] == ()
     assert "diffrender: at work\n" in capsys.readouterr().out
 
 
@@ -221,117 +264,11 @@ def frame(target: str, **details: Any) -> Observation:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("requested", "library", "fitted", "label", "used"),
-    [
-        ("auto", True, [], "library (OTHER)", 0),
-        ("auto", False, ["REF"], "references (REF)", 4),
-        ("references", True, ["REF"], "references (REF), library (OTHER)", 4),
-        ("off", True, [], "none", 0),
-        ("mine", True, [], "given (mine)", 0),
-    ],
-)
-def test_which_pattern_is_used(
-    requested: Any, library: bool, fitted: list[str], label: str, used: int,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    stars: list[str] = []
-
-    def refine(model: Any, frames: Any, opd: Any, **options: Any) -> Any:
-        stars.append(frames[0].target)
-        return SimpleNamespace(frames=[SimpleNamespace(observation=each) for each in frames])
-
-    def known(observation: Observation, references: Any = (), **options: Any) -> Any:
-        known_stars = library and options.get("library", True)
-        names = ["REF"] * bool(references) + ["OTHER"] * known_stars
-        flat = np.zeros(observation.shape)
-        made = Systematics(flat, flat + 0.1, (15.5, 15.5), 0.1, provenance={"stars": names})
-        return made if names else None
-
-    choosing = "pyklip_diffrender.pattern.choice"
-    monkeypatch.setattr(f"{choosing}.refine", refine)
-    monkeypatch.setattr(f"{choosing}.known_systematics", known)
-    zeros = np.zeros((32, 32))
-    mine = Systematics(zeros, zeros, (15.5, 15.5), 0.1, name="mine")
-    model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
-    read: list[str] = []
-
-    def references() -> list[Observation]:
-        read.append("references")
-        return [frame("REF"), frame("REF")]
-
-    def choose(**options: Any) -> PatternChoice:
-        # Two rolls, which would share a pattern of their own if nothing else were known.
-        science, request = [frame("TARGET")] * 2, mine if requested == "mine" else requested
-        return choose_systematics(science, references, model, OPD, systematics=request, **options)
-
-    chosen = choose()
-    assert stars == fitted
-    assert bool(read) == bool(fitted)
-    assert (chosen.label, chosen.reference_frames) == (label, used)
-    assert (chosen.systematics is None) == (label == "none")
-    if label != "none":
-        # The pattern's own error takes the place of most of the model's.
-        assert chosen.settings == GaussNewton.nircam(min_model_error=0.002)
-    assert "library" not in choose(library=False).label
-
-
-def test_a_library_of_another_flat_field_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The fit is repeated with what there is besides the library."""
-    patterns: list[str] = []
-    zeros = np.zeros((32, 32))
-
-    def chosen(*_: Any, library: bool = True, **options: Any) -> PatternChoice:
-        name = "library" if library else "the rolls themselves"
-        pattern = Systematics(zeros, zeros + 0.1, (15.5, 15.5), 0.1, name=name)
-        origin: Any = "library" if library else "rolls"
-        return PatternChoice((simulated,), pattern, settings.fit, origin=origin)
-
-    def lacks(fit: Refinement) -> bool:
-        assert fit.systematics is not None
-        patterns.append(fit.systematics.name)
-        return True
-
-    simulated = replace(frame("TARGET"), header=fits.Header())
-    model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
-    fit = GaussNewton(free=("flux", "background"), wavefront=False)
-    settings = DiffrenderSettings(model=model, fit=fit, max_chi2=np.inf)
-    monkeypatch.setattr("pyklip_diffrender.pattern.fit.choose_systematics", chosen)
-    monkeypatch.setattr("pyklip_diffrender.pattern.choice.lacks_pattern", lacks)
-    told: list[str] = []
-    with pytest.warns(DiffrenderWarning):  # The star is not one of this model.
-        result = subtract_by_refinement(simulated, OPD, settings, tell=told.append)
-    assert result.systematics == "the rolls themselves"
-    assert patterns == ["library"]
-    assert "the frames do not show the pattern of the library" in told
-
-
 def test_references_that_are_asked_for_must_be_there() -> None:
     model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
     settings = DiffrenderSettings(systematics="references")
     with pytest.raises(IncompatibleSetupError, match=r"psflib_filepaths after register\(\)"):
         subtract_by_refinement(frame("TARGET"), OPD, replace(settings, model=model))
-
-
-@pytest.mark.parametrize(("cards", "expected"), [({}, "off"), ({"INSTRUME": "NIRCAM"}, "auto")])
-def test_simulations_use_no_pattern_by_default(
-    cards: dict[str, str], expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    requests: list[str] = []
-
-    class Stop(Exception):
-        pass
-
-    def chosen(*_: Any, systematics: str, **options: Any) -> PatternChoice:
-        requests.append(systematics)
-        raise Stop
-
-    monkeypatch.setattr("pyklip_diffrender.pattern.fit.choose_systematics", chosen)
-    model = nircam_coronagraph("F444W", fov_pixels=32, npix=64, monochromatic=4.4e-6)
-    star = replace(frame("TARGET"), header=fits.Header(cards))
-    with pytest.raises(Stop):
-        subtract_by_refinement(star, OPD, DiffrenderSettings(model=model))
-    assert requests == [expected]
 
 
 # Which wavefront map is used
@@ -398,14 +335,8 @@ def test_a_map_needs_a_folder_and_the_frames_a_date(
 )
 def test_mistakes_are_found_before_the_fit(
     settings: dict[str, Any], call: dict[str, Any], message: str, files: list[str],
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:  # fmt: skip
-    def subtract(*args: Any, **kw: Any) -> None:
-        raise AssertionError("fitted for nothing")
-
-    monkeypatch.setattr(
-        "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
-    )
     unregister()
     register(opd=OPD, **settings)
     dataset = JWSTData(files[:2])

@@ -146,11 +146,10 @@ def test_products_and_refusals(tmp_path: Path) -> None:
     ]
 
 
-def test_non_negative_light_is_that_of_scipy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_THRESHOLD", 0.0)
+def test_non_negative_light_is_that_of_scipy() -> None:
     rng = np.random.default_rng(2)
     columns, data = rng.normal(size=(60, 20)), rng.normal(size=60)
-    solved = module._brightest(columns.T @ columns, columns.T @ data, np.zeros(20))
+    solved = module._brightest(columns.T @ columns, columns.T @ data, np.zeros(20), 0.0)
     expected = nnls(columns, data)[0]
     assert 3 < (expected > 0).sum() < 17
     np.testing.assert_allclose(solved, expected, atol=1e-4)

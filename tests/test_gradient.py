@@ -13,13 +13,12 @@ from torch import Tensor
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.refinement import GaussNewton
-from pyklip_diffrender.refinement import accurate_step as accurate
 from pyklip_diffrender.refinement.accurate_step import (
     ModelDerivatives,
     accurate_step,
     conjugate_gradients,
 )
-from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
+from pyklip_diffrender.refinement.normal_equations import linearise
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.solver import Solver
@@ -168,12 +167,8 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> No
     assert (products[0] - expected).norm() > 0.1 * expected.norm()
 
 
-def test_an_accurate_step_ends_where_that_of_the_model_does(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
     """In as many iterations as are needed, whatever the coarse copy that preconditions them."""
-    monkeypatch.setattr(accurate, "_ITERATIONS", 20)
-    monkeypatch.setattr(accurate, "_SUFFICIENT", 0.0)
     solver, state = solver_of(1)
     same = of_the_model_itself(solver)
     weights = solver.objective.errors(state, 0.01, 4.0)
@@ -189,7 +184,13 @@ def test_an_accurate_step_ends_where_that_of_the_model_does(
     steps = []
     for equations in (coarse, earlier):
         step, settled = accurate_step(
-            derivatives, equations.curvature, fine.current, deviation, enough=0.0
+            derivatives,
+            equations.curvature,
+            fine.current,
+            deviation,
+            enough=0.0,
+            iterations=20,
+            sufficient=0.0,
         )
         assert not settled  # Every iteration lowers it, if only by a little.
         steps.append(step)
@@ -202,11 +203,8 @@ def test_an_accurate_step_ends_where_that_of_the_model_does(
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 3])
-def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(
-    wrong: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(wrong: int) -> None:
     """Of that many directions the preconditioner says far too little; two more iterations end."""
-    monkeypatch.setattr(accurate, "_SUFFICIENT", 0.0)
     rng = np.random.default_rng(8)
     vectors = torch.from_numpy(np.linalg.qr(rng.normal(size=(20, 20)))[0])
     powers = torch.logspace(0, 6, 20, dtype=torch.float64)
@@ -220,7 +218,11 @@ def test_conjugate_gradients_need_an_iteration_for_each_wrong_direction(
 
     gradient = torch.from_numpy(rng.normal(size=20))
     x, settled = conjugate_gradients(
-        product, lambda x: vectors @ ((vectors.T @ x) / stated), gradient, enough=1e-8
+        product,
+        lambda x: vectors @ ((vectors.T @ x) / stated),
+        gradient,
+        enough=1e-8,
+        sufficient=0.0,
     )
     expected = vectors @ ((vectors.T @ gradient) / powers)
     assert settled
@@ -243,81 +245,69 @@ def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner(
     assert not x.any()
 
 
-def count_linearisations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """A list that grows with every set of normal equations; 1 for known Jacobians, else 0."""
-    calls: list[int] = []
-
-    def counted(*arguments: Any) -> NormalEquations:
-        calls.append(int(bool(arguments[5])))
-        return linearise(*arguments)
-
-    monkeypatch.setattr("pyklip_diffrender.refinement.solver.linearise", counted)
-    return calls
-
-
-def test_accurate_steps_keep_their_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_accurate_steps_keep_their_equations() -> None:
     """Until conjugate gradients need more iterations than there are, and until a companion."""
-    calls = count_linearisations(monkeypatch)
     solver, state = solver_of(1, relinearise=0.1, accurate_steps=True, robust=4.0)
     # Of the model itself: one iteration is enough with equations of nearly the same state.
     solver = of_the_model_itself(solver)
     weights = solver.objective.errors(state, 0.01, 4.0)
     before = solver._cost(state, weights)
+
+    def replaces(state: State, kappa: float) -> bool:
+        """Whether a step from a state makes new equations."""
+        equations = solver._equations
+        solver._accurate_step(state, kappa, len(BASIS))
+        return solver._equations is not equations
+
     after, _ = solver._accurate_step(state, 0.01, len(BASIS))
     assert solver._cost(after, weights) < 0.9 * before
-    solver._accurate_step(after, 0.01, len(BASIS))
-    assert calls == [0]
+    assert not replaces(after, 0.01)
     solver._has_poor_equations = True
-    solver._accurate_step(after, 0.01, len(BASIS))
-    assert calls == [0, 0]
+    assert replaces(after, 0.01)
     # Weights of a smaller model error are others, those of a little smaller one are not.
-    solver._accurate_step(after, 0.008, len(BASIS))
-    assert calls == [0, 0]
-    solver._accurate_step(after, 0.002, len(BASIS))
-    assert calls[:2] == [0, 0]
-    assert len(calls) == 3
+    assert not replaces(after, 0.008)
+    assert replaces(after, 0.002)
     grown = solver.objective.at(
         *after.unknowns.with_companions([dr.Planet(1e-4, 0.3, 20.0)], after.vector)
     )
-    solver._accurate_step(grown, 0.002, len(BASIS))
-    assert len(calls) == 4
+    assert replaces(grown, 0.002)
 
 
 def test_equations_that_lead_nowhere_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     solver, state = solver_of(1, relinearise=0.1, accurate_steps=True, robust=4.0)
     solver = of_the_model_itself(solver)
     after, _ = solver._accurate_step(state, 0.01, len(BASIS))
-    calls = count_linearisations(monkeypatch)
-    right = accurate_step
+    earlier, right = solver._equations, accurate_step
 
     def wrong(*arguments: Any, **options: Any) -> tuple[Tensor, bool]:
         step, settled = right(*arguments, **options)
-        return (step if calls else -step), settled
+        return (-step if solver._equations is earlier else step), settled
 
     monkeypatch.setattr("pyklip_diffrender.refinement.solver.accurate_step", wrong)
     last, gain = solver._accurate_step(after, 0.01, len(BASIS))
-    assert calls == [0]
     assert gain > 0
     assert last is not after
 
 
-def test_other_weights_need_no_new_jacobian(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_weights_need_no_new_jacobian() -> None:
     """Neither for the errors of all pixels nor where a pixel is left out; the model is the same."""
-    calls = count_linearisations(monkeypatch)
     models = []
-    for _ in range(2):
+    for goes_on in (True, False):
         solver, state = solver_of(2, relinearise=0.1, accurate_steps=True)
-        if not models:  # The second solver begins where the first one ends.
-            solver.linear_model(state, 0.01, len(BASIS), 4.0, final=False)
+        if goes_on:  # The second solver begins where the first one ends.
+            models = [
+                solver.linear_model(state, kappa, len(BASIS), robust, final=False)
+                for kappa, robust in ((0.01, 4.0), (0.0, math.inf))
+            ]
         mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
         mask[7, 9] = True
-        if not models:
-            solver.linear_model(state, 0.0, len(BASIS), math.inf, final=False)
         solver.leave_out([mask, ~mask & mask])
         models.append(solver.linear_model(state, 0.0, len(BASIS), math.inf, final=False))
-    assert calls == [0, 1, 1, 0]
-    torch.testing.assert_close(models[0].curvature, models[1].curvature, rtol=1e-6, atol=0.0)
-    assert models[0].frames[0].weight[7, 9] == 0
+    *same, new = ([frame.jacobian for frame in model.frames] for model in models)
+    assert all(each[k] is same[0][k] for each in same for k in range(2))
+    assert new[0] is not same[0][0]
+    torch.testing.assert_close(models[2].curvature, models[3].curvature, rtol=1e-6, atol=0.0)
+    assert models[2].frames[0].weight[7, 9] == 0
 
 
 def test_derivatives_by_a_frame_become_those_by_all_unknowns() -> None:

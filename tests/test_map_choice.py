@@ -16,13 +16,12 @@ from pyklip_diffrender.errors import (
     DiffrenderWarning,
     IncompatibleSetupError,
     MissingOPDError,
-    RefinementError,
 )
 from pyklip_diffrender.io import sensing_date
 from pyklip_diffrender.optics import resample
-from pyklip_diffrender.reduction import pipeline
+from pyklip_diffrender.reduction import ReduceOptions, prepare
 from pyklip_diffrender.scene import Observation, Sequence
-from pyklip_diffrender.wavefront import OPDMap, choose_map, random_opd, read_opd, wavefront_for
+from pyklip_diffrender.wavefront import choose_map, random_opd, read_opd, wavefront_for
 
 NPIX = 64
 
@@ -153,28 +152,21 @@ def test_a_folder_needs_the_date_of_the_frames(folder: Path) -> None:
         read_opd(folder)
 
 
-def test_reduce_takes_the_nearest_map_of_a_folder(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chosen: list[str] = []
-
-    def stop(model: None, frames: object, opd: OPDMap, **_: object) -> None:
-        chosen.append(opd.name)
-        raise RefinementError("that is all")
-
-    monkeypatch.setattr(pipeline, "model_for", lambda *_, **__: None)
-    monkeypatch.setattr(pipeline, "refine", stop)
+def test_a_reduction_takes_the_nearest_map_of_a_folder(folder: Path) -> None:
     frames = tuple(
         Observation.from_arrays(
-            np.ones((8, 8)), np.ones((8, 8)), pixelscale=0.06, date=Time(f"2022-08-{day}")
+            np.ones((8, 8)),
+            np.ones((8, 8)),
+            pixelscale=0.063,
+            filter="F444W",
+            date=Time(f"2022-08-{day}"),
         )
         for day in ("10", "18")
     )
     sequence = Sequence("star", frames)
     assert sequence.date == Time("2022-08-14")
-    with pytest.raises(RefinementError, match="that is all"):
-        pipeline.reduce(sequence, folder, size=8, systematics="off")
-    assert chosen == ["R2022081102-NRCA3_FP1-1.fits"]
+    prepared = prepare(sequence, folder, ReduceOptions(size=8))
+    assert prepared.wavefront.name == "R2022081102-NRCA3_FP1-1.fits"
 
 
 @pytest.mark.parametrize(

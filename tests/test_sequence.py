@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
@@ -22,8 +21,7 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.names import same_name
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.pattern import PatternChoice, learn_systematics
-from pyklip_diffrender.pattern import choice as pattern_choice
+from pyklip_diffrender.pattern import learn_systematics
 from pyklip_diffrender.reduction import reduce
 from pyklip_diffrender.refinement import GaussNewton, Refinement, refine
 from pyklip_diffrender.scene.objects import Planet, Scene, Star
@@ -340,127 +338,3 @@ def test_reduce_says_what_systematics_it_takes() -> None:
     sequence = Sequence("TARGET", (frame("TARGET", 20),))
     with pytest.raises(IncompatibleSetupError, match=r"'maybe', expected 'auto', 'references'"):
         reduce(sequence, opd(), size=SIZE, systematics="maybe")  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("systematics", "library", "shown", "fits"),
-    [
-        ("auto", True, True, ["TARGET"]),
-        ("auto", False, True, ["REF", "TARGET"]),
-        ("references", True, True, ["REF", "TARGET"]),
-        ("off", True, True, ["TARGET"]),
-        # The library is of another flat field.
-        ("auto", True, False, ["TARGET", "REF", "TARGET"]),
-        ("references", True, False, ["REF", "TARGET"]),
-    ],
-)
-def test_references_are_fitted_only_where_they_are_needed(
-    monkeypatch: pytest.MonkeyPatch, systematics: str, library: bool, shown: bool, fits: list[str]
-) -> None:
-    fitted, patterns, asked = [], [], []
-    known = learn_systematics(reference_fit())
-
-    def fit(model: object, frames: object, opd: object, **options: object) -> Refinement:
-        several = [frames] if isinstance(frames, Observation) else frames
-        (first, *_) = several  # type: ignore[misc]
-        fitted.append(first.target)
-        patterns.append(options.get("systematics"))
-        return reference_fit()
-
-    def from_library(
-        observation: Observation, references: object = (), **options: object
-    ) -> Systematics | None:
-        asked.append(options.get("library", True))
-        return known if library or references else None
-
-    choosing = "pyklip_diffrender.pattern.choice"
-    for module in ("pyklip_diffrender.reduction.pipeline", choosing):
-        monkeypatch.setattr(f"{module}.refine", fit)
-    monkeypatch.setattr(f"{choosing}.known_systematics", from_library)
-    monkeypatch.setattr(f"{choosing}.lacks_pattern", lambda fit: not shown)
-    monkeypatch.setattr("pyklip_diffrender.reduction.pipeline.detect", lambda fit, **options: None)
-    there = replace(frame("TARGET", 20), first_pixel=(0, 0))
-    sequence = Sequence("TARGET", (there,), (frame("REF", 10), frame("REF", 11)))
-    result = reduce(sequence, opd(), size=SIZE, systematics=systematics)  # type: ignore[arg-type]
-    assert fitted == fits
-    assert patterns[-1] is (None if systematics == "off" else known)
-    assert result.systematics is patterns[-1]
-    assert len(result.references) == fits.count("REF")
-    assert (False in asked) is (len(fits) == 3)
-
-
-def test_rolls_share_an_unknown_pattern_where_nothing_is_known(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(pattern_choice, "known_systematics", lambda *_: None)
-    header = fits.Header({"INSTRUME": "NIRCAM"})
-    roll = Observation.from_arrays(
-        np.ones((12, 12)),
-        np.ones((12, 12)),
-        unit=u.MJy / u.sr,
-        pixelscale=0.063,
-        filter="F335M",
-        first_pixel=(600, 1600),
-        header=header,
-    )
-
-    def chosen(*rolls: Observation, request: str = "auto", **options: float) -> PatternChoice:
-        system, opd = cast(OpticalSystem, None), cast(OPDMap, None)
-        return pattern_choice.choose_systematics(
-            rolls, [], system, opd, systematics=request, **options
-        )
-
-    pattern = chosen(roll, roll).systematics
-    assert pattern is not None
-    assert pattern.name == "the rolls themselves"
-    values, errors = pattern.at(roll)
-    assert (values == 0).all()
-    assert (errors == 0.03).all()
-    assert pattern.pedestal == 1.9
-    preset = GaussNewton.nircam(roll.filter, min_model_error=0.002)
-    assert chosen(roll, roll).settings == preset
-    assert chosen(roll, roll, memory=2e9).settings == replace(preset, memory=2e9)
-    assert chosen(roll, replace(roll, unit=u.DN / u.s)).systematics is not None
-    # One roll, different pixels, pixels that are not known, other instruments, and "off".
-    elsewhere = replace(roll, first_pixel=(601, 1600))
-    lost, simulated = replace(roll, first_pixel=None), replace(roll, header=fits.Header())
-    for rolls in ((roll,), (roll, elsewhere), (lost, lost), (simulated, simulated)):
-        assert chosen(*rolls).systematics is None
-    assert chosen(roll, roll, request="off").systematics is None
-
-
-def test_a_rough_fit_tells_which_pixels_a_frame_shows(monkeypatch: pytest.MonkeyPatch) -> None:
-    fitted, places = [], []
-    known = learn_systematics(reference_fit())
-
-    def rough_fit(*_: object, settings: GaussNewton, **options: object) -> Refinement:
-        fitted.append(settings)
-        return reference_fit()
-
-    def place(fit: Refinement, pattern: Systematics) -> Observation | None:
-        places.append(pattern)
-        return replace(lost, first_pixel=(3, 4)) if len(places) < 3 else None
-
-    monkeypatch.setattr(pattern_choice, "refine", rough_fit)
-    monkeypatch.setattr(pattern_choice, "place_on_detector", place)
-    monkeypatch.setattr(pattern_choice, "known_systematics", lambda *_: known)
-    lost = frame("TARGET", 20)
-    assert lost.first_pixel is None
-    own = GaussNewton(cycles=6.0, min_model_error=0.001)
-    for settings in (own, None):
-        choice = pattern_choice.choose_systematics(
-            [lost], [], cast(OpticalSystem, None), cast(OPDMap, None), settings=settings
-        )
-        assert choice.systematics is known
-        assert [each.first_pixel for each in choice.science] == [(3, 4)]
-        assert choice.settings is settings
-    # The fit ends while the pattern, 5 % of the star, dominates what it leaves.
-    assert [each.cycles for each in fitted] == [own.cycles, GaussNewton().cycles]
-    assert [each.min_model_error for each in fitted] == [0.05, 0.05]
-    assert all(each.tolerance > 10 * GaussNewton().tolerance for each in fitted)
-    # Without a place there is no pattern.
-    choice = pattern_choice.choose_systematics(
-        [lost], [], cast(OpticalSystem, None), cast(OPDMap, None)
-    )
-    assert choice.systematics is None
-    assert choice.science == (lost,)

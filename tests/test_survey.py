@@ -7,9 +7,11 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import CancelledError
 from dataclasses import replace
 from datetime import date
+from functools import partial
 from html.parser import HTMLParser
 from math import inf
 from pathlib import Path
@@ -38,6 +40,7 @@ from pyklip_diffrender.surveys import execution, folders, page, runs, work
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.driver import run_survey, survey
 from pyklip_diffrender.surveys.jobs import Injection, Job, jobs_of
+from pyklip_diffrender.surveys.runs import Work
 from pyklip_diffrender.surveys.tables import COLUMNS, table_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -596,25 +599,18 @@ def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_table_that_cannot_be_written_stops_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("pyklip_diffrender.surveys.driver.write_tables", full)
     config, output = inputs(tmp_path / "data"), tmp_path / "out"
-    with pytest.raises(IncompatibleSetupError, match="No space left on device"):
+    (output / "results.ecsv").mkdir(parents=True)
+    with pytest.raises(IncompatibleSetupError, match="Is a directory"):
         run_survey(config, output, stub)
-    assert "No space left" in caplog.text
-    monkeypatch.undo()
+    assert "Is a directory" in caplog.text
+    (output / "results.ecsv").rmdir()
     assert list(run_survey(config, output, pytest.fail)["status"]) == ["finished"] * 3
 
 
-def test_a_job_that_another_disk_has_is_a_failure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(execution, "_PATIENCE", 1)
-    monkeypatch.setattr(execution.time, "sleep", lambda _: None)
+def test_a_job_that_another_disk_has_is_a_failure(tmp_path: Path) -> None:
     (job,) = planned(inputs(tmp_path / "data", 1))
     jobs = folders.prepare(tmp_path / "out")
 
@@ -622,7 +618,7 @@ def test_a_job_that_another_disk_has_is_a_failure(
         def result(self) -> dict[str, Any]:
             return {"status": "finished", "host": "node7"}
 
-    record = execution._record_of(Future(), job, jobs)
+    record = execution._record_of(Future(), job, jobs, patience=0)
     assert record["status"] == "failed"
     assert "node7 wrote its products to another disk" in record["message"]
 
@@ -641,10 +637,16 @@ def test_a_result_that_dies_with_its_worker_is_read_from_the_disk(tmp_path: Path
     assert execution._record_of(Future(), job, jobs) == record
 
 
+@pytest.fixture
+def do(monkeypatch: pytest.MonkeyPatch) -> Callable[[Work], None]:
+    """Give the command other work than reductions."""
+    return partial(monkeypatch.setattr, "pyklip_diffrender.surveys.work.reduce_job")
+
+
 @pytest.mark.parametrize("broken", [False, True])
 def test_the_command_says_what_came_of_it(
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    do: Callable[[Work], None],
     capsys: pytest.CaptureFixture[str],
     broken: bool,
 ) -> None:
@@ -653,7 +655,7 @@ def test_the_command_says_what_came_of_it(
             raise ValueError("no such star")
         return stub(job, folder)
 
-    monkeypatch.setattr("pyklip_diffrender.surveys.work.reduce_job", work)
+    do(work)
     path = configuration(tmp_path / "survey.toml", inputs(tmp_path / "data", 2))
     with path.open("a") as file:
         file.write("\ninjections = { contrasts = [1e-5], separations = [0.5] }")
@@ -669,14 +671,14 @@ def test_the_command_says_what_came_of_it(
 
 
 def test_an_interrupted_command_says_that_it_can_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, do: Callable[[Work], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     def work(job: Job, folder: Path) -> dict[str, Any]:
         if job.name.startswith("star1"):
             raise KeyboardInterrupt
         return stub(job, folder)
 
-    monkeypatch.setattr("pyklip_diffrender.surveys.work.reduce_job", work)
+    do(work)
     path = configuration(tmp_path / "survey.toml", inputs(tmp_path / "data"))
     output = tmp_path / "out"
     assert main(["survey", str(path), "-o", str(output), "-q"]) == 130
@@ -686,7 +688,7 @@ def test_an_interrupted_command_says_that_it_can_go_on(
 
 
 def test_jobs_aim_at_less_than_the_memory_of_their_worker(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, do: Callable[[Work], None]
 ) -> None:
     limits = []
 
@@ -694,7 +696,7 @@ def test_jobs_aim_at_less_than_the_memory_of_their_worker(
         limits.append(memory)
         return stub(job, folder)
 
-    monkeypatch.setattr("pyklip_diffrender.surveys.work.reduce_job", work)
+    do(work)
     config = inputs(tmp_path / "data", 1)
     survey({**config, "memory_limit": "4 GB"}, tmp_path / "limited")
     survey(config, tmp_path / "free")
@@ -749,57 +751,40 @@ def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for() -> None:
         assert light[core].sum() == pytest.approx((expected - star.data[0])[core].sum(), rel=0.1)
 
 
-def test_a_disk_and_the_whole_frames_are_part_of_the_job(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[ReduceOptions] = []
+def test_a_disk_and_the_whole_frames_are_part_of_the_job(tmp_path: Path) -> None:
+    config = inputs(tmp_path, 1)
+    # Other fields than those asked for are those of the preset in the filter of the frames.
+    settings = GaussNewton.nircam("F356W", max_iterations=7)
+    for name in ("wide", "disk"):
+        options = {name: True, "star_flux": 0.4, "settings": {"max_iterations": 7}}
+        (job,) = planned({**config, "options": options})
+        expected = ReduceOptions(size=40, star_flux=0.4, settings=settings, **{name: True})
+        assert work._options(job, "F356W") == expected
+        assert work._options(job, "F356W", wide=False).wide is False
 
-    def prepare(sequence: Any, opd: str, options: ReduceOptions) -> Any:
-        asked.append(options)
-        return SimpleNamespace(run=lambda: "a reduction")
 
+def test_the_result_of_a_job_is_that_of_the_largest_field() -> None:
     wide_field = {"candidates": [{"snr": 7.0}], "contrast_curve": {k: [] for k in CURVE}}
     summary = {
         **result(), "status": {"name": "CONVERGED"}, "fit": {"reduced_chi2": 1, "error_factor": 1},
         "contrast_curve": {k: [1.0] for k in CURVE}, "frames": [], "wide_field": wide_field,
     }  # fmt: skip
-    written: list[tuple[str, bool]] = []
-    monkeypatch.setattr(work, "prepare", prepare)
-    frames = SimpleNamespace(science=(SimpleNamespace(filter="F356W"),))
-    monkeypatch.setattr(work.Sequence, "from_files", lambda *_, **__: frames)
-    monkeypatch.setattr(work, "summarise", lambda _: summary)
-    monkeypatch.setattr(work, "write_products", lambda what, _, fit: written.append((what, fit)))
-    config = inputs(tmp_path, 1)
-    for name in ("wide", "disk"):
-        options = {name: True, "star_flux": 0.4, "settings": {"max_iterations": 7}}
-        (job,) = planned({**config, "options": options})
-        record = work.reduce_job(job, tmp_path)
-        assert [each["false_alarm_probability"] for each in record["candidates"]] == [None]
-        assert record["curve"] == wide_field["contrast_curve"]
-    # Other fields than those asked for are those of the preset in the filter of the frames.
-    settings = GaussNewton.nircam("F356W", max_iterations=7)
-    common: dict[str, Any] = {"size": 40, "star_flux": 0.4, "settings": settings}
-    assert asked == [ReduceOptions(wide=True, **common), ReduceOptions(disk=True, **common)]
-    assert written == [("a reduction", True)] * 2
+    record = work._result(summary)
+    assert [each["false_alarm_probability"] for each in record["candidates"]] == [None]
+    assert record["curve"] == wide_field["contrast_curve"]
+    record = work._result({**summary, "wide_field": None})
+    assert record["curve"] == summary["contrast_curve"]
+    assert [each["snr"] for each in record["candidates"]] == [30.0]
 
 
-def test_a_planet_is_injected_into_the_frames_with_their_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_planet_is_injected_into_the_frames_with_their_disk() -> None:
     ones = np.ones((30, 30))
-    whole = dr.Observation.from_arrays(3 * ones, ones, pixelscale=0.063)
-    cut = whole.cutout(8)
+    cut = dr.Observation.from_arrays(3 * ones, ones, pixelscale=0.063).cutout(8)
     frame = FrameFit(
         cast(Any, None), replace(cut, data=cut.data - 2), {}, ones, ones, ones, {}, {}, ones
     )
-    sequence = dr.Sequence("HD 1", (whole,))
-    monkeypatch.setattr(work.Sequence, "from_files", lambda *_, **__: sequence)
-    config = inputs(tmp_path, 1)
-    config["sequence"][0]["size"] = 8
-    for disk, value in ((False, 1.0), (True, 3.0)):
-        (job,) = planned({**config, "options": {"disk": disk}})
-        (with_disk,) = work._with_disk([frame], job)
-        assert (with_disk.observation.data == value).all()
+    (with_disk,) = work._with_disk([frame], [cut])
+    assert (with_disk.observation.data == 3).all()
 
 
 def test_what_is_recovered_is_the_candidate_at_the_place() -> None:

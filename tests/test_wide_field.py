@@ -94,12 +94,12 @@ def test_planets_are_measured_wherever_they_are(wide: WideField) -> None:
 
 @pytest.mark.slow
 def test_contrasts_outside_have_the_error_of_the_stars_flux_as_well(
-    wide: WideField,
-    searched: tuple[Detection, list[dr.Observation]],
-    monkeypatch: pytest.MonkeyPatch,
+    wide: WideField, searched: tuple[Detection, list[dr.Observation]]
 ) -> None:
-    monkeypatch.setattr(wide_search, "star_flux_error", lambda fit: 0.1)
-    again = wide_field(*searched).table
+    detection, frames = searched
+    (fit,) = detection.fits
+    uncertain = replace(fit, settings=replace(fit.settings, star_flux_error=0.1))
+    again = wide_field(replace(detection, fits=(uncertain,)), frames).table
     outside = np.isfinite(again["fit_chi2"])
     assert outside.any()
     added = again["contrast_error"] ** 2 - wide.table["contrast_error"] ** 2

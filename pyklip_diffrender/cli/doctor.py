@@ -6,12 +6,12 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import import_module, resources
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import click
 
@@ -51,10 +51,10 @@ class Check:
     text: str
 
 
-def check_libraries() -> Iterator[Check]:
+def check_libraries(names: Iterable[str] = _LIBRARIES) -> Iterator[Check]:
     """Import every library that the package needs."""
     yield Check("ok", f"pyklip-diffrender {__version__}, Python {platform.python_version()}")
-    for name in _LIBRARIES:
+    for name in names:
         try:
             import_module(name)
             yield Check("ok", f"{name} {version(name.replace('_', '-'))}")
@@ -68,14 +68,14 @@ def check_libraries() -> Iterator[Check]:
             )
 
 
-def check_data() -> Iterator[Check]:
+def check_data(tables: Collection[str] = _TABLES) -> Iterator[Check]:
     """Read the files that come with the package."""
     from pyklip_diffrender.io.files import embedded_table
     from pyklip_diffrender.pattern.library import read_patterns
 
     library = resources.files("pyklip_diffrender.pattern") / "data" / "patterns.fits.gz"
     try:
-        rows = sum(len(embedded_table(name)) for name in _TABLES)
+        rows = sum(len(embedded_table(name)) for name in tables)
         with resources.as_file(library) as path:
             patterns = len(read_patterns(path))
     except (DiffrenderError, OSError, ValueError) as error:
@@ -83,7 +83,7 @@ def check_data() -> Iterator[Check]:
     else:
         yield Check(
             "ok",
-            f"data files: {rows} rows in {len(_TABLES)} tables of the instrument, {patterns} "
+            f"data files: {rows} rows in {len(tables)} tables of the instrument, {patterns} "
             "patterns of the flat field",
         )
 
@@ -120,27 +120,37 @@ def check_machine() -> Iterator[Check]:
         for k in range(torch.cuda.device_count()):
             memory = torch.cuda.get_device_properties(k).total_memory / 1e9
             yield Check("ok", f"cuda:{k}: {torch.cuda.get_device_name(k)}, {memory:.0f} GB")
-    free = free_memory()
+    yield memory_check(free_memory())
+    yield disk_check(shutil.disk_usage(Path.cwd()).free)
+
+
+def memory_check(free: float | None) -> Check:
+    """Judge so many bytes of free memory."""
     if free is None:
-        yield Check("note", "the system does not say how much memory is free")
-    elif free < _NEEDED:
-        yield Check(
-            "FAIL", f"{free / 1e9:.1f} GB of memory are free; the demo and a reduction need 2 GB"
-        )
-    else:
-        yield Check("ok", f"{free / 1e9:.1f} GB of memory are free")
-    disk = shutil.disk_usage(Path.cwd()).free
-    text = f"{disk / 1e9:.1f} GB are free on the disk of this folder"
-    if disk < _PRODUCTS:
-        yield Check("FAIL", f"{text}; the products of a reduction need up to 0.5 GB")
-    else:
-        yield Check("ok", text)
+        return Check("note", "the system does not say how much memory is free")
+    text = f"{free / 1e9:.1f} GB of memory are free"
+    if free < _NEEDED:
+        return Check("FAIL", f"{text}; the demo and a reduction need 2 GB")
+    return Check("ok", text)
 
 
-def check_fit() -> Iterator[Check]:
+def disk_check(free: float) -> Check:
+    """Judge so many free bytes on the disk."""
+    text = f"{free / 1e9:.1f} GB are free on the disk of this folder"
+    if free < _PRODUCTS:
+        return Check("FAIL", f"{text}; the products of a reduction need up to 0.5 GB")
+    return Check("ok", text)
+
+
+def check_fit(**settings: Any) -> Iterator[Check]:
     """Simulate a telescope whose segments have moved, and refine its wavefront.
 
     The mirror is coarsely sampled and nothing but its segments moves, so that seconds suffice.
+
+    Parameters
+    ----------
+    **settings
+        Of `GaussNewton`, besides the basis.
     """
     import numpy as np
     import torch
@@ -159,7 +169,7 @@ def check_fit() -> Iterator[Check]:
     motions = 1e-8 * np.random.default_rng(2).normal(size=len(basis))
     truth = measured + basis.opd(torch.from_numpy(motions), PupilGrid.full(model.npix)).numpy()
     frame = simulate(model, Scene(), truth, seed=1)
-    fit = refine(model, frame, measured, settings=GaussNewton(basis=basis))
+    fit = refine(model, frame, measured, settings=GaussNewton(basis=basis, **settings))
     lit = model.entrance.lit.numpy()
     before, after = (1e9 * float(np.std((opd - truth)[lit])) for opd in (measured, fit.wavefront))
     text = (

@@ -363,14 +363,14 @@ def _positions(grid: Image, inner: float) -> tuple[NDArray[np.int64], NDArray[np
     return rows[outside], columns[outside]
 
 
-def _brightest(matrix: Image, vector: Image, start: Image) -> Image:
+def _brightest(matrix: Image, vector: Image, start: Image, threshold: float = _THRESHOLD) -> Image:
     """The non-negative light that minimises the sum at the top of this module, (k,)."""
     scale = np.sqrt(matrix.diagonal().clip(min=1e-300))
     curvature, gradient = matrix / scale[:, None] / scale, vector / scale
 
     def target(light: Image) -> tuple[float, Image]:
-        slope = curvature @ light - gradient + _THRESHOLD
-        return float(light @ (slope + _THRESHOLD - gradient) / 2), slope
+        slope = curvature @ light - gradient + threshold
+        return float(light @ (slope + threshold - gradient) / 2), slope
 
     solved = minimize(target, start * scale, jac=True, method="L-BFGS-B",
                       bounds=[(0, None)] * len(scale), options={"maxiter": 2000})  # fmt: skip

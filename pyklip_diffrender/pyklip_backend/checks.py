@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,7 @@ import numpy as np
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
 from pyklip_diffrender.pyklip_backend.frames import require_frames
 from pyklip_diffrender.pyklip_backend.images import IMAGES
-from pyklip_diffrender.pyklip_backend.references import require_same_setup
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
-from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE as SOURCE
 
 __all__ = ["check_arguments", "check_dataset", "check_settings"]
 
@@ -31,16 +28,8 @@ def check_dataset(dataset: Any) -> None:
         )
 
 
-def check_arguments(arguments: Mapping[str, Any], references: tuple[Path, ...]) -> None:
-    """Raise for arguments of `klip_dataset` that do not go together.
-
-    Parameters
-    ----------
-    arguments : mapping
-        All arguments of the call.
-    references : tuple of Path
-        Files of the reference frames that the call gives.
-    """
+def check_arguments(arguments: Mapping[str, Any]) -> None:
+    """Raise for arguments of `klip_dataset` that do not go together."""
     dataset, mode = arguments["dataset"], str(arguments["mode"])
     if not any(part in mode.upper() for part in ("ADI", "RDI", "SDI")):
         raise IncompatibleSetupError(
@@ -67,9 +56,6 @@ def check_arguments(arguments: Mapping[str, Any], references: tuple[Path, ...]) 
                 f"calibrate_flux: a {type(dataset).__name__} has no flux calibration of its own. "
                 "Pass calibrate_flux=False; the products have the unit of the frames"
             )
-    source = getattr(dataset, SOURCE, None)
-    if source is not None:
-        require_same_setup({h.get("FILTER"): h for h in source.headers}.values(), references)
 
 
 def check_settings(settings: DiffrenderSettings) -> None:

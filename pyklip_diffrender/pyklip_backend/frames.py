@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import logging
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,14 +25,13 @@ from pyklip_diffrender.errors import (
     ShapeError,
 )
 from pyklip_diffrender.instrument.masks import FILTERS, detector_place
-from pyklip_diffrender.io.headers import header_date
 from pyklip_diffrender.io.units import native_float64
+from pyklip_diffrender.pyklip_backend.admitted import admit
 from pyklip_diffrender.pyklip_backend.pointings import (
     FrameDetails,
     Pointing,
     part_of,
     pointings_of,
-    reference_frames,
 )
 from pyklip_diffrender.pyklip_backend.recorded import NotRecordedError, recorded_frames
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, settings_of
@@ -40,6 +41,7 @@ from pyklip_diffrender.pyklip_backend.source import (
     attach_source,
     why_without_source,
 )
+from pyklip_diffrender.scene.exposure import beginning
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["Frames", "date_of_frames", "frames_of", "observation_from_dataset", "require_frames"]
@@ -66,7 +68,7 @@ class Frames:
     pointings : tuple of Pointing
         The same frames, sorted by where they show the star.
     references : tuple of Observation
-        Frames of reference stars in the dataset, by pointing.
+        Frames of reference stars in the dataset and the library, by pointing.
     factor : ndarray, (m,)
         By which the frames of ``dataset.input`` were multiplied since they were read; `data` and
         `observation` have the unit of the files.
@@ -146,7 +148,7 @@ def date_of_frames(dataset: Any) -> Time | None:
     if source is None:
         return None
     dates = [
-        header_date(header, ("DATE-BEG", "DATE-OBS"), name)
+        beginning(header, name)
         for header, name in zip(source.headers, source.filenames, strict=True)
     ]
     known = [date for date in dates if date is not None]
@@ -160,9 +162,16 @@ def require_frames(dataset: Any) -> None:
 
 
 def frames_of(
-    dataset: Any, index: NDArray[np.intp], imgs: NDArray[Any], settings: DiffrenderSettings
+    dataset: Any,
+    index: NDArray[np.intp],
+    imgs: NDArray[Any],
+    settings: DiffrenderSettings,
+    library: Sequence[Path] = (),
 ) -> Frames:
     """Gather the target's frames of one wavelength with their errors, masks and metadata.
+
+    Frames from files are judged by header and pixels, see `admit`; those that are not used stay NaN
+    in the products.
 
     Parameters
     ----------
@@ -174,11 +183,20 @@ def frames_of(
         The frames, as in ``dataset.input`` before any high-pass filter.
     settings : DiffrenderSettings
         Its `error`, `unit`, `pixelscale` and `filter` replace those of the dataset.
+    library : sequence of Path
+        Files of reference stars.
 
     Raises
     ------
     NoValidPixelsError
         If no frame has a valid pixel.
+    IncompatibleSetupError
+        If the files cannot be reduced together.
+
+    Warns
+    -----
+    DiffrenderWarning
+        For every file that is not used, or not entirely, with the reason.
     """
     every = _gather(dataset, index, imgs, settings)
     observation, chosen = every.observation, index[every.usable]
@@ -196,33 +214,24 @@ def frames_of(
         )
         for i in places[chosen]
     ]
-    others = reference_frames([each.header for each in details])
-    if not others.any():
-        return replace(every, pointings=tuple(pointings_of(observation, details)))
-    warnings.warn(
-        f"{int(others.sum())} of {len(others)} frames of the dataset show a reference star (IS_PSF "
-        "or TARGPROP in their headers) and stay NaN in the products. Give them to JWSTData as "
-        "psflib_filepaths",
-        DiffrenderWarning,
-        stacklevel=2,
-    )
-    usable = every.usable.copy()
-    usable[np.flatnonzero(usable)[others]] = False
-    target, rest = (
-        pointings_of(
-            part_of(observation, which), [d for d, w in zip(details, which, strict=True) if w]
+    target, references = admit(source, places[chosen], library)
+    if not target.any():
+        raise NoValidPixelsError(
+            f"{observation.name}: none of these frames can be used; the warnings say why"
         )
-        for which in (~others, others)
-    )
-    return Frames(
-        part_of(observation, ~others),
-        every.data[~others],
-        usable,
-        every.pixels,
-        every.noise,
-        tuple(target),
-        tuple(replace(each.observation, reference=True) for each in rest),
-        every.factor[~others],
+    usable = every.usable.copy()
+    usable[np.flatnonzero(usable)[~target]] = False
+    used = part_of(observation, target)
+    return replace(
+        every,
+        observation=used,
+        data=every.data[target],
+        usable=usable,
+        pointings=tuple(
+            pointings_of(used, [d for d, yes in zip(details, target, strict=True) if yes])
+        ),
+        references=references,
+        factor=every.factor[target],
     )
 
 
@@ -286,7 +295,7 @@ def _gather(
         pixelscale=pixelscale,
         center=centers[usable],
         filter=passband,
-        date=header_date(header, ("DATE-BEG", "DATE-OBS"), name),
+        date=beginning(header, name),
         position_angles=native_float64(dataset.PAs)[index][usable],
         name=name,
         header=header,

@@ -11,16 +11,14 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from pyklip_diffrender.io.headers import header_date
+from pyklip_diffrender.scene.exposure import beginning
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
     "FrameDetails",
     "Pointing",
-    "may_be_one_star",
     "part_of",
     "pointings_of",
-    "reference_frames",
 ]
 
 _SAME_PLACE = 0.05
@@ -54,27 +52,6 @@ class Pointing:
 
     frames: NDArray[np.intp]
     observation: Observation
-
-
-def reference_frames(headers: Sequence[fits.Header]) -> NDArray[np.bool_]:
-    """Which frames show a reference star: marked IS_PSF, or of another star (TARGPROP).
-
-    The target is the star of the first frame that is not marked. If all are marked, they are the
-    target: somebody reduces a reference star.
-    """
-    marked = np.array([bool(header.get("IS_PSF", False)) for header in headers])
-    target = headers[int(np.argmin(marked))]
-    others = np.array([not may_be_one_star(header, target) for header in headers])
-    return others if marked.all() else marked | others
-
-
-def may_be_one_star(header: fits.Header, other: fits.Header) -> bool:
-    """Whether two headers name the same star, or one of them none."""
-    one, two = (
-        "".join(c for c in str(each.get("TARGPROP", "")).upper() if c.isalnum())
-        for each in (header, other)
-    )
-    return one == two or not (one and two)
 
 
 def part_of(observation: Observation, which: NDArray[np.intp] | NDArray[np.bool_]) -> Observation:
@@ -130,7 +107,7 @@ def pointings_of(
                 part,
                 name=first.name if len(group) == 1 else f"{first.name} and {len(group) - 1} more",
                 header=first.header,
-                date=header_date(first.header, ("DATE-BEG", "DATE-OBS"), first.name),
+                date=beginning(first.header, first.name),
                 first_pixel=first.first_pixel,
                 star_offset=first.star_offset,
             )

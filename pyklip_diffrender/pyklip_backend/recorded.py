@@ -77,7 +77,8 @@ def recorded_frames(
         masked = np.isnan(imgs[i]) & np.isfinite(before[i])
         added = np.where(np.isfinite(change[i]), change[i], 0.0)
         # A changed factor is known to the rounding of single precision.
-        if np.abs(added).max() > _ROUNDING * np.nanmax(np.abs(before[i])):
+        peak = np.max(np.abs(before[i]), where=np.isfinite(before[i]), initial=0.0)
+        if np.abs(added).max() > _ROUNDING * peak:
             # Nothing is known beyond the edge of the shifted frame; assume nothing was added.
             data[i] += np.nan_to_num(align_and_scale(added, **shift))
         if masked.any():
@@ -94,9 +95,11 @@ def _factor(now: NDArray[np.float64], before: NDArray[np.float64]) -> float:
     NotRecordedError
         If it is not positive.
     """
+    known = np.isfinite(before) & np.isfinite(now)
+    if not known.any():
+        return 1.0
     with np.errstate(invalid="ignore"):
-        bright = np.abs(before) > np.nanpercentile(np.abs(before), 90)
-    bright &= np.isfinite(now)
+        bright = known & (np.abs(before) > np.percentile(np.abs(before[known]), 90))
     if not bright.any():
         return 1.0
     ratios = now[bright] / before[bright]

@@ -11,6 +11,7 @@ import dataclasses
 import io
 import logging
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,14 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from pyklip_diffrender.errors import IncompatibleSetupError, RefinementError, ShapeError
+from pyklip_diffrender.errors import (
+    DiffrenderWarning,
+    IncompatibleSetupError,
+    RefinementError,
+    ShapeError,
+)
 from pyklip_diffrender.io.headers import fits_text
+from pyklip_diffrender.pyklip_backend.admitted import library_files
 from pyklip_diffrender.pyklip_backend.checks import (
     check_arguments,
     check_dataset,
@@ -44,17 +51,12 @@ from pyklip_diffrender.pyklip_backend.products import (
     staging,
     stamp,
 )
-from pyklip_diffrender.pyklip_backend.references import (
-    References,
-    files_of_setup,
-    library_files,
-)
 from pyklip_diffrender.pyklip_backend.settings import (
     DiffrenderSettings,
     starting_opd,
     thread_limit,
 )
-from pyklip_diffrender.pyklip_backend.source import attach_source
+from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE, attach_source
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction, subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.throughput import (
     on_product,
@@ -145,7 +147,7 @@ class DatasetReduction:
         """Raise for input that cannot work, before anything is changed."""
         dataset = self.dataset
         check_dataset(dataset)
-        check_arguments(self.arguments, self._reference_files())
+        check_arguments(self.arguments)
         check_settings(self.settings)
         for wave in np.unique(dataset.wvs):
             self._settings_at(wave)
@@ -247,10 +249,21 @@ class DatasetReduction:
         )
         unfiltered = imgs if self._unfiltered is None else self._unfiltered[index]
         placed = np.full(imgs.shape, np.nan)
+        library = self._reference_files()
+        if self._rdi and not library and hasattr(self.dataset, ATTRIBUTE):
+            warnings.warn(
+                "the frames of psf_library are not used, because their files are not known: make "
+                "the JWSTData that reads them after register()",
+                DiffrenderWarning,
+                stacklevel=2,
+            )
+        gathered = []
+        # All files are judged before the first fit.
         for wave in np.unique(wvs):
-            of_wave = np.flatnonzero(wvs == wave)
-            settings = self._settings_at(wave)
-            frames = frames_of(self.dataset, index[of_wave], unfiltered[of_wave], settings)
+            of_wave, settings = np.flatnonzero(wvs == wave), self._settings_at(wave)
+            frames = frames_of(self.dataset, index[of_wave], unfiltered[of_wave], settings, library)
+            gathered.append((of_wave, frames, settings))
+        for of_wave, frames, settings in gathered:
             residuals = self._subtract(frames, opd, settings)
             for i, residual, old_center in zip(
                 of_wave[frames.usable], residuals, frames.observation.center, strict=True
@@ -345,17 +358,12 @@ class DatasetReduction:
         elif settings.subtractor is not None:
             subtraction = settings.subtractor(observation, opd, settings)
         else:
-            files = self._reference_files()
-            if self._rdi and not files:
-                self._tell("psf_library is not used: no JWSTData read its files after register()")
-            files = files_of_setup(observation.header, files)
-            references = References(files, frames.references)
             subtraction = subtract_by_refinement(
                 observation,
                 opd,
                 settings,
                 pointings=frames.pointings,
-                references=references if self._rdi else None,
+                references=frames.references if self._rdi else (),
                 tell=self._tell,
             )
         if subtraction.star.shape != frames.data.shape:

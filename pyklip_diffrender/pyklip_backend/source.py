@@ -85,6 +85,8 @@ class SourceFrames:
         Detector column and row of the first pixel of every frame, where known.
     star_offsets : list of (float, float) or None
         x, y of the star from the occulter as the file says, arcsec, where it does.
+    paths : list of Path
+        The file of every frame.
     """
 
     headers: list[fits.Header]
@@ -97,6 +99,7 @@ class SourceFrames:
     filenames: tuple[str, ...]
     first_pixels: list[tuple[int, int] | None]
     star_offsets: list[tuple[float, float] | None]
+    paths: list[Path]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> SourceFrames:
         """Itself: it never changes, so copies of a dataset can share it."""
@@ -244,6 +247,7 @@ def read_source(
         filenames=names,
         first_pixels=[f.first_pixel for f, n in zip(files, counts, strict=True) for _ in range(n)],
         star_offsets=[f.star_offset for f, n in zip(files, counts, strict=True) for _ in range(n)],
+        paths=[Path(p).absolute() for p, n in zip(paths, counts, strict=True) for _ in range(n)],
     )
     if not late:
         same_shape = source.data.shape == aligned.shape

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 from pyklip_diffrender.pyklip_backend.pointings import Pointing, pointings_of
-from pyklip_diffrender.pyklip_backend.references import References
 from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.verdict import (
     require_plausible,
@@ -134,7 +133,7 @@ def subtract_by_refinement(
     settings: DiffrenderSettings,
     *,
     pointings: Sequence[Pointing] | None = None,
-    references: References | None = None,
+    references: Sequence[Observation] = (),
     tell: Callable[[str], None] = logger.info,
 ) -> Subtraction:
     """Refine the wavefront until the rendered star matches the frames (the default).
@@ -149,7 +148,7 @@ def subtract_by_refinement(
         See `Subtractor`.
     pointings : sequence of Pointing, optional
         The frames by pointing, with what their files say; found from `observation` by default.
-    references : References, optional
+    references : sequence of Observation
         Frames of reference stars.
     tell : callable
         Called with a line of text at every stage.
@@ -174,11 +173,11 @@ def subtract_by_refinement(
     groups = list(pointings_of(observation) if pointings is None else pointings)
     windows = [Window.about(g.observation.center[0], model.detector.shape) for g in groups]
     cut = [g.observation.within(w) for g, w in zip(groups, windows, strict=True)]
-    references = References() if references is None else references
 
     def frames_of_references() -> list[Observation]:
         tell("fitting the reference stars")
-        return references.cut(model.detector.shape, cut[0])
+        shape = model.detector.shape
+        return [each.within(Window.about(each.center[0], shape)) for each in references]
 
     def fit(choice: PatternChoice, again: bool) -> Refinement:
         if again:
@@ -223,7 +222,7 @@ def subtract_by_refinement(
 
 
 def _requested_pattern(
-    settings: DiffrenderSettings, observation: Observation, references: References
+    settings: DiffrenderSettings, observation: Observation, references: Sequence[Observation]
 ) -> PatternRequest:
     """Return the pattern that is asked for: real NIRCam frames get "auto", others "off".
 

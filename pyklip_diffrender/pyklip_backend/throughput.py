@@ -49,7 +49,9 @@ _CORE = 0.5
 _BATCH = 256
 
 
-def throughput_map(fit: Refinement, spacing: int = SPACING) -> NDArray[np.float64]:
+def throughput_map(
+    fit: Refinement, spacing: int = SPACING, inner: float = _INNER
+) -> NDArray[np.float64]:
     """Fraction of a faint source's peak that is left, on the pixels of the fit's first frame.
 
     Companions of the fit are part of its model, so that no light at their places becomes star.
@@ -61,6 +63,8 @@ def throughput_map(fit: Refinement, spacing: int = SPACING) -> NDArray[np.float6
     spacing : int
         Pixels between the computed positions; next to the star and to companions every pixel is
         computed.
+    inner : float
+        Pixels about the star within which every pixel is computed.
 
     Returns
     -------
@@ -77,7 +81,7 @@ def throughput_map(fit: Refinement, spacing: int = SPACING) -> NDArray[np.float6
     every = np.moveaxis(np.indices((ny, nx)), 0, -1)
     filled = np.asarray(RegularGridInterpolator((rows, columns), coarse)(every))
     pixel = math.sqrt(math.prod(fit.model.detector.pixelscale))
-    dense = np.hypot(*templates.grid.transpose(2, 0, 1)) <= _INNER * pixel
+    dense = np.hypot(*templates.grid.transpose(2, 0, 1)) <= inner * pixel
     for _, *offset in fit.companions:
         dense |= np.hypot(*(templates.grid - offset).transpose(2, 0, 1)) <= _DENSE * pixel
     filled[dense] = _at(fit, templates, *np.nonzero(dense))

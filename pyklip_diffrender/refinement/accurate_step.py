@@ -20,7 +20,6 @@ __all__ = ["ModelDerivatives", "accurate_step", "conjugate_gradients"]
 
 _ITERATIONS = 6
 _SUFFICIENT = 0.05
-"""Part of the whole decrease below which that of one iteration is the last."""
 
 _ROUNDING = 1e-12
 """Relative error of the curvature's elements."""
@@ -87,6 +86,9 @@ def accurate_step(
     offset: Tensor,
     deviation: Tensor,
     enough: float,
+    *,
+    iterations: int = _ITERATIONS,
+    sufficient: float = _SUFFICIENT,
 ) -> tuple[Tensor, bool]:
     """Compute the step to the minimum of the linearised penalised chi-squared.
 
@@ -101,6 +103,8 @@ def accurate_step(
         Prior standard deviations.
     enough : float
         Decrease of the penalised chi-squared that does not matter.
+    iterations, sufficient
+        See `conjugate_gradients`.
 
     Returns
     -------
@@ -125,7 +129,9 @@ def accurate_step(
         return torch.cholesky_solve(scaled[:, None], factor)[:, 0]
 
     gradient = derivatives.gradient()[:count] - precision * offset[:count]
-    scaled, settled = conjugate_gradients(product, precondition, unit * gradient, enough)
+    scaled, settled = conjugate_gradients(
+        product, precondition, unit * gradient, enough, iterations, sufficient
+    )
     step[:count] = unit * scaled
     return step, settled
 
@@ -135,6 +141,8 @@ def conjugate_gradients(
     precondition: Callable[[Tensor], Tensor],
     gradient: Tensor,
     enough: float = 0.0,
+    iterations: int = _ITERATIONS,
+    sufficient: float = _SUFFICIENT,
 ) -> tuple[Tensor, bool]:
     """Minimise x A x - 2 g x approximately.
 
@@ -152,6 +160,10 @@ def conjugate_gradients(
         g.
     enough : float
         Decrease below which that of one iteration is the last.
+    iterations : int
+        Largest number of iterations.
+    sufficient : float
+        Part of the whole decrease below which that of one iteration is the last.
 
     Returns
     -------
@@ -171,7 +183,7 @@ def conjugate_gradients(
     remaining = gradient.clone()
     direction = precondition(remaining)
     power, total = float(remaining @ direction), 0.0
-    for _ in range(_ITERATIONS):
+    for _ in range(iterations):
         # The decrease if the preconditioner were right; it understates the curvature, if anything.
         if power <= enough:
             return x, True
@@ -183,7 +195,7 @@ def conjugate_gradients(
         remaining -= power / curvature * pulled
         decrease = power**2 / curvature
         total += decrease
-        if decrease < max(_SUFFICIENT * total, enough):
+        if decrease < max(sufficient * total, enough):
             return x, True
         ahead = precondition(remaining)
         power, before = float(remaining @ ahead), power

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -33,6 +34,8 @@ class Row:
         The frames, unless they are excluded.
     remark : str
         Why the file is excluded, or what of it was left out.
+    path : Path or None
+        Of the file, where there is one.
     """
 
     use: Literal["target", "reference", "excluded"]
@@ -40,6 +43,7 @@ class Row:
     exposure: Exposure
     observation: Observation | None = None
     remark: str = ""
+    path: Path | None = None
 
     @property
     def time(self) -> float:

@@ -32,7 +32,7 @@ from pyklip_diffrender.scene.detector_pixels import (
     undo_shifts,
 )
 from pyklip_diffrender.scene.exposure import beginning, position_angle
-from pyklip_diffrender.scene.integrations import empty_integrations
+from pyklip_diffrender.scene.integrations import Judgement, empty_integrations
 from pyklip_diffrender.scene.star_place import measured_offset
 
 _log = logging.getLogger(__name__)
@@ -137,16 +137,19 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
 
 def without_empty(
     arguments: dict[str, Any], shifts: NDArray[Any] | None
-) -> tuple[dict[str, Any], NDArray[Any] | None, tuple[str, ...]]:
-    """Leave integrations out that have no usable pixels; see `read_calints` for the arguments."""
+) -> tuple[dict[str, Any], NDArray[Any] | None, Judgement | None]:
+    """Leave integrations out that have no usable pixels; see `read_calints` for the arguments.
+
+    The last value says which are kept; None for all.
+    """
     stacks = [np.asarray(arguments[key]) for key in ("data", "error", "valid")]
     data, error, valid = (each[None] if each.ndim == 2 else each for each in stacks)
     if data.ndim != 3 or not data.shape == error.shape == valid.shape:
-        return arguments, shifts, ()
+        return arguments, shifts, None
     usable = valid & np.isfinite(data) & np.isfinite(error) & (error > 0)
     judgement = empty_integrations(data, usable)
     if judgement.kept.all():
-        return arguments, shifts, ()
+        return arguments, shifts, None
     name, remarks = arguments["name"], judgement.remarks
     if not judgement.kept.any():
         raise NoValidPixelsError(f"{name}: {'; '.join(remarks)}. Look at its SCI, ERR and DQ")
@@ -156,7 +159,7 @@ def without_empty(
     changed = {"data": data[kept], "error": error[kept], "valid": valid[kept]}
     if arguments["position_angles"] is not None:
         changed["position_angles"] = arguments["position_angles"][kept]
-    return arguments | changed, None if shifts is None else shifts[kept], remarks
+    return arguments | changed, None if shifts is None else shifts[kept], judgement
 
 
 def dither(header: fits.Header, name: str) -> tuple[float, float] | None:

@@ -177,7 +177,7 @@ class Observation:
         ----------
         path : path
         every_integration : bool
-            Keep all integrations and pixels, as the file has them.
+            Keep a frame for every integration; those that are left out have no valid pixel.
 
         Raises
         ------
@@ -190,9 +190,7 @@ class Observation:
             As `from_arrays`.
         """
         arguments, shifts = read_calints(path)
-        remarks: tuple[str, ...] = ()
-        if not every_integration:
-            arguments, shifts, remarks = without_empty(arguments, shifts)
+        arguments, shifts, empty = without_empty(arguments, shifts)
         observation = cls.from_arrays(**arguments)
         if shifts is not None:
             changes = on_detector_pixels(arguments, observation.center, shifts)
@@ -207,27 +205,39 @@ class Observation:
                 observation.name,
             )
             observation = replace(observation, error=error, noise_ratios=ratios)
-        observation = replace(observation, remarks=remarks)
-        return observation if every_integration else observation.judged()
+        observation = replace(observation, remarks=() if empty is None else empty.remarks)
+        observation, kept = observation._judged()
+        if not every_integration:
+            return observation if kept.all() else observation.part(np.flatnonzero(kept))
+        if empty is not None:
+            observation = observation.part(np.maximum(np.cumsum(empty.kept) - 1, 0))
+            every = empty.kept.copy()
+            every[empty.kept] = kept
+            kept = every
+        return observation._with_valid(observation.valid & kept[:, None, None])
 
-    def judged(self) -> Observation:
-        """Leave out what deviates from the median of the integrations of one pointing."""
+    def _judged(self) -> tuple[Observation, NDArray[np.bool_]]:
+        """Mask what deviates from the median of the integrations of one pointing.
+
+        The second value says which integrations are kept.
+        """
         judgement = judge_pointings(
             self.data, self.error, self.valid, self.center, self.position_angles, self.pixelscale
         )
-        valid = judgement.valid
-        if judgement.kept.all() and (valid == self.valid).all():
-            return self
         for remark in judgement.remarks:
             _log.warning("%s: %s", self.name, remark)
-        cleaned = replace(
+        cleaned = replace(self, remarks=(*self.remarks, *judgement.remarks))
+        return cleaned._with_valid(judgement.valid), judgement.kept
+
+    def _with_valid(self, valid: NDArray[np.bool_]) -> Observation:
+        if (valid == self.valid).all():
+            return self
+        return replace(
             self,
             data=np.where(valid, self.data, 0.0),
             error=np.where(valid, self.error, 1.0),
             valid=valid,
-            remarks=(*self.remarks, *judgement.remarks),
         )
-        return cleaned.part(np.flatnonzero(judgement.kept))
 
     def part(self, which: NDArray[np.intp]) -> Observation:
         """Select frames by their indices."""

@@ -226,14 +226,15 @@ class Sequence:
                 reason = f"of another epoch than the frames of {day}, which have another wavefront"
             if reason:
                 excluded.append((each.name, reason))
-                rows.append(Row("excluded", each.star, each.exposure, None, reason))
+                rows.append(Row("excluded", each.star, each.exposure, None, reason, each.path))
                 continue
             use: Literal["target", "reference"] = "target" if each in chosen else "reference"
             observation = frames[id(each)]
             for part in () if observation is None else observation.pointings():
                 part = replace(part, reference=use == "reference")
                 used[use].append(part)
-                rows.append(Row(use, each.star, each.exposure, part, "; ".join(part.remarks)))
+                remark = "; ".join(part.remarks)
+                rows.append(Row(use, each.star, each.exposure, part, remark, each.path))
         rows.sort(key=lambda row: (("target", "reference", "excluded").index(row.use), row.time))
         return cls(
             star,

@@ -233,8 +233,8 @@ def _admitted(key: str, table: Table) -> tuple[Table, QTable]:
     )
     for name, reason in sequence.excluded:
         warnings.warn(f"{key}: {name} is left out: {reason}", DiffrenderWarning, stacklevel=3)
-    used = {row.exposure.name for row in sequence.rows if row.use != "excluded"}
-    return table[np.array([path.name in used for path in files])], sequence.table
+    used = {row.path for row in sequence.rows if row.use != "excluded"}
+    return table[np.array([path in used for path in files])], sequence.table
 
 
 def _reduced(

@@ -177,7 +177,7 @@ def _without_messages(name: str) -> Iterator[None]:
         logger.setLevel(before)
 
 
-def _record_of(future: Any, job: Job, jobs: Path) -> Record:
+def _record_of(future: Any, job: Job, jobs: Path, patience: int = _PATIENCE) -> Record:
     """Record of a job that dask has finished with."""
     final = jobs / job.key
     known = read_record(final)
@@ -201,7 +201,7 @@ def _record_of(future: Any, job: Job, jobs: Path) -> Record:
         )
         killed.__cause__ = error
         return failure(job, jobs, killed)
-    if record["status"] == "finished" and not _appears(final):
+    if record["status"] == "finished" and not _appears(final, patience):
         lost = IncompatibleSetupError(
             f"the worker on {record['host']} wrote its products to another disk than {jobs}. Put "
             "the output on a disk that all workers share"
@@ -210,8 +210,8 @@ def _record_of(future: Any, job: Job, jobs: Path) -> Record:
     return record
 
 
-def _appears(final: Path) -> bool:
-    for _ in range(_PATIENCE):
+def _appears(final: Path, patience: int) -> bool:
+    for _ in range(patience):
         if finished(final):
             return True
         time.sleep(0.5)

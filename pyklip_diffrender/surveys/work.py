@@ -18,6 +18,7 @@ from pyklip_diffrender.reduction import (
 )
 from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement
 from pyklip_diffrender.scene.objects import Planet
+from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.surveys.jobs import Injection, Job
 
@@ -26,20 +27,21 @@ __all__ = ["reduce_job"]
 
 def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str, Any]:
     """Reduce a sequence, perhaps with a planet in it, and write the products."""
-    options: dict[str, Any] = {**job.options.keywords, "memory": memory}
+    changes: dict[str, Any] = {"memory": memory}
     if job.injection is not None and job.base is not None:
         fit = Refinement.read(folder.parent / job.base / "fit.fits")
         first = fit.frames[0].observation
         planet = _planet(job.injection, first.position_angle)
-        science = with_planets(_with_disk(fit.frames, job), [planet])
+        frames: abc.Sequence[FrameFit] = fit.frames
+        if job.options.disk:
+            frames = _with_disk(frames, _sequence(job).cutout(job.options.size).science)
+        science = with_planets(frames, [planet])
         sequence = Sequence(first.target, science)
-        options |= {"systematics": fit.systematics or "off", "wide": False}
+        changes |= {"systematics": fit.systematics or "off", "wide": False}
     else:
         sequence = _sequence(job)
-    if job.options.settings:
-        name = sequence.science[0].filter
-        options["settings"] = GaussNewton.nircam(name, **job.options.settings)
-    reduction = prepare(sequence, job.opd, ReduceOptions(**options)).run()
+    options = _options(job, sequence.science[0].filter, **changes)
+    reduction = prepare(sequence, job.opd, options).run()
     write_products(reduction, folder, fit=job.injection is None)
     result = _result(summarise(reduction))
     if job.injection is not None and job.base is not None:
@@ -51,11 +53,18 @@ def _sequence(job: Job) -> Sequence:
     return Sequence.from_files(job.files, target=job.target, filter=job.filter, epoch=job.epoch)
 
 
-def _with_disk(frames: abc.Sequence[FrameFit], job: Job) -> list[FrameFit]:
+def _options(job: Job, filter: str | None, **changes: Any) -> ReduceOptions:
+    """Options of a job's reduction; settings that it does not name are those of the preset."""
+    keywords = {**job.options.keywords, **changes}
+    if job.options.settings:
+        keywords["settings"] = GaussNewton.nircam(filter, **job.options.settings)
+    return ReduceOptions(**keywords)
+
+
+def _with_disk(
+    frames: abc.Sequence[FrameFit], original: abc.Sequence[Observation]
+) -> list[FrameFit]:
     """The frames of a fit, with the extended light that was subtracted from them."""
-    if not job.options.disk:
-        return list(frames)
-    original = _sequence(job).cutout(job.options.size).science
     return [
         replace(frame, observation=replace(frame.observation, data=each.combined().data))
         for frame, each in zip(frames, original, strict=True)
