@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from astropy.io import fits
 from numpy.typing import NDArray
 
@@ -17,6 +19,13 @@ CENTER = (21.25, 24.5)
 RIPPLE = 2e-9 * np.hypot(*np.mgrid[-32:32, -32:32])
 OPD = as_opd_map(RIPPLE)
 BACKGROUND = 3.0
+
+
+def in_place_of_fits(monkeypatch: pytest.MonkeyPatch, subtract: Callable[..., Any]) -> None:
+    """Give the backend another subtractor, which gets the references as the default one does."""
+    monkeypatch.setattr(
+        "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
+    )
 
 
 def psf(x: float, y: float, shape: tuple[int, int] = SHAPE) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.io import fits
-from backend_scene import CENTER, OPD, SHAPE, calints, planet, psf, render
+from backend_scene import CENTER, OPD, SHAPE, calints, in_place_of_fits, planet, psf, render
 from pyklip import fakes
 from pyklip.instruments import JWST
 from pyklip.instruments.JWST import JWSTData
@@ -133,9 +133,7 @@ def test_filters_are_fitted_one_by_one(
         seen.append((observation.filter, list(observation.position_angles), names))
         return render(observation, opd, settings)
 
-    monkeypatch.setattr(
-        "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
-    )
+    in_place_of_fits(monkeypatch, subtract)
     setups = [(roll, name) for roll in (0.0, 10.0) for name in ("F356W", "F444W")]
     for roll, name in setups:
         paths.append(str(tmp_path / f"{name}_{roll:.0f}.fits"))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
-from backend_scene import OPD, RIPPLE, calints, psf, render
+from backend_scene import OPD, RIPPLE, calints, in_place_of_fits, psf, render
 from pyklip.instruments import JWST
 from pyklip.instruments.JWST import JWSTData
 from pyklip.parallelized import klip_dataset
@@ -236,9 +236,7 @@ def test_the_files_of_the_library_reach_the_fit(
         subtraction = render(observation, opd, settings)
         return replace(subtraction, systematics="references (REF)", references=2)
 
-    monkeypatch.setattr(
-        "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
-    )
+    in_place_of_fits(monkeypatch, subtract)
     unregister()
     register(opd=OPD)
     dataset = copy.deepcopy(JWSTData(files[:2], files[2:]))

@@ -272,6 +272,7 @@ def test_copies_with_added_sources_are_not_fitted_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A fit of flux and background is linear, so that a new fit would do exactly the same."""
+    # The map of the throughput takes seconds, and has tests of its own.
     monkeypatch.setattr(reduction, "throughput_map", lambda fit: np.ones((32, 32)))
     made = dataset(frames, small, fit=ALIGNED, error=1e3, plan="off")
     untouched = copy.deepcopy(made)

@@ -785,15 +785,8 @@ def test_the_shell_completes_commands_and_options() -> None:
 # -- doctor --------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def without_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the self-test, which takes seconds."""
-    quick = tuple(check for check in doctor.CHECKS if check is not doctor.check_fit)
-    monkeypatch.setattr(doctor, "CHECKS", quick)
-
-
-@pytest.mark.usefixtures("without_fit")
-def test_doctor_reports_versions_data_and_machine(
+@pytest.mark.slow
+def test_doctor_reports_versions_data_machine_and_a_fit(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("STPSF_PATH", raising=False)
@@ -804,6 +797,7 @@ def test_doctor_reports_versions_data_and_machine(
     assert any(line.startswith("ok    data files: ") for line in lines)
     assert any("of memory are free" in line for line in lines)
     assert any("STPSF_PATH is not set" in line and line.startswith("note") for line in lines)
+    assert any(line.startswith("ok    self-test in") for line in lines)
 
 
 def test_doctor_fails_with_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -821,9 +815,3 @@ def test_doctor_fails_with_a_sentence(tmp_path: Path, monkeypatch: pytest.Monkey
         assert words in failed.text
     assert doctor.memory_check(8e9).text == "8.0 GB of memory are free"
     assert doctor.memory_check(None).state == "note"
-
-
-@pytest.mark.slow
-def test_doctor_fits_a_wavefront() -> None:
-    (outcome,) = doctor.check_fit()
-    assert outcome.state == "ok", outcome

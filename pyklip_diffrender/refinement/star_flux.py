@@ -107,7 +107,12 @@ def to_jansky(star_flux: float | str | u.Quantity) -> float:
 
 
 def with_star_flux(
-    fit: Refinement, star_flux: float, error: float, *, progress: bool = False
+    fit: Refinement,
+    star_flux: float,
+    error: float,
+    *,
+    held: float = _HELD,
+    progress: bool = False,
 ) -> Refinement:
     """Continue a fit with the flux of the star held at that of a catalogue.
 
@@ -122,6 +127,8 @@ def with_star_flux(
         Flux density in the filter, Jy.
     error : float
         Its relative standard deviation, which errors of contrasts then include.
+    held : float
+        Relative deviation from it that the fit allows.
     progress : bool
         Show progress bars.
 
@@ -136,7 +143,7 @@ def with_star_flux(
         scale = jansky_per_unit(frame)
         assert scale is not None
         frames.append(replace(frame, start={**frame.start, "flux": star_flux / scale}))
-    changes = {"deviations": {**fit.settings.deviations, "flux": _HELD}, "star_flux_error": error}
+    changes = {"deviations": {**fit.settings.deviations, "flux": held}, "star_flux_error": error}
     return refine_again(replace(fit, frames=tuple(frames)), progress=progress, **changes)
 
 
