@@ -18,7 +18,7 @@ from pyklip_diffrender.wavefront import random_opd
 
 SIZE = 40
 PLANET = Planet(3e-4, 0.45, 60.0)
-PHOTONS = 1e10  # Of the star, in a frame.
+PHOTONS = 2e9  # Of the star, in a frame.
 NOISE = 30.0
 STAR = (0.002, -0.002)  # arcsec from the middle of the mask.
 
@@ -87,18 +87,16 @@ def test_a_planet_is_where_it_is_and_nothing_else(tmp_path: Path, filter: str, m
         calints(tmp_path, roll, filter=filter, mask=mask, seed=seed)
         for seed, roll in enumerate((0.0, 10.0))
     ]
-    settings = GaussNewton.nircam(filter, cycles=(9.0,), max_iterations=15)
+    settings = GaussNewton.nircam(filter, cycles=(10.0,), max_iterations=15)
     result = reduce(files, random_opd(1, npix=256), size=SIZE, settings=settings)
     assert result.systematics is None
-    (found,) = result.detection.candidates
     table = result.detection.table
-    print(table)
+    assert len(table) == 1
     assert table["separation"][0].to_value(u.arcsec) == pytest.approx(PLANET.separation, abs=0.01)
     assert table["position_angle"][0].to_value(u.deg) == pytest.approx(60.0, abs=1.5)
     error = float(table["contrast_error"][0])
     assert float(table["contrast"][0]) == pytest.approx(PLANET.contrast, abs=3 * error)
     assert error < 0.2 * PLANET.contrast
-    assert found is not None
 
 
 def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path: Path) -> None:
