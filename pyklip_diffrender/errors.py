@@ -15,6 +15,7 @@ __all__ = [
     "DiffrenderError",
     "DiffrenderWarning",
     "IncompatibleSetupError",
+    "MissingFileError",
     "MissingOPDError",
     "NoValidPixelsError",
     "NonFiniteError",
@@ -54,6 +55,10 @@ class MissingOPDError(DiffrenderError, ValueError):
 
 class CorruptFileError(DiffrenderError, OSError):
     """A file is missing, truncated, or not of the expected type."""
+
+
+class MissingFileError(CorruptFileError, FileNotFoundError):
+    """There is no such file."""
 
 
 class ArchiveError(DiffrenderError, OSError):

@@ -65,6 +65,15 @@ def test_help_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
         assert command in shown
 
 
+def test_threads_sleep_while_they_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
+    assert main(["--version"]) == 0
+    assert os.environ["OMP_WAIT_POLICY"] == "active"
+    monkeypatch.delenv("OMP_WAIT_POLICY")
+    assert main(["--version"]) == 0
+    assert os.environ["OMP_WAIT_POLICY"] == "passive"
+
+
 @pytest.mark.parametrize("command", ["demo", "reduce", "detect", "psf"])
 def test_help_of_a_command_has_sections_and_examples(
     capsys: pytest.CaptureFixture[str], command: str

@@ -27,13 +27,15 @@ def summary(mjd: float, places: list[tuple[float, float]], error: float = 0.01) 
             "position_angle_deg": float(np.degrees(np.arctan2(*place))),
             "position_angle_error_deg": float(np.degrees(error / np.hypot(*place))),
             "snr": 9.0,
+            "contrast": 1e-5,
+            "contrast_error": 1e-6,
         }
         for place in places
     ]
     return {
         "target": "AU Mic <b>", "oriented": True, "epoch_mjd": mjd, "sentence": "Result.",
         "first_date": "2022-10-03T00:00:00" if mjd < 60000 else "2023-12-02T00:00:00",
-        "candidates": candidates,
+        "filter": "F444W", "candidates": candidates,
     }  # fmt: skip
 
 

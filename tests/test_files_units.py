@@ -221,6 +221,9 @@ def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
     for path in (tmp_path / "nowhere.fits", tmp_path):
         with pytest.raises(CorruptFileError, match=path.name), open_fits(path):
             pass
+        # As other libraries have it.
+        with pytest.raises(FileNotFoundError), open_fits(path):
+            pass
 
 
 def test_an_unusual_but_complete_header_is_no_corruption(tmp_path: Path) -> None:

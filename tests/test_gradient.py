@@ -167,6 +167,7 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> No
     assert (products[0] - expected).norm() > 0.1 * expected.norm()
 
 
+@pytest.mark.slow
 def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
     """In as many iterations as are needed, whatever the coarse copy that preconditions them."""
     solver, state = solver_of(1)

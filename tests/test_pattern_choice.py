@@ -174,7 +174,7 @@ def test_a_rough_fit_tells_which_pixels_a_frame_shows(
     ("cards", "shown", "label"),
     [
         ({}, 1.0, "none"),
-        (LIBRARY, 1.0, f"library ({STARS})"),
+        pytest.param(LIBRARY, 1.0, f"library ({STARS})", marks=pytest.mark.slow),
         (LIBRARY, 0.0, "none"),
     ],
 )

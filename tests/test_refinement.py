@@ -211,7 +211,7 @@ def test_residual_is_data_minus_star(bright: Case, fit: Refinement) -> None:
     np.testing.assert_array_equal(
         fit.frames[0].star,
         fit.frames[0].values["flux"][0]
-        * bright.model(fit.wavefront, **fit.frames[0].optical_values).numpy()
+        * bright.model(fit.frames[0].opd, **fit.frames[0].optical_values).numpy()
         + fit.frames[0].values["background"][0],
     )
 
@@ -253,12 +253,20 @@ def test_the_summary_holds_what_provenance_needs(bright: Case, fit: Refinement) 
     assert "test star" in repr(fit.frames[0])
 
 
+def test_wavefront_and_absorption_are_real(fit: Refinement) -> None:
+    opd = fit.wavefront + 2e-9j
+    both = replace(fit, frames=(replace(fit.frames[0], opd=opd),))
+    assert both.wavefront.dtype == both.absorption.dtype == np.float64
+    np.testing.assert_array_equal(both.wavefront, opd.real)
+    np.testing.assert_array_equal(both.absorption, opd.imag)
+
+
 def test_a_pickled_fit_is_the_same_fit(plain: Refinement) -> None:
     written = pickle.dumps(plain)
     again = pickle.loads(written)
     np.testing.assert_array_equal(again.frames[0].star, plain.frames[0].star)
     images = [
-        each.model(each.wavefront, **each.frames[0].optical_values) for each in (again, plain)
+        each.model(each.frames[0].opd, **each.frames[0].optical_values) for each in (again, plain)
     ]
     assert torch.equal(*images)
     assert torch.equal(again.linear.covariance, plain.linear.covariance)

@@ -20,12 +20,15 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
 from astropy.time import Time
+from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction import summarise, write_report
+from pyklip_diffrender.reduction.extended import looks_extended
+from pyklip_diffrender.reduction.overview import Klip, Overview
 from pyklip_diffrender.reduction.page import page
 from pyklip_diffrender.reduction.words import (
     advice,
@@ -66,6 +69,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("products")
     assert [each.name for each in reduction().write(path)][-2:] == ["report.html", "summary.json"]
     return path
+
+
+def sources(places: NDArray[np.float64]) -> QTable:
+    """Candidates at x, y from the star, arcsec."""
+    x, y = places.T
+    angle = np.rad2deg(np.arctan2(-x, y)) % 360
+    return QTable({"x": x * u.arcsec, "y": y * u.arcsec, "frame_angle": angle * u.deg})
 
 
 class Tags(HTMLParser):
@@ -162,9 +172,9 @@ def test_the_report_says_how_much_of_the_pattern_is_there() -> None:
     assert abs(size[0] - 1) < 5 * size[1] < 0.5
 
 
-def test_several_candidates_suggest_a_disk() -> None:
+def test_candidates_in_line_suggest_a_disk() -> None:
     whole = reduction()
-    places = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.6]])
+    places = np.array([[0.5, 0.0], [-0.5, 0.02], [0.3, 0.01]])
     three = Candidates.at(places, np.full(3, 1e-5))
     three = replace(three, covariance=1e-12 * torch.eye(9, dtype=torch.float64))
     crowded = replace(
@@ -175,6 +185,9 @@ def test_several_candidates_suggest_a_disk() -> None:
     assert str(crowded).endswith(f"{suggestion}.")
     assert suggestion in crowded._repr_html_()
     assert suggestion in summarise(crowded)["status"]["advice"]
+    said = summarise(crowded)
+    assert said["sentence"].startswith("The candidates are in line with the star")
+    assert {each["false_alarm_probability"] for each in said["candidates"]} == {None}
     # So does a residual that is not explained by an unknown pattern of the flat field.
     poor = replace(whole, fit=replace(whole.fit, chi2_per_pixel=9.0))
     flat = np.zeros((4, 4))
@@ -184,6 +197,35 @@ def test_several_candidates_suggest_a_disk() -> None:
     fitted = [replace(each, disk=cast(dr.Disk, object())) for each in (crowded, patterned)]
     assert [each.remark for each in (whole, poor, *fitted)] == [""] * 4
     assert "disk" not in str(whole)
+
+
+@pytest.mark.parametrize(
+    ("places", "reason"),
+    [
+        ([[0.5, 0.0], [-0.5, 0.02], [0.3, 0.01]], "in line with the star"),
+        ([[1.0, 0.0], [1.1, 0.1], [1.0, 0.2], [0.0, -1.0]], "next to each other"),
+        ([[0.5, 0.0], [-0.5, 0.5], [0.0, 0.6]], ""),
+        ([[1.0, 0.0], [-1.0, 0.0]], ""),
+        ([[1.0, 0.0]], ""),
+    ],
+    ids=["edge-on disk", "arc", "three planets", "two opposite", "one"],
+)
+def test_extended_light_is_told_by_the_arrangement(places: list[list[float]], reason: str) -> None:
+    assert reason in looks_extended(sources(np.array(places)), 0.14, 2.4)
+    assert bool(looks_extended(sources(np.array(places)), 0.14, 2.4)) == bool(reason)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 8])
+def test_unrelated_sources_rarely_look_extended(count: int) -> None:
+    """At most 1 % for each of the two criteria, counted in 500 draws."""
+    rng, edge = np.random.default_rng(count), 2.4
+    hits = 0
+    for _ in range(500):
+        radius, angle = edge * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
+        drawn = sources(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
+        hits += bool(looks_extended(drawn, 0.14, edge))
+    # 10 are expected at most, with a standard deviation of 3.
+    assert hits <= 20
 
 
 @pytest.mark.parametrize(
@@ -215,7 +257,7 @@ def test_probabilities_of_false_alarms() -> None:
     unknown = replace(reduction().detection, false_alarm=np.array([np.nan]))
     (row,) = summarise(replace(reduction(), detection=unknown))["candidates"]
     assert row["false_alarm_probability"] is None
-    assert probability(None) == "not known"
+    assert probability(None) == "not stated"
 
 
 # -- the files -------------------------------------------------------------------------------------
@@ -258,7 +300,7 @@ def test_calibrated_frames_have_flux_densities_on_the_page() -> None:
         "flux_density_Jy": 0.41, "flux_density_error_Jy": 0.05, "source": "diffracted light"
     }  # fmt: skip
     summary["candidates"][0] |= {"flux_density_Jy": 1.2e-4, "flux_density_error_Jy": 1e-5}
-    words = Tags(page(summary, [], [], [])).words
+    words = Tags(page(summary, [], [], [], [])).words
     assert "0.41 ± 0.05 Jy, from its diffracted light" in words
     assert scientific(1.2e-4, 1e-5) in words
 
@@ -273,15 +315,15 @@ def test_pixels_that_the_fit_left_out_are_named() -> None:
     summary = summarise(replace(whole, detection=replace(whole.detection, fits=fits)))
     (place,) = summary["frames"][0]["bad_pixels"]
     assert place == pytest.approx(frame.grid[3, 5], abs=6e-4)
-    assert f"({place[0]:+.2f}, {place[1]:+.2f})" in page(summary, [], [], [])
+    assert f"({place[0]:+.2f}, {place[1]:+.2f})" in page(summary, [], [], [], [])
     assert summarise(whole)["frames"][0]["bad_pixels"] == []
-    assert "left out because" not in page(summarise(whole), [], [], [])
+    assert "left out because" not in page(summarise(whole), [], [], [], [])
 
 
 def test_every_picture_has_words_and_nothing_is_loaded(folder: Path) -> None:
     page = Tags((folder / "report.html").read_text(encoding="utf-8"))
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]
-    assert len(pictures) == 8
+    assert len(pictures) == 9
     for attributes in pictures:
         assert len(attributes["alt"] or "") > 30
         assert (attributes["src"] or "").startswith("data:image/png;base64,iVBOR")
@@ -312,7 +354,7 @@ def test_a_header_cannot_write_into_the_page(tmp_path: Path) -> None:
     assert text.count(escape(HOSTILE)) > 8
     tags = Tags(text).tags
     assert not [tag for tag, attributes in tags if tag == "script" or "onerror" in attributes]
-    assert len([tag for tag, _ in tags if tag == "img"]) == 8
+    assert len([tag for tag, _ in tags if tag == "img"]) == 9
     assert json.loads(data.read_text(encoding="utf-8"))["target"] == HOSTILE
 
 
@@ -355,6 +397,31 @@ def test_with_reference_frames_klip_is_shown_beside(tmp_path: Path) -> None:
     # Farther out than that there is something left of a planet.
     assert min(curve["contrast"][4:]) > 0
     assert "Squares: KLIP RDI (1 reference frame, 1 mode)" in html.read_text(encoding="utf-8")
+
+
+def test_images_have_north_up() -> None:
+    """The planet is at its position angle on the sky in ours, in KLIP's, and in the S/N map."""
+    whole = reduction()
+    star = replace(whole.sequence.science[0], reference=True)
+    # A reference without the planet, which is in the lower left.
+    fitted = whole.detection.fits[0].frames[0]
+    alone = replace(star, data=fitted.star[None] + 0.1 * star.error)
+    klip = Klip.of(replace(whole, sequence=replace(whole.sequence, references=(alone,))))
+    assert klip is not None
+    assert klip.label == "KLIP RDI (1 reference frame, 1 mode)"
+    overview = Overview(whole, klip)
+    wrong = [replace(PLANET, position_angle=angle).offset for angle in (10.0, 70.0, -40.0, 220.0)]
+    for image, grid in ((overview.image, overview.grid), (klip.image, klip.grid),
+                        (overview._snr(), overview.grid)):  # fmt: skip
+        # Its position on the frame, turned twice, mirrored, and on the other side.
+        light, *others = (
+            np.nansum(image[np.hypot(*(grid - place).T).T < 0.1]) for place in
+            (PLANET.offset, *wrong)
+        )  # fmt: skip
+        assert light > 2 * np.abs(others).max()
+    # Four standard deviations.
+    (circled,) = overview._places
+    assert np.hypot(*(circled - PLANET.offset)) < 0.05
 
 
 @pytest.mark.usefixtures("_few_pictures")
@@ -421,7 +488,7 @@ def test_a_failure_of_klip_does_not_break_the_report(
     (star,) = whole.sequence.science
     sequence = replace(whole.sequence, references=(star.cutout(10),))
     _, data = write_report(replace(whole, sequence=sequence), tmp_path)
-    assert "the report has no contrast curve of KLIP" in caplog.text
+    assert "the report has no comparison with KLIP" in caplog.text
     assert json.loads(data.read_text(encoding="utf-8"))["klip_curve"] is None
 
 

@@ -321,6 +321,22 @@ def test_orbitize_reads_the_astrometry(tmp_path: Path) -> None:
     np.testing.assert_allclose(read["radec_corr"], known["radec_corr"], rtol=1e-5)
 
 
+def test_backtracks_and_octofitter_read_the_astrometry(tmp_path: Path) -> None:
+    """backtracks takes columns by their place, as in its `System`; Octofitter by their names."""
+    known = table()
+    ra, error = (known[name].to_value("mas") for name in ("delta_ra", "delta_ra_error"))
+    dec = known["delta_dec"].to_value("mas")
+    rows = ascii.read(write_astrometry(known, tmp_path / "b.csv", "backtracks"))
+    assert list(rows["quant_type"]) == ["radec", "radec"]
+    for place, expected in ((0, [59855.5] * 2), (2, ra), (3, error), (4, dec),
+                            (6, known["radec_corr"])):  # fmt: skip
+        np.testing.assert_allclose(rows.columns[place], expected, rtol=1e-5)
+    rows = ascii.read(write_astrometry(known, tmp_path / "o.csv", "octofitter"))
+    for name, expected in (("epoch", [59855.5] * 2), ("ra", ra), ("σ_ra", error), ("dec", dec),
+                           ("cor", known["radec_corr"])):  # fmt: skip
+        np.testing.assert_allclose(rows[name], expected, rtol=1e-5)
+
+
 def test_orvara_reads_the_astrometry(tmp_path: Path) -> None:
     known = table()
     path = write_astrometry(known, tmp_path / "relAst.txt", "orvara")
@@ -337,7 +353,7 @@ def test_orvara_reads_the_astrometry(tmp_path: Path) -> None:
     [
         (Sky(north=1.0), "orbitize", "no date"),
         (Sky(mjd=59855.0), "orbitize", "no position angle"),
-        (SKY, "csv", "expected one of orbitize, orvara"),
+        (SKY, "csv", "expected one of orbitize, backtracks"),
     ],
 )
 def test_an_orbit_needs_angle_and_date(sky: Sky, format: str, message: str, tmp_path: Path) -> None:

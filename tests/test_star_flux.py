@@ -76,7 +76,8 @@ def test_without_a_map_the_star_is_less_certain(
         assert ("may be wrong by 40 %; give the flux" in caplog.text) is warned
 
 
-@pytest.mark.parametrize("share", [pytest.param(0.98, marks=pytest.mark.slow), 1.02])
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.98, 1.02])
 def test_contrasts_refer_to_the_catalogues_star(fit: Refinement, share: float) -> None:
     """Held more tightly than these frames, which determine it to 1e-4: the star obeys."""
     before = dr.detect(fit)

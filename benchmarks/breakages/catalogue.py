@@ -113,11 +113,12 @@ def _instrument_and_wavefront() -> list[Breakage]:
         ),
         Breakage(
             "mask-centre", "positions of masks count pixels from 0",
-            "return x - 1, y - 1", "return x, y", "instrument detector_pixels",
+            '(float(row["x"]) - 1, float(row["y"]) - 1),', '(float(row["x"]), float(row["y"])),',
+            "instrument detector_pixels",
         ),
         Breakage(
             "flight-struts", "pupil='flight' has the obscurations seen in flight",
-            '"flight": "flight_strut"', '"flight": "strut"', "instrument parity_stpsf",
+            '"flight": "flight_strut"', '"flight": "strut"', "geometry instrument",
         ),
         Breakage(
             "quadrature", "condensed wavelengths keep the integrals of polynomials",
@@ -341,7 +342,8 @@ def _around() -> list[Breakage]:
         ),
         Breakage(
             "library-frames", "frames marked as references are not the target's",
-            'header.get("IS_PSF", False)', 'header.get("IS_PSFS", False)', "backend_references",
+            'return _flag(header, "IS_PSF")', 'return _flag(header, "IS_PSFS")',
+            "sequence admission backend_references",
         ),
         Breakage(
             "tried-again", "failed jobs of a survey are tried again",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections import abc
 from typing import Any
 
@@ -54,6 +55,9 @@ def main(arguments: abc.Sequence[str] | None = None) -> int:
         Exit status: 0, 1 for an error that a message explains, 2 for wrong options, 130 if
         interrupted.
     """
+    # Threads of PyTorch that wait in a loop take the processor from other processes. Libraries read
+    # this when they are loaded, which is later.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     run = Run()
     with run.messages():
         try:

@@ -113,7 +113,12 @@ def check_machine() -> Iterator[Check]:
     """Look at processors, memory and disk."""
     import torch
 
-    yield Check("ok", f"{torch.get_num_threads()} threads on {os.cpu_count()} processors")
+    policy = os.environ.get("OMP_WAIT_POLICY", "active")
+    yield Check(
+        "ok",
+        f"{torch.get_num_threads()} threads on {os.cpu_count()} processors, wait policy {policy} "
+        "(in Python set OMP_WAIT_POLICY=passive before PyTorch is imported)",
+    )
     if not torch.cuda.is_available():
         yield Check("note", "PyTorch sees no GPU; the processor is used")
     else:

@@ -9,8 +9,9 @@ is unbiased, and its error includes the uncertainty of the wavefront.
 from __future__ import annotations
 
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.combination import combine_frames
 from pyklip_diffrender.detection.disk import Disk, fit_disk
-from pyklip_diffrender.detection.figure import draw_search
+from pyklip_diffrender.detection.figure import draw_curve, draw_search
 from pyklip_diffrender.detection.recovery import measured_planet, recover_planets, with_planets
 from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure
@@ -23,10 +24,12 @@ __all__ = [
     "Detection",
     "Disk",
     "WideField",
+    "combine_frames",
     "completeness",
     "contrast_curve",
     "contrast_of_completeness",
     "detect",
+    "draw_curve",
     "draw_search",
     "fit_disk",
     "measure",

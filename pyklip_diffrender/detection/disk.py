@@ -24,15 +24,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 from scipy.optimize import minimize
 
 from pyklip_diffrender import drawing
+from pyklip_diffrender.detection.combination import combine_frames
 from pyklip_diffrender.detection.field import Image, separation_of
 from pyklip_diffrender.detection.groups import groups_of, has_only_reference_stars
 from pyklip_diffrender.detection.relinearise import without_light
@@ -387,20 +386,10 @@ def _combined(
 ) -> tuple[Image, Image]:
     """Frames minus the star, turned onto the first one and averaged, and the errors."""
     templates = sources.templates
-    total, weights = np.zeros((2, *templates.grid.shape[:2]))
+    images, errors = {}, {}
     for k, light in sources.light.items():
         frame = original[k].combined()
         valid = frame.valid[0]
-        # Invalid pixels get no weight, but their neighbours are interpolated from them.
-        left = np.where(valid, frame.data[0] - fit.frames[k].star, light)
-        weight = np.where(valid, frame.error[0], np.inf) ** -2
-        places = templates.pixels_of(k, torch.from_numpy(templates.grid.reshape(-1, 2)))
-        left, weight = (
-            map_coordinates(array, places, order=order, cval=0.0).reshape(total.shape)
-            for array, order in ((left, 3), (weight, 1))
-        )
-        total += weight * left
-        weights += weight
-    covered = weights > 0
-    safe = np.where(covered, weights, 1.0)
-    return np.where(covered, total / safe, np.nan), np.where(covered, safe**-0.5, np.nan)
+        images[k] = np.where(valid, frame.data[0] - fit.frames[k].star, light)
+        errors[k] = np.where(valid, frame.error[0], np.inf)
+    return combine_frames(templates, images, errors, templates.grid)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+import numpy as np
 from astropy.table import QTable
 
 from pyklip_diffrender import drawing
@@ -12,7 +13,7 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["draw_search"]
+__all__ = ["draw_curve", "draw_search"]
 
 
 class _Search(Protocol):
@@ -36,24 +37,37 @@ class _Search(Protocol):
     def north(self) -> float: ...
 
 
-def draw_search(axes: Sequence[Any], search: _Search, klip: QTable | None = None) -> None:
+def draw_search(axes: Sequence[Any], search: _Search) -> None:
     """Draw the S/N map with the candidates, and the contrast curve.
 
     Parameters
     ----------
     axes : two Axes
     search : Detection or WideField
+    """
+    table = search.table
+    drawing.snr_map(
+        axes[0], search.snr, search.grid,
+        np.stack([table["x"].value, table["y"].value], axis=1),
+        None if search.observation.position_angles is None else search.north,
+        title=f"{len(table)} candidate{'' if len(table) == 1 else 's'} above "
+        f"S/N {search.threshold:g}",
+        labels=[f"S/N {each:.1f}" for each in table["snr"]],
+    )  # fmt: skip
+    draw_curve(axes[1], search)
+
+
+def draw_curve(ax: Any, search: _Search, klip: QTable | None = None) -> None:
+    """Draw the contrast curve with the candidates.
+
+    Parameters
+    ----------
+    ax : Axes
+    search : Detection or WideField
     klip : QTable, optional
         Contrast curve of KLIP on the same frames, see `klip_curve`.
     """
-    drawing.search(
-        axes,
-        search.snr,
-        search.grid,
-        search.table,
-        search.contrast_curve,
-        threshold=search.threshold,
-        north=None if search.observation.position_angles is None else search.north,
-        small_sample=search.error_factor.is_measured,
+    drawing.contrast_curve(
+        ax, search.contrast_curve, search.table, small_sample=search.error_factor.is_measured,
         klip=klip,
-    )
+    )  # fmt: skip

@@ -40,6 +40,31 @@ def _orbitize(table: QTable) -> Table:
     )
 
 
+def _backtracks(table: QTable) -> Table:
+    """Columns of backtracks, in its order; orbitize! reads them as well."""
+    return Table(
+        {
+            "epoch": table["epoch_mjd"],
+            "object": np.arange(1, len(table) + 1),
+            "quant1": table["delta_ra"].to_value("mas"),
+            "quant1_err": table["delta_ra_error"].to_value("mas"),
+            "quant2": table["delta_dec"].to_value("mas"),
+            "quant2_err": table["delta_dec_error"].to_value("mas"),
+            "quant12_corr": table["radec_corr"],
+            "quant_type": ["radec"] * len(table),
+        }
+    )
+
+
+def _octofitter(table: QTable) -> Table:
+    """Columns of Octofitter's relative astrometry: MJD and mas."""
+    names = ("epoch", "object", "ra", "σ_ra", "dec", "σ_dec", "cor")
+    plain = _backtracks(table)
+    plain.remove_column("quant_type")
+    plain.rename_columns(plain.colnames, list(names))
+    return plain
+
+
 def _orvara(table: QTable) -> Table:
     """Columns of orvara's relative astrometry: arcsec and degrees, companions from 0."""
     return Table(
@@ -57,6 +82,8 @@ def _orvara(table: QTable) -> Table:
 
 _FORMATS: dict[str, tuple[Callable[[QTable], Table], str]] = {
     "orbitize": (_orbitize, "ascii.csv"),
+    "backtracks": (_backtracks, "ascii.csv"),
+    "octofitter": (_octofitter, "ascii.csv"),
     "orvara": (_orvara, "ascii.commented_header"),
 }
 

@@ -15,8 +15,8 @@ from pyklip_diffrender.refinement import Refinement, refine_again
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
-    "has_unconfirmed_companions",
     "lacks_candidates",
+    "unconfirmed_companions",
     "with_companions",
     "without_light",
 ]
@@ -50,22 +50,30 @@ def lacks_candidates(fits: Sequence[Refinement], candidates: Candidates) -> bool
     )
 
 
-def has_unconfirmed_companions(fits: Sequence[Refinement], candidates: Candidates) -> bool:
-    """Return True if a fit of the target has a companion that is not one of the candidates.
+def unconfirmed_companions(
+    fits: Sequence[Refinement], candidates: Candidates
+) -> NDArray[np.float64]:
+    """Companions of the fits of the target that are none of the candidates.
 
-    It is most often an error of the star, and would remain in the star's image, in files and plots.
+    They are most often errors of the star, which was fitted together with them.
 
     Parameters
     ----------
     fits : sequence of Refinement
     candidates : Candidates
         Positions refer to the first frame of the first fit.
+
+    Returns
+    -------
+    ndarray, (k, 3)
+        Contrast, and x and y from the star in the first frame of their fit, arcsec.
     """
-    return any(
-        bool((~_confirmed(fit, fits, candidates)).any())
+    parts = [
+        fit.companions[~_confirmed(fit, fits, candidates)]
         for fit in fits
         if not has_only_reference_stars(fit)
-    )
+    ]
+    return np.concatenate([np.zeros((0, 3)), *parts])
 
 
 def _confirmed(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import textwrap
 from collections.abc import Sequence
@@ -31,6 +32,7 @@ from pyklip_diffrender.detection.measurement import (
     subtracted_frames,
 )
 from pyklip_diffrender.detection.orbits import write_astrometry
+from pyklip_diffrender.detection.relinearise import unconfirmed_companions
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.detection.storage import (
     computed_of,
@@ -135,7 +137,22 @@ class Detection:
 
     @property
     def remark(self) -> str:
-        """Caveat about real frames of a single roll; else empty."""
+        """Caveats about sources that only the fit has, and about real frames of a single roll."""
+        return " ".join(filter(None, [self._unconfirmed, self._single_roll]))
+
+    @property
+    def _unconfirmed(self) -> str:
+        if not self.fits:
+            return ""
+        sources = unconfirmed_companions(self.fits, self.candidates)
+        return " ".join(
+            f"A possible source of contrast {contrast:.1e} at {math.hypot(x, y):.2f} arcsec was "
+            "fitted with the star; the search does not confirm it."
+            for contrast, x, y in sources
+        )
+
+    @property
+    def _single_roll(self) -> str:
         if self.rolls > 1 or not self.observation.is_nircam:
             return ""
         step = np.rad2deg(self.contrast_curve.meta["resolution_arcsec"])
@@ -382,9 +399,9 @@ class Detection:
         Parameters
         ----------
         path : path
-        format : "orbitize" or "orvara"
-            The CSV file of orbitize! (MJD, mas, degrees), or the text file with relative
-            astrometry of orvara (JD, arcsec, degrees).
+        format : "orbitize", "backtracks", "octofitter" or "orvara"
+            The CSV file of orbitize! (MJD, mas, degrees), backtracks or Octofitter (MJD, mas), or
+            the text file with relative astrometry of orvara (JD, arcsec, degrees).
 
         Raises
         ------

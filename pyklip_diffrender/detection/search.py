@@ -32,7 +32,6 @@ from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.measurement import contrasts_at
 from pyklip_diffrender.detection.raised_peaks import with_raised_peaks
 from pyklip_diffrender.detection.relinearise import (
-    has_unconfirmed_companions,
     lacks_candidates,
     with_companions,
 )
@@ -142,9 +141,7 @@ def detect(
             "not refined with them in the model",
             len(candidates),
         )
-    elif has_unconfirmed_companions(fits, candidates) or (
-        bright.any() and lacks_candidates(fits, candidates)
-    ):
+    elif bright.any() and lacks_candidates(fits, candidates):
         fits = with_companions(fits, candidates, progress)
         maps = Maps(groups_of(fits), progress)
         candidates, factor, significance = _search(

@@ -12,6 +12,7 @@ from pyklip_diffrender.drawing.curves import (
 )
 from pyklip_diffrender.drawing.figures import axes_for, new_figure, panel, save, to_png
 from pyklip_diffrender.drawing.images import (
+    SNR_LINEAR,
     light_norm,
     pupil_image,
     signed_image,
@@ -20,9 +21,9 @@ from pyklip_diffrender.drawing.images import (
     wavefront_map,
 )
 from pyklip_diffrender.drawing.marks import compass, halo, unit_label
-from pyklip_diffrender.drawing.search import search
 
 __all__ = [
+    "SNR_LINEAR",
     "axes_for",
     "compass",
     "completeness",
@@ -34,7 +35,6 @@ __all__ = [
     "panel",
     "pupil_image",
     "save",
-    "search",
     "signed_image",
     "snr_map",
     "star_image",

@@ -54,11 +54,11 @@ def contrast_curve(
                     label="median, few samples")  # fmt: skip
     ax.semilogy(separation, curve["known_star"], "--", color=INK, label="star known exactly")
     if klip is not None:
-        label = klip.meta.get("label", "KLIP")
+        label = klip.meta.get("label", "KLIP").replace(" (", "\n(")
         ax.semilogy(klip["separation"].value, klip["contrast"], "s-", color=_KLIP, ms=3.5,
                     label=label)  # fmt: skip
         ax.semilogy(klip["separation"].value, klip["small_sample"], "s:", color=_KLIP, ms=3.5,
-                    mfc="white", label=f"{label}, few samples")  # fmt: skip
+                    mfc="white", label="KLIP, few samples")  # fmt: skip
     if len(candidates):
         ax.errorbar(
             candidates["separation"].value, candidates["contrast"], candidates["contrast_error"],

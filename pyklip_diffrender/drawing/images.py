@@ -18,17 +18,23 @@ from pyklip_diffrender.drawing.marks import INK, circles, compass, label_sky
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["light_norm", "pupil_image", "signed_image", "snr_map", "star_image", "wavefront_map"]
+__all__ = [
+    "SNR_LINEAR",
+    "light_norm",
+    "pupil_image",
+    "signed_image",
+    "snr_map",
+    "star_image",
+    "wavefront_map",
+]
 
 Image = NDArray[np.float64]
 
 _LIGHT = "magma"
 _SIGNED = "RdBu_r"
 
-_LINEAR = 5.0
+SNR_LINEAR = 5.0
 """Linear part of the scale for S/N."""
-
-_SNR_TICKS = (-100, -50, -20, -10, -5, 0, 5, 10, 20, 50, 100)
 
 _DECADES = 6
 """Decades of a logarithmic scale."""
@@ -49,12 +55,22 @@ def star_image(
 
 def signed_image(
     ax: Axes, image: Image, grid: Image, limit: float, *, bar: str, title: str,
-    places: ArrayLike = (), north: float | None = None,
+    places: ArrayLike = (), labels: Sequence[str] = (), north: float | None = None,
+    linear: float | None = None,
 ) -> None:  # fmt: skip
-    """Draw an image of either sign on a linear scale to +-`limit`, with circles at `places`."""
-    _on_sky(ax, image, grid, north, bar=bar, title=title, cmap=_SIGNED, vmin=-limit, vmax=limit)
-    if np.size(places):
-        circles(ax, places)
+    """Draw an image of either sign, to +-`limit`, with circles at `places`.
+
+    The scale is linear within +-`linear` and logarithmic beyond, so that a bright source keeps its
+    shape beside faint ones; without `linear` it is linear throughout.
+    """
+    style: dict[str, Any] = {"vmin": -limit, "vmax": limit}
+    if linear is not None:
+        from matplotlib.colors import AsinhNorm
+
+        limit = max(limit, linear)
+        style = {"norm": AsinhNorm(linear, -limit, limit), "ticks": _ticks(linear, limit)}
+    _on_sky(ax, image, grid, north, bar=bar, title=title, cmap=_SIGNED, **style)
+    circles(ax, places, labels)
 
 
 def snr_map(
@@ -78,14 +94,10 @@ def snr_map(
     labels : sequence of str
         One for each of the places, or none.
     """
-    from matplotlib.colors import AsinhNorm
-
-    limit = max(_LINEAR, float(np.nanmax(np.abs(snr))))
-    _on_sky(
-        ax, snr, grid, north, bar="S/N of a point source", title=title, cmap=_SIGNED,
-        norm=AsinhNorm(_LINEAR, -limit, limit), ticks=_SNR_TICKS,
+    signed_image(
+        ax, snr, grid, float(np.nanmax(np.abs(snr))), bar="S/N of a point source", title=title,
+        places=places, labels=labels, north=north, linear=SNR_LINEAR,
     )  # fmt: skip
-    circles(ax, places, labels)
 
 
 def wavefront_map(
@@ -120,6 +132,16 @@ def light_norm(image: Image, noise: Image | None = None) -> Any:
         return LogNorm(high * 10.0**-_DECADES, high, clip=True)
     width = 3 * float(np.median(noise))
     return AsinhNorm(width, vmin=max(low, -width), vmax=max(high, low + width))
+
+
+def _ticks(linear: float, limit: float) -> list[float]:
+    """0, and 1, 2 or 5 times a power of ten on both sides, from half of `linear` to `limit`."""
+    decades = 10.0 ** np.arange(np.floor(np.log10(linear)), np.log10(limit) + 1)
+    steps = np.outer(decades, [1, 2, 5]).ravel()
+    steps = steps[(steps >= 0.5 * linear) & (steps <= limit)]
+    # More of them would overlap.
+    steps = steps[:: max(1, len(steps) // 4)]
+    return [*(-steps[::-1]).tolist(), 0.0, *steps.tolist()]
 
 
 def _on_sky(ax: Axes, image: Image, grid: Image, north: float | None, **style: Any) -> None:

@@ -19,6 +19,9 @@ INK = "#1b1f24"
 ACCENT = "#0b6e4f"
 """A dark green, distinct from both ends of the red and blue maps."""
 
+_LABELLED = 4
+"""Largest number of circles that are labelled."""
+
 _COMPASS = 30.0
 """From the tail of an arrow to its letter, points."""
 
@@ -38,12 +41,13 @@ def label_sky(ax: Axes) -> None:
 
 
 def circles(ax: Axes, places: ArrayLike, labels: Sequence[str] = ()) -> None:
-    """Draw circles around positions (k, 2), with labels."""
+    """Draw circles around positions (k, 2), with labels unless so many would overlap."""
     x, y = np.reshape(places, (-1, 2)).T
     ax.plot(
         x, y, "o", mfc="none", mec=INK, ms=15, mew=1.6, label="companions", path_effects=halo()
     )  # fmt: skip
-    for label, place in zip(labels, zip(x, y, strict=True), strict=False):
+    shown = labels if len(x) <= _LABELLED else ()
+    for label, place in zip(shown, zip(x, y, strict=True), strict=False):
         ax.annotate(
             label, place, (0, 11), textcoords="offset points", color=INK, ha="center", va="bottom",
             path_effects=halo(),

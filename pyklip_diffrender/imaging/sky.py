@@ -282,26 +282,6 @@ class SkyModel:
             light.append({k: torch.stack(each) for k, each in sums.items()})
         return light, peaks
 
-    def pixels_in_frame(self, grid: Image, angle: float) -> Image:
-        """Row and column in a frame, (ny, nx, 2), of the pixels of the sky.
-
-        Parameters
-        ----------
-        grid : ndarray, (rows, columns, 2)
-            x, y of the frame's pixels from the star, arcsec.
-        angle : float
-            Position angle of its +y axis, degrees.
-        """
-        sine, cosine = math.sin(math.radians(angle)), math.cos(math.radians(angle))
-        x, y = np.moveaxis(self.grid, -1, 0)
-        offsets = np.stack([x * cosine + y * sine, y * cosine - x * sine])
-        rows, columns = grid.shape[0] - 1, grid.shape[1] - 1
-        steps = np.stack(
-            [(grid[0, -1] - grid[0, 0]) / columns, (grid[-1, 0] - grid[0, 0]) / rows], axis=1
-        )
-        column, row = np.linalg.solve(steps, (offsets - grid[0, 0][:, None, None]).reshape(2, -1))
-        return np.stack([row, column], axis=-1).reshape(*self.shape, 2)
-
 
 def _batches(items: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
     """Split items into parts that are solved together."""

@@ -14,6 +14,7 @@ from pyklip_diffrender.instrument.jwst import (
 from pyklip_diffrender.instrument.masks import (
     FILTERS,
     MASKS,
+    BarMask,
     detector_place,
     filter_shift,
     is_short_wave,
@@ -31,6 +32,7 @@ __all__ = [
     "MASKS",
     "NIRCAM_LW_PIXELSCALE",
     "TABULATED_GAP",
+    "BarMask",
     "ChromaticAberration",
     "blackbody",
     "detector_place",

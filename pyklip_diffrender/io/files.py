@@ -20,7 +20,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
 
-from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning
+from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, MissingFileError
 
 __all__ = ["embedded_table", "open_fits", "replacing", "sha256", "write_fits"]
 
@@ -33,8 +33,10 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
 
     Raises
     ------
+    MissingFileError
+        If there is no such file; it is also a `FileNotFoundError`.
     CorruptFileError
-        If the file is missing, truncated, or not FITS, if a card cannot be read, or if data do
+        If the file is truncated, or not FITS, if a card cannot be read, or if data do
         not match DATASUM.
 
     Warns
@@ -45,7 +47,7 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
     """
     path = Path(path)
     if not path.is_file():
-        raise CorruptFileError(f"{path}: no such file")
+        raise MissingFileError(f"{path}: no such file")
     try:
         content = path.read_bytes()
         if content.startswith(_GZIP):

@@ -17,7 +17,6 @@ from astropy.io import fits
 from pyklip_diffrender.io.files import open_fits, write_fits
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.names import same_name
-from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
     combine_patterns,
@@ -26,7 +25,7 @@ from pyklip_diffrender.pattern.measure import (
 from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.scene.exposure import star_of
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.scene.systematics import Systematics, pattern_fields, pattern_hdus
 
 __all__ = ["known_systematics", "read_patterns", "write_patterns"]
 
@@ -116,23 +115,15 @@ def _library() -> tuple[MeasuredPattern, ...]:
 
 
 def write_patterns(patterns: Sequence[MeasuredPattern], path: str | os.PathLike[str]) -> Path:
-    """Write patterns to a FITS file, two extensions (PATTERN, ERROR) for each, atomically."""
+    """Write patterns to a FITS file, two extensions as of a `Systematics` for each, atomically."""
     hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [fits.PrimaryHDU()]
     for k, pattern in enumerate(patterns, 1):
-        value = fits.ImageHDU(pattern.value.astype(np.float32), name="PATTERN", ver=k)
         error = np.sqrt(np.where(np.isfinite(pattern.variance), pattern.variance, np.nan))
-        header = value.header
+        value = pattern.value.astype(np.float32)
+        hdus += pattern_hdus(value, error.astype(np.float32), pattern, k)
+        header = hdus[-2].header
         header["STAR"] = (fits_text(pattern.star), "star that it was measured on")
-        header["FILTER"], header["CORONMSK"] = pattern.filter or "", pattern.image_mask or ""
-        header["STARX"], header["STARY"] = pattern.center
-        header["PEDESTAL"] = (
-            pattern.pedestal,
-            "added to the star, then multiplied",
-        )
-        if pattern.first_pixel is not None:
-            header["COLUMN"], header["ROW"] = pattern.first_pixel
         header["FRAME"], header["DATE-BEG"] = fits_text(pattern.frame), pattern.date
-        hdus += [value, fits.ImageHDU(error.astype(np.float32), name="ERROR", ver=k)]
     write_fits(fits.HDUList(hdus), path)
     return Path(path)
 
@@ -148,21 +139,17 @@ def read_patterns(path: str | os.PathLike[str]) -> list[MeasuredPattern]:
     patterns = []
     with open_fits(path) as hdus:
         for k in range(1, 1 + sum(hdu.name == "PATTERN" for hdu in hdus)):
-            header = hdus["PATTERN", k].header
-            error = native_float64(hdus["ERROR", k].data)
+            header, fields = hdus["PATTERN", k].header, pattern_fields(hdus, k)
+            value, error = fields.pop("pattern"), fields.pop("error")
             known = np.isfinite(error)
             patterns.append(
                 MeasuredPattern(
                     star=header["STAR"],
-                    value=np.where(known, native_float64(hdus["PATTERN", k].data), 0.0),
+                    value=np.where(known, value, 0.0),
                     variance=np.where(known, error, np.inf) ** 2,
-                    center=(header["STARX"], header["STARY"]),
-                    pedestal=header["PEDESTAL"],
-                    first_pixel=(header["COLUMN"], header["ROW"]) if "COLUMN" in header else None,
-                    filter=header["FILTER"] or None,
-                    image_mask=header["CORONMSK"] or None,
                     frame=header["FRAME"],
                     date=header["DATE-BEG"],
+                    **fields,
                 )
             )
     return patterns

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.reduction import html
-from pyklip_diffrender.reduction.words import plus_minus
+from pyklip_diffrender.reduction.words import plus_minus, scientific
 
 __all__ = ["EPOCHS", "compare_epochs", "write_epochs"]
 
@@ -171,10 +171,13 @@ def _page(
     positions = [
         [
             str(each["first_date"])[:10],
+            str(each["filter"] or ""),
             str(k),
             plus_minus(row["separation_arcsec"], row["separation_error_arcsec"]),
             plus_minus(row["position_angle_deg"], row["position_angle_error_deg"]),
             f"{row['snr']:.1f}",
+            scientific(row["contrast"], row["contrast_error"]),
+            plus_minus(row["ab_mag"], row["ab_mag_error"]) if "ab_mag" in row else "not known",
         ]
         for each in folders.values()
         for k, row in enumerate(each["candidates"], 1)
@@ -195,7 +198,9 @@ def _page(
         html.section(
             "Candidates",
             html.table(
-                ["Date", "", "Separation (arcsec)", "Position angle (deg)", "S/N"], positions
+                ["Date", "Filter", "", "Separation (arcsec)", "Position angle (deg)", "S/N",
+                 "Contrast", "AB magnitude"],
+                positions
             )
             if positions
             else html.note("No epoch has a candidate."),

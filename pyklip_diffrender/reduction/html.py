@@ -13,6 +13,7 @@ from urllib.parse import quote
 __all__ = [
     "Markup",
     "Picture",
+    "beside",
     "count",
     "document",
     "facts",
@@ -97,6 +98,11 @@ def pictures(shown: Sequence[Picture], style: str = "") -> str:
         for each in shown
     ]
     return "\n".join([f'<div class="pictures {style}">', *figures, "</div>"])
+
+
+def beside(*parts: str) -> str:
+    """Parts side by side as far as there is room."""
+    return "\n".join(['<div class="beside">', *(f"<div>{each}</div>" for each in parts), "</div>"])
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], wrap: int | None = None) -> str:

@@ -23,19 +23,22 @@ _HEADER = Template("""\
 <header>
 <h1>$target</h1>
 <p class="setup">$setup</p>
+$pictures
 <p class="result">$sentence</p>
 <div class="status $tone">
 <strong>$status</strong>
 <p>$advice</p>
 </div>
 $facts
+$links
 </header>
 """)
 
 
 def page(
     summary: Mapping[str, Any],
-    search: Sequence[Picture],
+    overview: Sequence[Picture],
+    curve: Sequence[Picture],
     stars: Sequence[Sequence[Picture]],
     wavefront: Sequence[Picture],
     wide: Sequence[Picture] = (),
@@ -49,7 +52,7 @@ def page(
     ----------
     summary : dict
         See `summarise`.
-    search, wavefront, wide, disk : sequence of Picture
+    overview, curve, wavefront, wide, disk : sequence of Picture
         Those of whole frames, `wide`, and of extended light, `disk`, may be missing.
     stars : sequence of sequence of Picture
         One for each frame of the target that is shown.
@@ -67,9 +70,8 @@ def page(
     message = status["message"]
     tone = "good" if status["name"] == "CONVERGED" else "warn" if status["usable"] else "bad"
     sections = [
-        html.section(
-            "Search", html.pictures(search, "pair"), _candidates(summary), _limits(summary)
-        ),
+        html.section("Candidates", _candidates(summary)),
+        html.section("Limits", html.beside(html.pictures(curve), _limits(summary))),
         *(
             [html.section("Whole frames", html.pictures(wide, "pair"), _wide(summary))]
             if wide
@@ -97,7 +99,9 @@ def page(
     }
     header = _HEADER.substitute(
         {name: escape(str(value)) for name, value in text.items()},
+        pictures=html.pictures(overview),
         facts=html.facts(_key_facts(summary)),
+        links=_links(files or {}),
     )
     title = f"{summary['target']}, {summary['filter'] or 'no filter'}: report"
     return html.document(title, header, sections)
@@ -116,8 +120,16 @@ def _setup(summary: Mapping[str, Any]) -> str:
         " to ".join(dict.fromkeys(filter(None, dates))),
         html.count(len(targets), "frame") + " of the target",
         html.count(references, "reference frame") if references else None,
+        summary["exposure_s"] and f"{summary['exposure_s']:.0f} s on the target",
     ]
     return " · ".join(str(part) for part in parts if part)
+
+
+def _links(files: Mapping[str, str]) -> str:
+    """The files beside the page in a line."""
+    if not files:
+        return ""
+    return f'<p class="note">Files: {", ".join(html.link(name, name) for name in files)}.</p>'
 
 
 def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -141,10 +153,9 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
             "Error of the star model",
             "none needed" if error == 0 else number(error and 100 * error, ".2g", "% of the star"),
         ),
-        ("Chi-squared per pixel, by separation", _by_ring(fit["rings"])),
         ("Errors multiplied by", number(fit["error_factor"])),
         ("Wavefront map", f"{map_['name']}, {_age(map_['days_before_first_frame'])}"),
-        ("Pattern of the model's error learned from", pattern),
+        ("Flat-field pattern", pattern),
         *flux,
     ]
 
@@ -187,15 +198,10 @@ def _candidates(summary: Mapping[str, Any]) -> str:
         "Contrast is relative to the star without coronagraph; errors are standard deviations, "
         "those of contrasts with that of the star's flux. The false-alarm probability is that of "
         "noise alone making such a peak anywhere in the field; it is not stated where the model "
-        "does not explain the data. One epoch does not show whether a candidate is bound "
-        "or in the background."
+        "does not explain the data, nor for candidates that look like extended light. One epoch "
+        "does not show whether a candidate is bound or in the background."
     )
-    return (
-        "<h3>Candidates</h3>"
-        + html.table(header, rows)
-        + html.note(note)
-        + _on_sky(summary["candidates"])
-    )
+    return html.table(header, rows) + html.note(note) + _on_sky(summary["candidates"])
 
 
 def _disk(summary: Mapping[str, Any]) -> str:
@@ -240,6 +246,13 @@ def _wide(summary: Mapping[str, Any]) -> str:
     return "<h3>Candidates</h3>" + html.table(header, rows) + html.note(note)
 
 
+PHOTOMETRY = (
+    "Flux densities and magnitudes (AB) are those of the source without coronagraph: the "
+    "transmission of mask and Lyot stop is accounted for. Their errors do not include that of the "
+    "pipeline's photometric calibration behind the coronagraph, about 30 % (0.3 mag)."
+)
+"""Whatever stands beside a flux density."""
+
 _SKY = (
     ("Mid-exposure (UTC)", "epoch", None, str),
     ("ΔRA cos Dec (arcsec)", "delta_ra_arcsec", "delta_ra_error_arcsec", plus_minus),
@@ -261,8 +274,8 @@ def _on_sky(candidates: Sequence[Mapping[str, Any]]) -> str:
         for k, each in enumerate(candidates, 1)
     ]
     note = (
-        "Errors of positions do not include those of the pixel scale and of the roll angle; errors "
-        "of flux densities do not include that of the photometric calibration."
+        "Errors of positions do not include those of the pixel scale and of the roll angle. "
+        + PHOTOMETRY
     )
     titles = ["", *(title for title, *_ in columns)]
     return "<h3>Astrometry and photometry</h3>" + html.table(titles, rows) + html.note(note)
@@ -272,21 +285,23 @@ def _limits(summary: Mapping[str, Any]) -> str:
     if not summary["limits"]:
         return ""
     sigmas = summary["contrast_curve"]["sigmas"]
+    calibrated = "ab_mag" in summary["limits"][0]
     rows = [
         [
             f"{each['separation_arcsec']:.3g}",
             scientific(each["contrast"]),
-            f"{each['delta_mag']:.2f}",
             f"{scientific(each['lowest'])} to {scientific(each['highest'])}",
-            scientific(each["known_star"]),
+            f"{each['delta_mag']:.2f}",
+            *([f"{each['ab_mag']:.2f}", scientific(each["flux_density_Jy"])] if calibrated else []),
         ]
         for each in summary["limits"]
     ]
     header = [
-        "Separation (arcsec)", "Contrast, median", "Magnitude difference (mag)",
-        "Contrast, all angles", "Contrast if the star were known",
+        "Separation (arcsec)", f"Contrast at {sigmas:g} sigma", "All angles",
+        "Magnitude difference (mag)",
+        *(["AB magnitude", "Flux density (Jy)"] if calibrated else []),
     ]  # fmt: skip
-    return f"<h3>Limits at {sigmas:g} sigma</h3>" + html.table(header, rows)
+    return html.table(header, rows) + (html.note(PHOTOMETRY) if calibrated else "")
 
 
 def _star(summary: Mapping[str, Any], stars: Sequence[Sequence[Picture]]) -> Iterable[str]:
@@ -325,13 +340,14 @@ def _frames(summary: Mapping[str, Any]) -> str:
             (each["date"] or "not known")[:16].replace("T", " "),
             number(each["position_angle_deg"], ".2f"),
             str(each["integrations"]),
+            number(each["exposure_s"], ".0f"),
             f"{100 * each['pixels_used']:.1f}",
             each["file"],
         ]
         for each in summary["frames"]
     ]
     header = ["Use", "Star", "Date (UTC)", "Position angle of +y (deg)", "Integrations",
-              "Pixels used (%)", "File"]  # fmt: skip
+              "Exposure (s)", "Pixels used (%)", "File"]  # fmt: skip
     table = html.table(header, rows)
     bad = [
         f"{each['file']}: " + ", ".join(f"({x:+.2f}, {y:+.2f})" for x, y in each["bad_pixels"])
@@ -361,18 +377,15 @@ def _provenance(summary: Mapping[str, Any], files: Mapping[str, str]) -> str:
         ("Seed", str(summary["seed"])),
         ("Chi-squared per pixel", number(summary["fit"]["chi2_per_pixel"])),
     ]
-    long = [("Software", versions), ("SHA-256 of the wavefront map", map_["sha256"])]
-    settings = [
-        [name, "none" if value is None else str(value)]
-        for name, value in summary["settings"].items()
+    settings = "; ".join(f"{name}: {value}" for name, value in summary["settings"].items())
+    long = [
+        ("Chi-squared per pixel, by separation", _by_ring(summary["fit"]["rings"])),
+        ("Software", versions),
+        ("SHA-256 of the wavefront map", map_["sha256"]),
+        ("Settings of the fit", settings),
     ]
     parts = [html.facts(facts), html.facts(long, "facts long")]
     if files:
         rows = [[html.link(name, name), content] for name, content in files.items()]
         parts += ["<h3>Files written with this page</h3>", html.table(["File", "Content"], rows, 1)]
-    parts += [
-        "<details><summary>Settings of the fit</summary>",
-        html.table(["Setting", "Value"], settings, wrap=1),
-        "</details>",
-    ]
     return "\n".join(parts)

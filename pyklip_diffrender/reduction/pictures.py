@@ -9,16 +9,18 @@ import numpy as np
 from astropy.table import QTable
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.detection import Detection, Disk, WideField, draw_search
+from pyklip_diffrender.detection import Detection, Disk, WideField, draw_curve, draw_search
 from pyklip_diffrender.reduction.html import Picture
+from pyklip_diffrender.reduction.overview import Overview
 from pyklip_diffrender.reduction.result import Reduction
 from pyklip_diffrender.reduction.summary import wavefronts
 from pyklip_diffrender.reduction.words import number
 
 __all__ = [
     "MOST_FRAMES",
+    "curve_pictures",
     "disk_pictures",
-    "search_pictures",
+    "overview_pictures",
     "star_pictures",
     "wavefront_pictures",
     "wide_pictures",
@@ -27,45 +29,57 @@ __all__ = [
 MOST_FRAMES = 4
 """Frames of which pictures are shown."""
 
-_LIMIT = 5.0
-"""Limit of the scale for residuals, standard deviations."""
 
-
-def search_pictures(
-    reduction: Reduction, summary: Mapping[str, Any], klip: QTable | None = None
-) -> list[Picture]:
-    """The S/N map and the contrast curve, with that of KLIP if it is known."""
-    detection = reduction.detection
-    count, threshold = len(detection.table), detection.threshold
-    candidates = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {threshold:g}"
+def overview_pictures(overview: Overview, summary: Mapping[str, Any]) -> list[Picture]:
+    """The frames without the star, KLIP's beside them, and the S/N map; north is up."""
+    count = len(summary["candidates"])
+    some = f"{count or 'no'} candidate{'' if count == 1 else 's'}"
+    some += f" above S/N {summary['threshold_snr']:g}"
     places = "; ".join(
         f"S/N {row['snr']:.1f} at {row['separation_arcsec']:.2f} arcsec"
         for row in summary["candidates"]
     )
-    circles = "Circles mark the candidates. " if count else ""
-    compass = "N and E point to north and east. " if summary["oriented"] else ""
-    factors = detection.error_factor.factors
-    if not detection.error_factor.is_needed:
-        scaled = "Errors are those of the fit, not scaled."
-    elif not detection.error_factor.is_measured:
-        scaled = (
-            f"Errors were multiplied by {factors[0, 0]:.2f}, the square root of the reduced "
-            "chi-squared without the candidates."
+    up = "north up" if summary["oriented"] else "oriented like the first frame"
+    words = [
+        (
+            f"Image of {summary['target']} without the star, all frames combined, {up}.",
+            f"All frames without the star, turned {up} and averaged. "
+            + ("Circles mark the candidates. " if count else "")
+            + "The scale is linear near 0 and logarithmic beyond.",
+        ),
+        (
+            "Map of the signal-to-noise ratio of a point source, "
+            f"{some}{': ' if places else ''}{places}.",
+            f"S/N of a point source at every pixel, {some}. The scale is linear within ±5.",
+        ),
+    ]
+    if overview.klip is not None:
+        label = overview.klip.label
+        words.insert(
+            1,
+            (
+                f"Image of the same frames after {label}.",
+                f"The same frames after {label}, on the same scale.",
+            ),
         )
-    else:
-        scaled = (
-            f"Errors were multiplied by {factors.min():.2f} to {factors.max():.2f}, depending on "
-            "the star's light and the separation, so that the S/N away from candidates has a "
-            "standard deviation of 1."
-        )
+    figures, axes = _panels(overview.panels)
+    overview.draw(axes)
+    return _pictures(figures, *words)
+
+
+def curve_pictures(
+    reduction: Reduction, summary: Mapping[str, Any], klip: QTable | None
+) -> list[Picture]:
+    """The contrast curve, with that of KLIP if it is known."""
+    detection = reduction.detection
     limits = "; ".join(
         f"{row['contrast']:.1e} at {row['separation_arcsec']:.3g} arcsec"
         for row in summary["limits"]
     )
     sigmas = summary["contrast_curve"]["sigmas"]
-    small_sample = (
-        " Dotted: the median, corrected for the small number of positions that tell of the scatter."
-        if detection.error_factor.is_measured
+    dotted = (
+        " Dotted: corrected for the small number of positions that tell of the scatter."
+        if detection.error_factor.is_measured or klip is not None
         else ""
     )
     beside = (
@@ -73,32 +87,47 @@ def search_pictures(
         if klip is None
         else f" Squares: {klip.meta['label']} on the same frames, in units of the same star, with "
         "the best number of modes at every separation; its noise is the scatter in a ring, its "
-        "throughput that of injected planets. Dotted: with the small-sample correction."
+        "throughput that of injected planets."
     )
+    figure, ax = drawing.panel()
+    draw_curve(ax, detection, klip)
     return _pictures(
-        _search(detection, klip),
-        (
-            f"Map of the signal-to-noise ratio of a point source, {candidates}"
-            f"{': ' if places else ''}{places}.",
-            "S/N of a point source at every pixel, all frames of the target together, on the "
-            f"pixels of the first. The scale is linear within ±5. {circles}{compass}{scaled}",
-        ),
+        [figure],
         (
             f"Curve of the contrast at {sigmas:g} sigma against separation in arcsec"
             f"{': ' if limits else ''}{limits}.",
             f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "
             "median of all position angles and their range. Dashed: the same if the image of the "
-            f"star were known exactly.{small_sample}{beside}",
+            f"star were known exactly.{beside}{dotted} {_scaled(detection)}",
         ),
+    )
+
+
+def _scaled(detection: Detection) -> str:
+    """How errors were scaled, in a sentence."""
+    factors = detection.error_factor.factors
+    if not detection.error_factor.is_needed:
+        return "Errors are those of the fit, not scaled."
+    if not detection.error_factor.is_measured:
+        return (
+            f"Errors were multiplied by {factors[0, 0]:.2f}, the square root of the reduced "
+            "chi-squared without the candidates."
+        )
+    return (
+        f"Errors were multiplied by {factors.min():.2f} to {factors.max():.2f}, depending on "
+        "the star's light and the separation, so that the S/N away from candidates has a "
+        "standard deviation of 1."
     )
 
 
 def wide_pictures(wide: WideField) -> list[Picture]:
     """The S/N map of the whole frames, and the contrast curve to their edge."""
+    figures, axes = _panels(2)
+    draw_search(axes, wide)
     count = len(wide.table)
     some = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {wide.threshold:g}"
     return _pictures(
-        _search(wide),
+        figures,
         (
             f"Map of the signal-to-noise ratio of a point source in the whole frames, {some}.",
             "S/N of a point source in the whole frames. About the star it is that of the search "
@@ -158,7 +187,8 @@ def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
         (
             f"The residual image of {observation.target} without the star, in standard "
             "deviations of the noise.",
-            f"Data without the star, over the noise of each pixel.{subtracted}",
+            "Data without the star, over the noise of each pixel; the scale is linear within ±5."
+            f"{subtracted}",
         ),
     )
 
@@ -192,13 +222,6 @@ def wavefront_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list
     )
 
 
-def _search(result: Detection | WideField, klip: QTable | None = None) -> list[Any]:
-    """Draw the S/N map and the contrast curve."""
-    figures, axes = _panels(2)
-    draw_search(axes, result, klip)
-    return figures
-
-
 def _star(detection: Detection, frame: int) -> list[Any]:
     """Draw a frame, the model of its star, and the residual, in which candidates are kept."""
     fit = detection.fits[0]
@@ -210,15 +233,17 @@ def _star(detection: Detection, frame: int) -> list[Any]:
     figures, axes = _panels(3)
     for ax, image, title in ((axes[0], data, "Data"), (axes[1], part.star, "Model of the star")):
         drawing.star_image(ax, image, part.grid, norm, bar=unit, title=title, north=north)
+    residual = detection.subtracted[frame] / noise
     places = np.stack([detection.table["x"].value, detection.table["y"].value], axis=1)
     drawing.signed_image(
         axes[2],
-        detection.subtracted[frame] / noise,
+        residual,
         part.grid,
-        _LIMIT,
+        float(np.nanmax(np.abs(residual))),
         bar="standard deviations of the noise",
         title="Residual",
         places=observation.turned(places, fit.frames[0].observation),
+        linear=drawing.SNR_LINEAR,
         north=north,
     )
     return figures

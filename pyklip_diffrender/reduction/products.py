@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Iterable
 from pathlib import Path
-
-from astropy.table import QTable
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.reduction.injections import completeness_section, injections_section
+from pyklip_diffrender.reduction.overview import Klip, Overview
 from pyklip_diffrender.reduction.page import page
 from pyklip_diffrender.reduction.pictures import (
     MOST_FRAMES,
+    curve_pictures,
     disk_pictures,
-    search_pictures,
+    overview_pictures,
     star_pictures,
     wavefront_pictures,
     wide_pictures,
@@ -26,12 +25,10 @@ from pyklip_diffrender.reduction.summary import summarise
 
 __all__ = ["PRODUCTS", "existing_products", "write_products", "write_report"]
 
-_log = logging.getLogger(__name__)
-
 PRODUCTS = {
     "report.html": "this page",
     "summary.json": "the content of this page, for programs",
-    "detection.png": "the S/N map and the contrast curve",
+    "detection.png": "the frames without the star, the S/N map and the contrast curve",
     "detection.fits": "maps, star-subtracted frames and candidates, for Detection.read",
     "candidates.ecsv": "the candidates with all columns",
     "contrast.ecsv": "the contrast curve",
@@ -89,11 +86,10 @@ def write_products(
             written.append(folder / f"{name}.ecsv")
             with replacing(written[-1]) as temporary:
                 table.write(temporary, format="ascii.ecsv", overwrite=True)
-    figure, axes = drawing.new_figure(1, 2)
-    reduction.detection.plot(axes)
+    overview = Overview(reduction, Klip.of(reduction))
     written.append(folder / "detection.png")
-    drawing.save(figure, written[-1])
-    written += write_report(reduction, folder, written)
+    drawing.save(overview.figure(), written[-1])
+    written += _write_report(reduction, overview, folder, written)
     for path in set(existing_products(folder)) - set(written):
         path.unlink()
     return written
@@ -114,15 +110,22 @@ def write_report(reduction: Reduction, folder: Path, files: Iterable[Path] = ())
     -------
     list of Path
     """
+    return _write_report(reduction, Overview(reduction, Klip.of(reduction)), folder, files)
+
+
+def _write_report(
+    reduction: Reduction, overview: Overview, folder: Path, files: Iterable[Path]
+) -> list[Path]:
     html, data = (folder / name for name in ("report.html", "summary.json"))
-    klip = _klip_curve(reduction)
+    klip = overview.klip and overview.klip.curve
     summary = summarise(reduction, klip)
     injections, fractions = reduction.injections, reduction.completeness
     curve = reduction.detection.contrast_curve
     frames = range(min(len(reduction.detection.fits[0].frames), MOST_FRAMES))
     text = page(
         summary,
-        search_pictures(reduction, summary, klip),
+        overview_pictures(overview, summary),
+        curve_pictures(reduction, summary, klip),
         [star_pictures(reduction, frame) for frame in frames],
         wavefront_pictures(reduction, summary),
         [] if reduction.wide is None else wide_pictures(reduction.wide),
@@ -138,17 +141,3 @@ def write_report(reduction: Reduction, folder: Path, files: Iterable[Path] = ())
         with replacing(path) as temporary:
             temporary.write_text(content, encoding="utf-8")
     return list(written)
-
-
-def _klip_curve(reduction: Reduction) -> QTable | None:
-    """KLIP's contrast curve; None where KLIP has no references or fails."""
-    if not reduction.sequence.references and len(reduction.sequence.science) < 2:
-        return None
-    try:
-        # pyKLIP is loaded only if it is needed.
-        from pyklip_diffrender.pyklip_backend.klip import klip_curve
-
-        return klip_curve(reduction.detection, reduction.sequence.references)
-    except Exception as error:  # An addition to the report, which is complete without it.
-        _log.warning("the report has no contrast curve of KLIP: %s", error)
-        return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from astropy.table import QTable
@@ -11,14 +12,12 @@ from astropy.table import QTable
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.reduction.extended import looks_extended
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = ["Reduction"]
-
-_SEVERAL = 3
-"""Number of candidates from which extended light is more likely than planets."""
 
 _LARGE = 4.0
 """Chi-squared per pixel above which more is missing than what real frames leave where the pattern
@@ -86,16 +85,22 @@ class Reduction:
             )
         if self.disk is not None:
             return ""
-        if len(self.detection.table) >= _SEVERAL:
-            reason = (
-                "Several candidates about one star are more often parts of a disk, or residuals of "
-                "the star, than planets"
-            )
-        elif self.systematics is not None and self.fit.chi2_per_pixel > _LARGE:
+        reason = self.extended
+        if not reason and self.systematics is not None and self.fit.chi2_per_pixel > _LARGE:
             reason = "The residual is far above the noise, as it is where the star has a disk"
-        else:
+        if not reason:
             return ""
         return f"{reason}: repeat the reduction with disk=True (--disk on the command line)."
+
+    @cached_property
+    def extended(self) -> str:
+        """How the candidates are arranged like extended light, such as a disk; else empty."""
+        curve = self.detection.contrast_curve
+        if self.disk is not None or not len(curve):
+            return ""
+        resolution = curve.meta["resolution_arcsec"]
+        edge = float(curve["separation"][-1].to_value("arcsec"))
+        return looks_extended(self.detection.table, resolution, edge)
 
     def __repr__(self) -> str:
         return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
+from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from importlib.metadata import version
 from typing import Any
@@ -55,6 +56,7 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
         "filter": sequence.filter,
         "image_mask": first.header.get("CORONMSK"),
         "program": first.header.get("PROGRAM"),
+        "exposure_s": _exposure(sequence.science),
         "first_date": min(dates).isot if dates else None,
         "last_date": max(dates).isot if dates else None,
         "epoch_mjd": detection.sky.mjd,
@@ -81,7 +83,8 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
         },
         "wavefront_map": _wavefront_map(fit, first),
         "systematics": _systematics(reduction),
-        "candidates": _rows(detection.table),
+        "extended": reduction.extended,
+        "candidates": _candidates(reduction),
         "wide_field": None if reduction.wide is None else _wide_field(reduction.wide),
         "disk": None if reduction.disk is None else _disk(reduction.disk),
         "limits": _limits(detection),
@@ -122,7 +125,7 @@ def wavefronts(fit: Refinement) -> tuple[NDArray[np.float64], NDArray[np.float64
     """
     lit = fit.model.entrance.lit.cpu().numpy()
     before = resample(fit.initial.data, len(fit.wavefront))
-    maps = [1e9 * np.real(opd) for opd in (before, fit.wavefront)]
+    maps = [1e9 * opd for opd in (before, fit.wavefront)]
     before, after = (np.where(lit, each - each[lit].mean(), np.nan) for each in maps)
     return before, after
 
@@ -178,6 +181,14 @@ def _rows(table: QTable) -> list[dict[str, Any]]:
         {_label(table, name): getattr(row[name], "value", row[name]) for name in table.colnames}
         for row in table
     ]
+
+
+def _candidates(reduction: Reduction) -> list[dict[str, Any]]:
+    """Candidates; those that look like extended light have no false-alarm probability."""
+    rows = _rows(reduction.detection.table)
+    if reduction.extended:
+        rows = [each | {"false_alarm_probability": None} for each in rows]
+    return rows
 
 
 def _wide_field(wide: WideField) -> dict[str, Any]:
@@ -238,7 +249,7 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
             for name in ("contrast", "lowest", "highest", "known_star", "small_sample")
         }
         star = detection.sky.star_jansky
-        known = {} if star is None else {"flux_density_Jy": star * values["contrast"]}
+        known = {} if star is None else _photometry(star * values["contrast"])
         rows.append(
             {
                 "separation_arcsec": float(separation_arcsec),
@@ -248,6 +259,10 @@ def _limits(detection: Detection) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def _photometry(jansky: float) -> dict[str, float]:
+    return {"flux_density_Jy": jansky, "ab_mag": (jansky * u.Jy).to_value(u.ABmag)}
 
 
 def _frame(observation: Observation, use: str) -> dict[str, Any]:
@@ -262,6 +277,12 @@ def _frame(observation: Observation, use: str) -> dict[str, Any]:
         "pixels_used": observation.valid.mean(),
         "file": observation.name,
     }
+
+
+def _exposure(frames: Sequence[Observation]) -> float | None:
+    """Exposure time of all frames, s; None where one does not say it."""
+    times = [each.header.get("EFFEXPTM") for each in frames]
+    return None if None in times else sum(times)
 
 
 def _bad_pixels(observation: Observation, fitted: FrameFit) -> list[list[float]]:

@@ -49,8 +49,8 @@ _ADVICE = {
 }
 
 _REFERENCES = (
-    " The pattern of the model's error was not known: add reference stars, or the systematics of "
-    "an earlier reduction."
+    " The flat-field pattern was not known: add reference stars, or the systematics.fits of an "
+    "earlier reduction."
 )
 
 
@@ -61,7 +61,7 @@ def advice(status: Status, *, patterned: bool, remark: str = "") -> str:
     ----------
     status : Status
     patterned : bool
-        Whether the pattern of the model's error was known.
+        Whether the flat-field pattern was known.
     remark : str
         What else there is to say about the reduction.
     """
@@ -72,6 +72,8 @@ def advice(status: Status, *, patterned: bool, remark: str = "") -> str:
 def sentence(summary: Mapping[str, Any]) -> str:
     """The result in a few sentences."""
     parts = [_compact(summary)]
+    if summary["extended"]:
+        parts.insert(0, f"{summary['extended']}: fit extended light first, with --disk.")
     if summary["disk"] is not None:
         parts.insert(0, _extended(summary))
     if summary["wide_field"] is not None:
@@ -157,9 +159,9 @@ def scientific(value: float, error: float | None = None) -> str:
 
 
 def probability(value: float | None) -> str:
-    """A probability of a false alarm; "not known" for None."""
+    """A probability of a false alarm; "not stated" for None."""
     if value is None:
-        return number(None)
+        return "not stated"
     if value < _TINY:
         return f"< {scientific(_TINY).replace('1.0 × ', '')}"
     return scientific(value) if value < 0.01 else f"{value:.2f}"

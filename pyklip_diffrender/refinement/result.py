@@ -186,9 +186,20 @@ class Refinement:
         return self.frames[0].model
 
     @property
-    def wavefront(self) -> NDArray[Any]:
-        """The refined wavefront of the first frame, (npix, npix), m."""
-        return self.frames[0].opd
+    def wavefront(self) -> Image:
+        """The refined wavefront of the first frame, (npix, npix), m, real; see `absorption`.
+
+        It is on the samples of the model's pupil. Both together are ``frames[0].opd``.
+        """
+        return np.array(np.real(self.frames[0].opd))
+
+    @property
+    def absorption(self) -> Image:
+        """Imaginary part of the first frame's wavefront, (npix, npix), m: it dims the pupil.
+
+        0 where the amplitude was not fitted.
+        """
+        return np.array(np.imag(self.frames[0].opd))
 
     @property
     def method(self) -> str:

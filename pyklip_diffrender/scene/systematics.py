@@ -19,9 +19,51 @@ from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["Systematics"]
+__all__ = ["Systematics", "pattern_fields", "pattern_hdus"]
 
 _PROVENANCE = ("stars", "frames", "dates")
+
+
+def pattern_hdus(
+    pattern: NDArray[np.floating], error: NDArray[np.floating], source: Any, version: int = 1
+) -> list[fits.ImageHDU]:
+    """Return the FITS extensions PATTERN and PATTERN_ERROR of one of the patterns of a file.
+
+    Parameters
+    ----------
+    pattern, error : ndarray, (ny, nx)
+        NaN errors where nothing was measured.
+    source : object
+        With the attributes `center`, `pedestal`, `first_pixel`, `filter` and `image_mask` of
+        `Systematics`.
+    version : int
+        Number of the pattern in the file.
+    """
+    hdus = [
+        fits.ImageHDU(pattern, name="PATTERN", ver=version),
+        fits.ImageHDU(error, name="PATTERN_ERROR", ver=version),
+    ]
+    header = hdus[0].header
+    header["STARX"], header["STARY"] = source.center
+    if source.first_pixel is not None:
+        header["COLUMN"], header["ROW"] = source.first_pixel
+    header["PEDESTAL"] = (source.pedestal, "added to the star, then multiplied")
+    header["FILTER"], header["CORONMSK"] = source.filter or "", source.image_mask or ""
+    return hdus
+
+
+def pattern_fields(hdus: fits.HDUList, version: int = 1) -> dict[str, Any]:
+    """Return pattern, error and the other attributes that `pattern_hdus` wrote."""
+    header = hdus["PATTERN", version].header
+    return {
+        "pattern": native_float64(hdus["PATTERN", version].data),
+        "error": native_float64(hdus["PATTERN_ERROR", version].data),
+        "center": (float(header["STARX"]), float(header["STARY"])),
+        "pedestal": float(header["PEDESTAL"]),
+        "first_pixel": (header["COLUMN"], header["ROW"]) if "COLUMN" in header else None,
+        "filter": header["FILTER"] or None,
+        "image_mask": header["CORONMSK"] or None,
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,18 +148,10 @@ class Systematics:
 
     def to_hdus(self) -> list[Any]:
         """Return the FITS extensions PATTERN and PATTERN_ERROR."""
-        hdus = [
-            fits.ImageHDU(self.pattern, name="PATTERN"),
-            fits.ImageHDU(self.error, name="PATTERN_ERROR"),
-        ]
+        hdus = pattern_hdus(self.pattern, self.error, self)
         header = hdus[0].header
         header["LABEL"] = fits_text(self.name)
-        header["STARX"], header["STARY"] = self.center
-        if self.first_pixel is not None:
-            header["COLUMN"], header["ROW"] = self.first_pixel
         header["UNKNOWN"] = (self.unknown, "deviation where nothing was measured")
-        header["PEDESTAL"] = (self.pedestal, "added to the star, then multiplied")
-        header["FILTER"], header["CORONMSK"] = self.filter or "", self.image_mask or ""
         for key, value in self.provenance.items():
             header[f"HIERARCH {key.upper()}"] = json.dumps(value)
         return hdus
@@ -127,14 +161,8 @@ class Systematics:
         """Make the systematics from what `to_hdus` returned."""
         header = hdus["PATTERN"].header
         return cls(
-            pattern=native_float64(hdus["PATTERN"].data),
-            error=native_float64(hdus["PATTERN_ERROR"].data),
-            center=(float(header["STARX"]), float(header["STARY"])),
+            **pattern_fields(hdus),
             unknown=float(header["UNKNOWN"]),
-            pedestal=float(header["PEDESTAL"]),
-            first_pixel=(header["COLUMN"], header["ROW"]) if "COLUMN" in header else None,
-            filter=header["FILTER"] or None,
-            image_mask=header["CORONMSK"] or None,
             name=header["LABEL"],
             provenance={
                 key: json.loads(header[key.upper()]) for key in _PROVENANCE if key.upper() in header

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from astropy.io import fits
-from hard_cases import DTYPES, NPIX, small, system, wavefront, worst
+from hard_cases import NPIX, small, system, wavefront, worst
 from stability_fits import error_of, fitted, noise, observed, star
 
 from pyklip_diffrender.bridges.image_masks import FourierMask
@@ -21,6 +21,13 @@ from pyklip_diffrender.scene import Planet, Scene, simulate
 from pyklip_diffrender.wavefront import random_drift, random_opd
 
 pytestmark = pytest.mark.hard
+
+
+PRECISIONS = pytest.mark.parametrize(
+    "dtype",
+    [torch.float64, pytest.param(torch.float32, marks=pytest.mark.slow)],
+    ids=["float64", "float32"],
+)
 
 
 @pytest.fixture
@@ -46,7 +53,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not() -> None:
 
 
 @pytest.mark.usefixtures("eight_threads")
-@pytest.mark.parametrize("dtype", DTYPES, ids=["float64", "float32"])
+@PRECISIONS
 def test_eight_threads_give_the_same_bits_every_time(dtype: torch.dtype) -> None:
     images = [small(dtype=dtype)(wavefront()).numpy() for _ in range(3)]
     assert images[0].tobytes() == images[1].tobytes() == images[2].tobytes()
@@ -69,11 +76,7 @@ def test_a_fit_with_eight_threads_is_the_serial_fit() -> None:
     assert error_of(first.frames[0].star) < 1
 
 
-@pytest.mark.parametrize(
-    "dtype",
-    [torch.float64, pytest.param(torch.float32, marks=pytest.mark.slow)],
-    ids=["float64", "float32"],
-)
+@PRECISIONS
 def test_eight_callers_of_one_model_get_what_one_gets(dtype: torch.dtype) -> None:
     """A fresh model: its constants are built by whoever comes first."""
     serial, shared = (

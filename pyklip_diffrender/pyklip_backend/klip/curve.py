@@ -27,7 +27,7 @@ from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["KlipSubtraction", "klip_curve", "small_sample_factor"]
+__all__ = ["KlipSubtraction", "klip_curve", "klip_image", "small_sample_factor"]
 
 Image = NDArray[np.float64]
 
@@ -149,6 +149,52 @@ def klip_curve(
     return table
 
 
+def klip_image(
+    detection: Detection,
+    references: Sequence[Observation] = (),
+    science: Sequence[Observation] | None = None,
+    *,
+    modes: int = _MODES,
+    north: float = 0.0,
+) -> tuple[Image, Image, str]:
+    """Subtract the star from the frames that were searched with KLIP, and combine them.
+
+    Parameters
+    ----------
+    detection : Detection
+    references : sequence of Observation
+        As for `klip_curve`.
+    science : sequence of Observation, optional
+        In place of the frames of the fit, from which a disk may have been subtracted.
+    modes : int
+        Largest number of modes.
+    north : float
+        Degrees by which the image is turned counter-clockwise from the orientation of the first
+        frame: its position angle turns it north up.
+
+    Returns
+    -------
+    image : ndarray, (ny, nx)
+        In the data's unit; NaN close to the star, where nothing is subtracted.
+    grid : ndarray, (ny, nx, 2)
+        x, y of its pixels from the star, arcsec.
+    label : str
+        References and modes.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If a roll has no references.
+    """
+    templates = Templates(detection.fits[0], detection.fits[0].frames[0])
+    resolution = detection.contrast_curve.meta["resolution_arcsec"]
+    klip = KlipSubtraction(templates, references, resolution, science, keep_companions=True)
+    used = min(modes, len(klip.modes))
+    image = klip.residuals(klip.science, north)[used - 1]
+    shown = np.where(klip._zone, image, np.nan)
+    return shown, klip.grid, klip.label_of(used)
+
+
 def small_sample_factor(
     separation: NDArray[np.float64], resolution: float, sigmas: float = 5.0
 ) -> NDArray[np.float64]:
@@ -191,6 +237,8 @@ class KlipSubtraction:
         lambda/D, arcsec.
     science : sequence of Observation, optional
         In place of the frames of the fit, from which a disk may have been subtracted.
+    keep_companions : bool
+        Leave the light of companions that are part of the fit in the frames.
 
     Attributes
     ----------
@@ -219,6 +267,8 @@ class KlipSubtraction:
         references: Sequence[Observation],
         resolution: float,
         science: Sequence[Observation] | None = None,
+        *,
+        keep_companions: bool = False,
     ) -> None:
         frames = templates.frames
         self.rolls = list(templates.rolls.values())
@@ -234,7 +284,8 @@ class KlipSubtraction:
         self.shifts = self.center - places
         if science is None:
             science = [frame.observation for frame in frames.values()]
-        companions = [frame.companion_image for frame in frames.values()]
+        kept = 0.0 if keep_companions else 1.0
+        companions = [kept * frame.companion_image for frame in frames.values()]
         images = [_filled(a) - b for a, b in zip(science, companions, strict=True)]
         self.science = shift_frames(np.array(images), self.shifts)
         self.references = [
@@ -271,6 +322,11 @@ class KlipSubtraction:
     @property
     def label(self) -> str:
         """Observing strategies, number of reference frames and of modes."""
+        return self.label_of(self.modes[0], self.modes[-1])
+
+    def label_of(self, fewest: int, most: int | None = None) -> str:
+        """The label for a number of modes, or for a range."""
+        most = most or fewest
         strategies = ["ADI"] if any(self._library) else []
         reference = f"{len(self.references)} reference frame"
         if self.references:
@@ -278,8 +334,7 @@ class KlipSubtraction:
             reference += "" if len(self.references) == 1 else "s"
         else:
             reference = "other roll" if len(self.rolls) == 2 else "other rolls"
-        most = self.modes[-1]
-        modes = "1 mode" if most == 1 else f"1 to {most} modes"
+        modes = f"{'' if fewest == most else f'{fewest} to '}{most} mode{'' if most == 1 else 's'}"
         return f"KLIP {'+'.join(strategies)} ({reference}, {modes})"
 
     def pixel(self, place: Image) -> tuple[int, int]:
@@ -288,8 +343,11 @@ class KlipSubtraction:
         row, column = np.unravel_index(int(away.argmin()), away.shape)
         return int(row), int(column)
 
-    def residuals(self, science: Image) -> Image:
-        """Frames without the star, turned and averaged, (modes, ny, nx)."""
+    def residuals(self, science: Image, north: float = 0.0) -> Image:
+        """Frames without the star, turned and averaged, (modes, ny, nx).
+
+        They have the orientation of the first roll, turned counter-clockwise by `north` degrees.
+        """
         total = np.zeros((len(self.modes), *self.distance.shape))
         for frame, roll, others in zip(science, self.rolls, self._library, strict=True):
             frames = [*(science[j] for j in others), *self.references]
@@ -300,7 +358,7 @@ class KlipSubtraction:
             residual[:, self._zone] = klip_math(
                 frame[self._zone], library, self.modes, covar_psfs=covariance
             ).T
-            turned = [rotate(each, -roll, self.center) for each in residual]
+            turned = [rotate(each, north - roll, self.center) for each in residual]
             total += np.nan_to_num(turned) / len(science)
         return total
 

@@ -1,0 +1,55 @@
+"""Whether candidates are arranged like extended light, such as a disk, rather than like planets."""
+
+from __future__ import annotations
+
+import numpy as np
+from astropy.table import QTable
+from scipy import stats
+
+__all__ = ["looks_extended"]
+
+_UNLIKELY = 0.01
+"""Probability below which unrelated sources are not taken to be arranged by chance."""
+
+_NEAR = 1.5
+"""Separation of neighbours, lambda/D: one extended source is found as several this close."""
+
+
+def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
+    """Say how candidates are arranged like extended light.
+
+    Sources that have nothing to do with each other have independent position angles, and are
+    spread evenly over the field. The number of candidates alone says nothing.
+
+    Parameters
+    ----------
+    candidates : QTable
+        Columns x and y from the star, and frame_angle.
+    resolution : float
+        lambda/D, arcsec.
+    edge : float
+        Largest separation that was searched, arcsec.
+
+    Returns
+    -------
+    str
+        Empty if the candidates may be where they are by chance.
+    """
+    count = len(candidates)
+    if count < 2:
+        return ""
+    if count > 2:
+        axes = np.sort(candidates["frame_angle"].value % 180)
+        gaps = np.diff(axes, append=axes[0] + 180)
+        # All axes are in the arc that is left by the largest gap. The probability that n random
+        # axes are in an arc a of their circle, a < 1/2, is n a^(n - 1).
+        arc = 1 - gaps.max() / 180
+        if arc < 0.5 and count * arc ** (count - 1) < _UNLIKELY:
+            return "The candidates are in line with the star, like an edge-on disk"
+    places = np.stack([candidates["x"].value, candidates["y"].value], axis=1)
+    distances = np.hypot(*(places[:, None] - places).T)[np.triu_indices(count, 1)]
+    reach = _NEAR * resolution
+    expected = len(distances) * (reach / edge) ** 2
+    if stats.poisson.sf((distances < reach).sum() - 1, expected) < _UNLIKELY:
+        return "Candidates are next to each other, like parts of an extended source"
+    return ""
