@@ -203,7 +203,7 @@ def _differences(got: Observation, expected: Observation, several: bool) -> list
     faults = []
     if got.reference != expected.reference:
         faults.append(f"used as {'reference' if got.reference else 'target'}")
-    for name in ("unit", "filter", "pixelscale"):
+    for name in ("unit", "filter", "pixelscale", "is_nircam"):
         if getattr(got, name) != getattr(expected, name):
             faults.append(f"{name} is {getattr(got, name)}")
     angles = [each.position_angles for each in (got, expected)]
@@ -218,6 +218,8 @@ def _differences(got: Observation, expected: Observation, several: bool) -> list
             faults.append("no date")
     elif abs(got.date.mjd - expected.date.mjd) > 1:
         faults.append(f"date {got.date}")
+    if got.mid_date is not None and got.date is not None and abs(got.mid_date - got.date).jd > 2:
+        faults.append(f"middle {got.mid_date}")
     if got.first_pixel not in (None, expected.first_pixel):
         faults.append(f"first pixel {got.first_pixel}, not {expected.first_pixel}")
     mine, other = got.combined(), expected.combined()

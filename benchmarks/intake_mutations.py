@@ -212,6 +212,10 @@ MUTATIONS["no unit"] = _cards(BUNIT=None)
 MUTATIONS["an unknown unit"] = _cards(BUNIT="parsnips")
 MUTATIONS["no pixel area"] = _cards(PIXAR_A2=None)
 MUTATIONS["a negative pixel area"] = _cards(PIXAR_A2=-0.0039)
+MUTATIONS["the pixel area of another detector"] = _cards(PIXAR_A2=0.00096)
+MUTATIONS["a date before the launch"] = _cards(DATE_BEG="0001-01-01T00:00:00")
+MUTATIONS["a middle of another year"] = _cards(EXPMID=59000.5)
+MUTATIONS["angles that do not add up"] = _cards(PA_APER=12.0)
 MUTATIONS["XOFFSET in mas"] = _cards(XOFFSET=20.0, YOFFSET=-10.0)
 MUTATIONS["contradicting masks"] = _cards(CORONMSK="MASKA430R")
 MUTATIONS["text for a number"] = _cards(ROLL_REF="seventy")
@@ -232,7 +236,8 @@ def _missing(*keys: str) -> Mutation:
 
 
 for _keys in (
-    ("ROLL_REF",), ("V3I_YANG",), ("ROLL_REF", "V3I_YANG", "PA_APER"), ("TARGPROP",),
+    ("INSTRUME",), ("EXPMID",), ("ROLL_REF",), ("V3I_YANG",),
+    ("ROLL_REF", "V3I_YANG", "PA_APER"), ("TARGPROP",),
     ("TARGPROP", "TARGNAME"), ("TARG_RA", "TARG_DEC"), ("CORONMSK",), ("CORONMSK", "APERNAME"),
     ("CORONMSK", "APERNAME", "SUBARRAY"), ("DETECTOR",), ("DETECTOR", "APERNAME", "FILENAME"),
     ("DATE_BEG",), ("DATE_BEG", "TIME_OBS"), ("DATE_BEG", "DATE_OBS", "EXPSTART"), ("IS_PSF",),
@@ -241,6 +246,21 @@ for _keys in (
     ("TARGPROP", "TARGNAME", "TARG_RA", "TARG_DEC", "RA_REF", "DEC_REF", "IS_PSF"),
 ):  # fmt: skip
     MUTATIONS[f"without {', '.join(_keys)}"] = _missing(*_keys)
+
+
+def _same_cards(**cards: Any) -> Mutation:
+    """Cards that say the same in other words, or nothing."""
+
+    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
+        folder.change(name, lambda hdus, _: _set(hdus, **cards), rng)
+        folder.doubtful.add(name)
+
+    return mutate
+
+
+MUTATIONS["another spelling of the unit"] = _same_cards(BUNIT="MJy sr-1")
+MUTATIONS["a middle of zero"] = _same_cards(EXPMID=0.0)
+MUTATIONS["SUBSTRT of the full frame"] = _same_cards(SUBSTRT1=1, SUBSTRT2=1)
 
 
 @_mutation("APERNAME of the full frame")
@@ -335,6 +355,22 @@ def _blank(hdus: fits.HDUList, rng: np.random.Generator) -> None:
     )
 
 
+def _negative(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    del rng
+    hdus["SCI"].data = -hdus["SCI"].data
+
+
+def _four(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    del rng
+    for key in ("SCI", "ERR", "DQ"):
+        hdus[key].data = hdus[key].data[None]
+
+
+def _big_endian(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    del rng
+    hdus["SCI"].data = hdus["SCI"].data.astype(">f8")
+
+
 def _zero(hdus: fits.HDUList, rng: np.random.Generator) -> None:
     del rng
     hdus["SCI"].data = np.zeros_like(hdus["SCI"].data)
@@ -366,6 +402,9 @@ MUTATIONS["pixels times 0.4"] = _another_unit(0.4)
 MUTATIONS["pixels times 2.5"] = _another_unit(2.5)
 MUTATIONS["star off the mask"] = _pixels(_moved, bad=True)
 MUTATIONS["errors of another unit"] = _pixels(_errors, bad=True)
+MUTATIONS["negative pixels"] = _pixels(_negative, bad=True)
+MUTATIONS["four dimensions"] = _pixels(_four, bad=True)
+MUTATIONS["double precision"] = _pixels(_big_endian, bad=False)
 MUTATIONS["no star"] = _pixels(_blank, bad=True)
 MUTATIONS["zeros"] = _pixels(_zero, bad=True)
 MUTATIONS["all flagged"] = _pixels(_masked, bad=True)

@@ -16,7 +16,8 @@ from astropy.time import Time
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints, starlight
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, NoValidPixelsError
-from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure, beginning, image_mask
+from pyklip_diffrender.scene.catalogue_star import CatalogueStar
+from pyklip_diffrender.scene.exposure import Exposure, beginning, image_mask
 
 
 @pytest.fixture
@@ -92,6 +93,10 @@ def test_the_table_says_what_every_file_is(folder: Path) -> None:
         ("mas.fits", {"XOFFSET": 15.0, "YOFFSET": -10.0, "OBSERVTN": "009"}, "milliarcseconds"),
         ("pup.fits", {"PUPIL": "CLEAR", "OBSERVTN": "009"}, "PUPIL is CLEAR"),
         ("two.fits", {"CORONMSK": "MASKA430R", "OBSERVTN": "009"}, "name different masks"),
+        ("area.fits", {"PIXAR_A2": 0.00096, "OBSERVTN": "009"}, "^by PIXAR_A2 .*0.063 in NRCALONG"),
+        ("old.fits", {"DATE-BEG": "2012-01-01", "OBSERVTN": "009"}, "^the exposure.*the launch"),
+        ("mid.fits", {"EXPMID": 59000.5, "OBSERVTN": "009"}, "EXPMID is 59000.5, expected about"),
+        ("sum.fits", {"PA_APER": 12.0, "OBSERVTN": "009"}, "PA_APER is 12.0, expected 70.050"),
     ],
 )  # fmt: skip
 def test_what_is_no_frame_of_this_setup_is_excluded(
@@ -104,6 +109,16 @@ def test_what_is_no_frame_of_this_setup_is_excluded(
     assert list(reasons(sequence)) == [name]
     assert re.search(words, reasons(sequence)[name])
     assert uses(sequence)[name] == "excluded"
+
+
+def test_cards_that_say_the_same_or_nothing_change_nothing(tmp_path: Path) -> None:
+    cards = {"BUNIT": "MJy sr-1", "EXPMID": 0.0, "INSTRUME": None, "PA_APER": 430.05}
+    calints(tmp_path / "a.fits", cards=cards)
+    calints(tmp_path / "b.fits", observation=2, roll=80.0)
+    first, second = dr.Sequence.from_files(tmp_path).science
+    assert first.mid_date is None
+    assert first.is_nircam
+    assert first.unit == second.unit
 
 
 def test_one_exposure_is_used_once(folder: Path) -> None:
@@ -202,6 +217,20 @@ def test_a_star_without_a_name_is_known_by_other_cards(
     assert as_before(sequence, folder)
 
 
+@pytest.mark.parametrize("nameless", [False, True])
+def test_a_reference_star_does_not_become_the_target(folder: Path, nameless: bool) -> None:
+    """Of a file that cannot be read, or states nothing, it is not known that it is no target."""
+    for name in (FIRST, SECOND):
+        (folder / name).write_bytes((folder / name).read_bytes()[:5000])
+    if nameless:
+        (folder / SECOND).unlink()
+        stars = dict.fromkeys(("TARGPROP", "TARGNAME", "TARG_RA", "TARG_DEC"))
+        calints(folder / SECOND, observation=2, cards=stars)
+    with pytest.raises(NoValidPixelsError, match=f"only frames that are marked.*HD 2.*{FIRST}"):
+        dr.Sequence.from_files(folder)
+    assert dr.Sequence.from_files(folder, target="HD 2").target == "HD 2"
+
+
 def test_a_frame_of_an_unknown_star_is_excluded(folder: Path) -> None:
     cards = dict.fromkeys(("TARGPROP", "TARGNAME", "TARG_RA", "TARG_DEC", "IS_PSF"))
     calints(folder / "x.fits", observation=8, date="2022-10-03T13:00:00", cards=cards)
@@ -243,8 +272,8 @@ def test_rolls_none_of_which_has_an_angle_are_refused(folder: Path) -> None:
 def test_the_sum_of_angles_stands_for_one_of_them() -> None:
     header = fits.Header({"ROLL_REF": 70.0, "PA_APER": 70.05})
     assert Exposure.of(header, "a.fits").position_angle == 70.05
-    header["V3I_YANG"] = -0.5
-    assert Exposure.of(header, "a.fits").position_angle == 69.5
+    header["V3I_YANG"] = 0.051
+    assert Exposure.of(header, "a.fits").position_angle == 70.051
     del header["ROLL_REF"]
     assert Exposure.of(header, "a.fits").position_angle is None
 

@@ -20,7 +20,7 @@ from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.reduction import EPOCHS, PRODUCTS, ReduceOptions, prepare, write_epochs
 from pyklip_diffrender.scene.admission_table import SHORT
-from pyklip_diffrender.scene.exposure import proper_motion
+from pyklip_diffrender.scene.catalogue_star import proper_motion
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.wavefront.map_choice import Rule, choose_map
 from pyklip_diffrender.wavefront.opd import as_opd_map

@@ -209,6 +209,12 @@ class DetectorPlace:
         return sum(self.siaf_pixelscale) / 2
 
     @property
+    def field(self) -> float:
+        """Least period of the star's image, arcsec, for a copy of it not to touch the mask."""
+        bar = isinstance(MASKS[self.mask], BarMask)
+        return _HALF_BAR + abs(self.offset) + 2.0 if bar else 0.0
+
+    @property
     def header_detector(self) -> str:
         """The detector as headers name it (DETECTOR)."""
         return "NRCALONG" if self.detector == "NRCA5" else self.detector

@@ -193,7 +193,7 @@ def nircam_coronagraph(
     _require_supported(place, recipe)
     bandpass = _bandpass(recipe)
     detector = _detector(place, recipe)
-    _require_samples(npix, detector, bandpass)
+    _require_samples(npix, place if image_mask else None, detector, bandpass)
     amplitude = _pupil(npix, recipe["segment_gap"], pupil).to(detector.device)
     return OpticalSystem(
         EntrancePupil(amplitude, JWST_DIAMETER, dtype, name="JWST pupil"),
@@ -277,9 +277,11 @@ def _detector(place: DetectorPlace, recipe: Mapping[str, Any]) -> Detector:
     )
 
 
-def _require_samples(npix: int, detector: Detector, bandpass: Bandpass) -> None:
+def _require_samples(
+    npix: int, place: DetectorPlace | None, detector: Detector, bandpass: Bandpass
+) -> None:
     (ny, nx), (x, y) = detector.shape, detector.pixelscale
-    field = max(nx * x, ny * y)
+    field = max(nx * x, ny * y, 0.0 if place is None else place.field)
     needed = samples_for_field(field, min(bandpass.wavelengths))
     if npix < needed:
         raise IncompatibleSetupError(

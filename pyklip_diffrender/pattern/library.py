@@ -23,7 +23,7 @@ from pyklip_diffrender.pattern.measure import (
     measure_patterns,
 )
 from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.scene.exposure import star_of
+from pyklip_diffrender.scene.catalogue_star import star_of
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics, pattern_fields, pattern_hdus
 

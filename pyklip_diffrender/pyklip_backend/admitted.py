@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from pyklip_diffrender.errors import DiffrenderWarning
 from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.pyklip_backend.source import REFERENCES, SourceFrames
-from pyklip_diffrender.scene.exposure import is_reference, star_of
+from pyklip_diffrender.scene.catalogue_star import star_of
+from pyklip_diffrender.scene.exposure import is_reference
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
 

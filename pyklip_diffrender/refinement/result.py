@@ -355,9 +355,6 @@ class Refinement:
                 for k, about in enumerate(facts["frames"])
             )
             label, sha256, date = facts["initial"]
-            # Files of earlier versions do not have them.
-            facts.setdefault("prior_ratios", {})
-            facts.setdefault("correlated_error", UNCORRELATED)
             plain: dict[str, Any] = {key: facts[key] for key in _PLAIN}
             plain |= {key: np.reshape(facts[key], (-1, 3)).astype(float) for key in _ARRAYS}
             return cls(

@@ -13,7 +13,8 @@ from astropy.time import Time
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
 from pyklip_diffrender.io.names import same_name, unknown_name
-from pyklip_diffrender.scene.exposure import CatalogueStar, Exposure
+from pyklip_diffrender.scene.catalogue_star import CatalogueStar
+from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.frame_files import FrameFile, admissible, require_some
 from pyklip_diffrender.scene.noise import why_odd_noise
 from pyklip_diffrender.scene.observation import Observation
@@ -136,11 +137,13 @@ def _require_no_lost_target(
     marked = [each.exposure.star for frames in stars.values() for each in frames]
     lost = [
         each for each in files
-        if each.reason and each.exposure.star.is_known and not each.exposure.reference
+        if not each.exposure.reference
+        # Of some files it is not known which star they show.
+        and (each.reason or not each.exposure.star.is_known)
         and not any(each.exposure.star.is_same(star) for star in marked)
     ]  # fmt: skip
     if lost:
-        reasons = "; ".join(f"{each.name}: {each.reason}" for each in lost)
+        reasons = "; ".join(f"{e.name}: {e.reason or 'its star is not known'}" for e in lost)
         raise NoValidPixelsError(
             f"only frames that are marked as references (IS_PSF) can be used, of "
             f"{', '.join(stars)}. Name one of them as the target, or correct the others: {reasons}"

@@ -6,10 +6,10 @@ No card has a default here: a value that is not stated is None, and whoever need
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
+from astropy import units as u
 from astropy.io import fits
 from astropy.time import Time
 
@@ -21,19 +21,18 @@ from pyklip_diffrender.io.headers import (
     header_number,
     header_text,
 )
-from pyklip_diffrender.io.names import same_name
+from pyklip_diffrender.scene.catalogue_star import CatalogueStar, star_of
 
 __all__ = [
-    "CatalogueStar",
     "Exposure",
     "bar_place",
     "beginning",
     "detector_of",
     "image_mask",
+    "instrument_of",
     "is_reference",
+    "middle",
     "position_angle",
-    "proper_motion",
-    "star_of",
 ]
 
 _LEVEL = re.compile(r"_([a-z0-9]+)\.fits(\.gz)?$", re.IGNORECASE)
@@ -60,62 +59,14 @@ _MASK = re.compile(r"(?<![A-Z0-9])(?:SUB\d+|MASK)?[AB]?(?:MASK)?(\d{3}R|LWB|SWB)
 _DETECTORS = {"NRCA5": "NRCALONG", "NRCB5": "NRCBLONG"}
 """Detectors whose apertures (APERNAME) have another name."""
 
-_COORDINATES: tuple[tuple[str, str], ...] = (("TARG_RA", "TARG_DEC"), ("RA_REF", "DEC_REF"))
-"""Cards of the star's coordinates, and of where the telescope pointed."""
+_SAME_ANGLE = 0.1
+"""Degrees by which the sum of two angles may differ from what a card says it is."""
 
-_SAME_PLACE = 5.0
-"""arcsec between the coordinates of one star in two headers. They may be those of a catalogue's
-epoch in one, and of the exposure in the other."""
+_LONGEST = 2.0
+"""Days from the beginning of an exposure to its middle, or to the midnight before."""
 
-_SAME_POINTING = 60.0
-"""arcsec between the coordinates of one star if its names agree, or if one of the two is where the
-telescope pointed."""
-
-
-@dataclass(frozen=True)
-class CatalogueStar:
-    """A star as a header describes it.
-
-    Attributes
-    ----------
-    names : tuple of str
-        The proposer's (TARGPROP) and the catalogue's (TARGNAME), where stated.
-    coordinates : tuple of float or None
-        Right ascension and declination, degrees.
-    pointing : bool
-        Whether these are the coordinates at which the telescope pointed, for want of the star's.
-    """
-
-    names: tuple[str, ...] = ()
-    coordinates: tuple[float, float] | None = None
-    pointing: bool = False
-
-    @property
-    def is_known(self) -> bool:
-        """Whether the header says which star it is."""
-        return bool(self.names or self.coordinates)
-
-    def is_called(self, name: str) -> bool:
-        """Whether one of the names is this one, in any spelling."""
-        return any(same_name(name, each) for each in self.names)
-
-    def separation(self, other: CatalogueStar) -> float | None:
-        """Arcsec between the coordinates of two headers; None if one has none."""
-        if self.coordinates is None or other.coordinates is None:
-            return None
-        (a, d), (b, e) = np.deg2rad([self.coordinates, other.coordinates])
-        # The haversine formula, which keeps its digits at small angles.
-        half = np.sin((e - d) / 2) ** 2 + np.cos(d) * np.cos(e) * np.sin((b - a) / 2) ** 2
-        return float(np.rad2deg(2 * np.arcsin(np.sqrt(np.clip(half, 0, 1)))) * 3600)
-
-    def is_same(self, other: CatalogueStar) -> bool:
-        """Whether two headers describe one star: coordinates decide, names where there are none."""
-        alike = any(other.is_called(name) for name in self.names)
-        apart = self.separation(other)
-        if apart is None:
-            return alike
-        coarse = alike or self.pointing or other.pointing
-        return apart < (_SAME_POINTING if coarse else _SAME_PLACE)
+_LAUNCH = 59573.0
+"""Modified Julian date of the launch of JWST, 2021-12-25."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +113,7 @@ class Exposure:
     subarray: str | None = None
     filter: str | None = None
     unit: str | None = None
-    star: CatalogueStar = CatalogueStar()
+    star: CatalogueStar = field(default_factory=CatalogueStar)
     reference: bool | None = None
     background: bool = False
     position_angle: float | None = None
@@ -203,13 +154,13 @@ class Exposure:
             level=_level(header, name, len(shape)),
             exposure_type=text("EXP_TYPE"),
             identity=_identity(header, name),
-            instrument=text("INSTRUME"),
+            instrument=instrument_of(header, name),
             detector=detector_of(header, name),
             mask=mask,
             stop=stop,
             subarray=text("SUBARRAY"),
             filter=text("FILTER"),
-            unit=header_text(header, "BUNIT", name),
+            unit=_unit(header, name),
             star=star_of(header, name),
             reference=is_reference(header),
             background=_flag(header, "BKGDTARG") is True,
@@ -290,32 +241,12 @@ def bar_place(header: fits.Header, name: str) -> str | None:
     return match[1] if match else None
 
 
-def star_of(header: fits.Header, name: str) -> CatalogueStar:
-    """Read which star a header names, and where it is."""
-    names = [header_text(header, key, name) for key in ("TARGPROP", "TARGNAME")]
-    for keys in _COORDINATES:
-        place = [header_number(header, key, name) for key in keys]
-        # Files without a target have zeros.
-        if None not in place and any(place):
-            ra, dec = (float(each or 0.0) for each in place)
-            if not -90 <= dec <= 90:
-                raise card_error(name, keys[1], dec, "a declination in degrees")
-            return CatalogueStar(tuple(filter(None, names)), (ra, dec), keys != _COORDINATES[0])
-    return CatalogueStar(tuple(filter(None, names)))
-
-
 def _flag(header: fits.Header, key: str) -> bool | None:
     """Logical value of a card, which may be written as text or a number."""
     value = header.get(key)
     if isinstance(value, bool | int):
         return bool(value)
     return {"T": True, "TRUE": True, "F": False, "FALSE": False}.get(str(value).strip().upper())
-
-
-def proper_motion(header: fits.Header, name: str) -> tuple[float, float] | None:
-    """Proper motion of the star, arcsec per year (MU_RA, which includes cos Dec, and MU_DEC)."""
-    east, north = (header_number(header, key, name) for key in ("MU_RA", "MU_DEC"))
-    return None if east is None or north is None else (east, north)
 
 
 def is_reference(header: fits.Header) -> bool | None:
@@ -333,6 +264,11 @@ def position_angle(header: fits.Header, name: str) -> float | None:
     -------
     float or None
         None if the cards do not say.
+
+    Raises
+    ------
+    CorruptFileError
+        If the cards contradict each other.
     """
     roll, angle, parity, total = (
         header_number(header, key, name) for key in ("ROLL_REF", "V3I_YANG", "VPARITY", "PA_APER")
@@ -342,7 +278,10 @@ def position_angle(header: fits.Header, name: str) -> float | None:
     if angle is None:
         return total
     # -1 for every detector of JWST, in which x goes opposite to V2.
-    return roll - angle * (-1.0 if parity is None else parity)
+    turned = roll - angle * (-1.0 if parity is None else parity)
+    if total is not None and abs((turned - total + 180) % 360 - 180) > _SAME_ANGLE:
+        raise card_error(name, "PA_APER", total, f"{turned:.3f}, by ROLL_REF and V3I_YANG")
+    return turned
 
 
 def beginning(header: fits.Header, name: str) -> Time | None:
@@ -360,16 +299,37 @@ def beginning(header: fits.Header, name: str) -> Time | None:
     CorruptFileError
         If a card does not hold a date.
     """
-    whole = header_date(header, ("DATE-BEG",), name)
-    if whole is not None:
-        return whole
-    split = day_and_time(header, name)
-    if split is not None:
-        return split
-    start = header_number(header, "EXPSTART", name)
-    if start:
-        return Time(start, format="mjd", scale="utc")
-    return header_date(header, ("DATE-OBS",), name)
+    dates = header_date(header, ("DATE-BEG",), name), day_and_time(header, name)
+    date = next((each for each in dates if each is not None), None)
+    if date is None:
+        start = header_number(header, "EXPSTART", name)
+        if start:
+            date = Time(start, format="mjd", scale="utc")
+        else:
+            date = header_date(header, ("DATE-OBS",), name)
+    if date is not None and date.mjd < _LAUNCH:
+        raise CorruptFileError(
+            f"{name}: the exposure began on {date.iso[:10]} by the header, before the launch of "
+            "JWST. Correct DATE-BEG, DATE-OBS or EXPSTART, or fetch the file again"
+        )
+    return date
+
+
+def middle(header: fits.Header, name: str) -> Time | None:
+    """Middle of an exposure, UTC (EXPMID); None if the header does not say.
+
+    Raises
+    ------
+    CorruptFileError
+        If it is more than two days from the beginning.
+    """
+    day = header_number(header, "EXPMID", name)
+    if not day:
+        return None
+    start = beginning(header, name)
+    if start is not None and abs(day - start.mjd) > _LONGEST:
+        raise card_error(name, "EXPMID", day, f"about {start.mjd:.2f}, when the exposure began")
+    return Time(day, format="mjd", scale="utc")
 
 
 def _level(header: fits.Header, name: str, dimensions: int) -> str | None:
@@ -388,6 +348,22 @@ def _level(header: fits.Header, name: str, dimensions: int) -> str | None:
     if stated == "calints" and dimensions == 2:
         return "cal"
     return stated
+
+
+def instrument_of(header: fits.Header, name: str) -> str | None:
+    """Instrument, from INSTRUME or the detector; None if not stated."""
+    stated = header_text(header, "INSTRUME", name)
+    if stated is None and (detector_of(header, name) or "").startswith("NRC"):
+        return "NIRCAM"
+    return None if stated is None else stated.upper()
+
+
+def _unit(header: fits.Header, name: str) -> str | None:
+    """BUNIT, spelled as the pipeline does where it is the pipeline's."""
+    stated = header_text(header, "BUNIT", name)
+    usual = u.MJy / u.sr
+    is_usual = stated is not None and u.Unit(stated, parse_strict="silent") == usual
+    return "MJy/sr" if is_usual else stated
 
 
 def detector_of(header: fits.Header, name: str) -> str | None:

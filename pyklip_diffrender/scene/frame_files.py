@@ -72,8 +72,12 @@ class FrameFile:
         try:
             return Observation.from_fits(self.path)
         except DiffrenderError as error:
-            self.reason = str(error).removeprefix(f"{self.name}: ")
+            self.reason = _without_name(error, self.name)
             return None
+
+
+def _without_name(error: Exception, name: str) -> str:
+    return str(error).removeprefix(f"{name}: ")
 
 
 def exposures_in(
@@ -126,7 +130,7 @@ def _frame_file(path: Path) -> FrameFile:
                 shape = np.shape(hdus["SCI"].data)
             return FrameFile(path, Exposure.of(header, path.name, shape))
     except DiffrenderError as error:
-        return FrameFile(path, Exposure(path.name), reason=str(error))
+        return FrameFile(path, Exposure(path.name), reason=_without_name(error, path.name))
 
 
 def admissible(files: Iterable[FrameFile]) -> list[FrameFile]:

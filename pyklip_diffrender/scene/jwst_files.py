@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from astropy.time import Time
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import (
@@ -31,7 +30,7 @@ from pyklip_diffrender.scene.detector_pixels import (
     recorded_shifts,
     undo_shifts,
 )
-from pyklip_diffrender.scene.exposure import beginning, position_angle
+from pyklip_diffrender.scene.exposure import beginning, detector_of, middle, position_angle
 from pyklip_diffrender.scene.integrations import Judgement, empty_integrations
 from pyklip_diffrender.scene.star_place import measured_offset
 
@@ -53,6 +52,9 @@ may be good; where it is not, the pipeline sets DO_NOT_USE as well."""
 
 BEHIND_THE_MASK = 0.1
 """Largest dither, arcsec, that leaves a star behind the mask; small-grid dithers are of 0.02."""
+
+_SCALES = (0.031, 0.063)
+"""arcsec of a pixel of NIRCam's short-wave and long-wave detectors, to 2 %."""
 
 _MISPLACED = 1.2
 """Pixels of a star from its stated position beyond which that is wrong: it is measured to half a
@@ -198,7 +200,6 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
         (("STARCENX", "CRPIX1"), ("STARCENY", "CRPIX2"))
     ]  # fmt: skip
     angle = position_angle(header, name)
-    middle = header_number(header, "EXPMID", name)
     area = number("PIXAR_A2", 0.0)
     if area == 0:
         raise UnitError(f"{name}: the header has no PIXAR_A2 (pixel area, arcsec^2)")
@@ -207,13 +208,21 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
             f"{name}: PIXAR_A2 is {area}, expected a pixel area in arcsec^2, such as 0.0039. "
             "Correct the header, or fetch the file again"
         )
+    detector = detector_of(header, name) or ""
+    if detector.startswith("NRC"):
+        usual = _SCALES[detector.endswith(("LONG", "5"))]
+        if not 0.9 < area**0.5 / usual < 1.1:
+            raise CorruptFileError(
+                f"{name}: by PIXAR_A2 a pixel is {area**0.5:.3g} arcsec wide, and {usual:g} in "
+                f"{detector}. Correct the header, or fetch the file again"
+            )
     return {
         "unit": unit,
         "pixelscale": area**0.5,
         "center": None if np.isnan(star).any() else np.array(star) - 1,
         "filter": header_text(header, "FILTER", name),
         "date": beginning(header, name),
-        "mid_date": None if middle is None else Time(middle, format="mjd", scale="utc"),
+        "mid_date": middle(header, name),
         "position_angles": None if angle is None else np.full(frames, angle),
         "name": name,
         "header": header,

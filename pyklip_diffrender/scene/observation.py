@@ -20,8 +20,9 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.scene.catalogue_star import star_of
 from pyklip_diffrender.scene.checked_frames import checked_frames
-from pyklip_diffrender.scene.exposure import star_of
+from pyklip_diffrender.scene.exposure import instrument_of
 from pyklip_diffrender.scene.integrations import judge_pointings, pointings
 from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints, without_empty
 from pyklip_diffrender.scene.noise import calibrated_errors, weighted_mean
@@ -308,7 +309,7 @@ class Observation:
     @property
     def is_nircam(self) -> bool:
         """Whether the header says that these are real frames of NIRCam."""
-        return str(self.header.get("INSTRUME", "")).strip().upper() == "NIRCAM"
+        return instrument_of(self.header, self.name) == "NIRCAM"
 
     @property
     def position_angle(self) -> float:
