@@ -148,12 +148,12 @@ def _instrument_and_wavefront() -> list[Breakage]:
         Breakage(
             "evidence", "scales of a prior are those of the highest evidence",
             "share = 1 - precision * variance", "share = precision * variance",
-            "refinement recovery",
+            "response refinement recovery",
         ),
         Breakage(
             "prior-weight", "the prior holds back modes that the data do not determine",
             ".add_((1 + damping) * precision)", ".add_(1e-9 + damping * precision)",
-            "refinement recovery",
+            "response refinement recovery",
         ),
     ]  # fmt: skip
 

@@ -140,7 +140,7 @@ def samples_for_field(field: float, wavelength: float, diameter: float = JWST_DI
     return math.ceil(field * ARCSEC * diameter / wavelength)
 
 
-def resample(opd: NDArray[np.float64], npix: int, name: str = "opd") -> NDArray[np.float64]:
+def resample(opd: NDArray[np.float64], npix: int) -> NDArray[np.float64]:
     """Resample square pupil maps to another number of pixels across the same pupil.
 
     Blocks are averaged where the numbers of pixels divide; otherwise the map is interpolated
@@ -152,8 +152,6 @@ def resample(opd: NDArray[np.float64], npix: int, name: str = "opd") -> NDArray[
     opd : ndarray, (..., n, n)
         Real values.
     npix : int
-    name : str
-        Name of the map, for messages.
 
     Returns
     -------
@@ -166,7 +164,7 @@ def resample(opd: NDArray[np.float64], npix: int, name: str = "opd") -> NDArray[
     """
     if opd.ndim < 2 or opd.shape[-1] != opd.shape[-2] or not opd.size:
         raise ShapeError(
-            f"{name}: got shape {opd.shape}, expected square maps, (..., npix, npix), whose sides "
+            f"opd: got shape {opd.shape}, expected square maps, (..., npix, npix), whose sides "
             "are those of the pupil array. Pad what is missing with zeros"
         )
     count = opd.shape[-1]

@@ -10,7 +10,7 @@ import torch
 from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
-from pyklip_diffrender.linear.frames import LinearFrame
+from pyklip_diffrender.linear.frames import LinearFrame, pixel_pieces
 from pyklip_diffrender.linear.noise import curvature_of, summed_rows
 from pyklip_diffrender.refinement.objective import Objective, State
 
@@ -46,10 +46,6 @@ class NormalEquations:
     frames: tuple[LinearFrame, ...]
 
 
-_PIXELS = 1024
-"""Number of pixels whose Jacobian is converted to double precision at a time."""
-
-
 def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     """G G^T and G r of the whitened Jacobian G = jacobian * weight.
 
@@ -63,8 +59,7 @@ def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Ten
     gradient = torch.zeros(count, dtype=torch.float64)
     # Only one triangle is computed, in place; LAPACK wants columns contiguous.
     triangle = np.zeros((count, count), order="F")
-    for start in range(0, jacobian.shape[1], _PIXELS):
-        piece = slice(start, start + _PIXELS)
+    for piece in pixel_pieces(jacobian.shape[1]):
         white = jacobian[:, piece].double().mul_(weight[piece])
         gradient += white @ residual[piece]
         triangle = dsyrk(1.0, white.numpy().T, beta=1.0, c=triangle, trans=1, overwrite_c=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -134,26 +134,20 @@ class Problem:
         image: Tensor,
         sigma: Tensor,
         names: tuple[str, ...],
-        *,
-        data: Tensor | None = None,
-        start: Mapping[str, Any] | None = None,
     ) -> tuple[float, float]:
         """Weighted least-squares flux and background for a rendered star.
 
         A parameter that is not in `names` keeps its start (flux must then have been given).
-        `data` and `start` take the place of the problem's own.
         """
         weight = torch.where(self.valid, sigma**-2, 0.0)
-        begin = self.start if start is None else start
-        flux = float(begin.get("flux", 0.0))
-        level = float(begin.get("background", 0.0))
+        flux = float(self.start.get("flux", 0.0))
+        level = float(self.start.get("background", 0.0))
         columns = []
         if "flux" in names:
             columns.append(image)
         if "background" in names:
             columns.append(torch.ones_like(image))
-        target = self.data if data is None else data
-        target = target - (0 if "flux" in names else flux) * image
+        target = self.data - (0 if "flux" in names else flux) * image
         target = target - (0 if "background" in names else level)
         if columns:
             design = torch.stack(columns).flatten(1)

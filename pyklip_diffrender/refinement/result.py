@@ -103,7 +103,7 @@ class Refinement:
         Logarithm of the evidence of the linearised model, up to a constant of the data. Differences
         compare priors.
     systematics : Systematics or None
-        Assumed pattern of the model's error.
+        Assumed flat-field pattern.
     stored_linear : LinearModel or None
         The linear model; None if the fit was read from a file without it.
     history : list of dict
@@ -355,9 +355,6 @@ class Refinement:
                 for k, about in enumerate(facts["frames"])
             )
             label, sha256, date = facts["initial"]
-            # Files of earlier versions do not have them.
-            facts.setdefault("prior_ratios", {})
-            facts.setdefault("correlated_error", UNCORRELATED)
             plain: dict[str, Any] = {key: facts[key] for key in _PLAIN}
             plain |= {key: np.reshape(facts[key], (-1, 3)).astype(float) for key in _ARRAYS}
             return cls(

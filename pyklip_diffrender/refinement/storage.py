@@ -122,24 +122,10 @@ def text_hdu(name: str, content: Mapping[str, Any]) -> fits.ImageHDU:
     return fits.ImageHDU(np.frombuffer(text.encode(), dtype=np.uint8), name=name)
 
 
-def _of_this_version(content: dict[str, Any]) -> dict[str, Any]:
-    """Content of a file in which tolerances of the settings implied modes of the fit."""
-    settings = content.get("settings")
-    if not isinstance(settings, dict) or settings.get("class") != GaussNewton.__name__:
-        return content
-    values = settings["fields"]
-    if "accurate_steps" not in values:
-        searches = not values["min_model_error"] > 0
-        values |= dict.fromkeys(("grow_basis", "coarse_first", "companions_if_stalled"), searches)
-        values["accurate_steps"] = values["relinearise"] > 0.05
-    return content
-
-
 def text_of(hdus: fits.HDUList, name: str) -> dict[str, Any]:
     """Return the content of an extension that `text_hdu` made."""
     text = np.asarray(hdus[name].data, dtype=np.uint8).tobytes().decode()
-    content = _of_this_version(json.loads(text))
-    return {key: decoded(value) for key, value in content.items()}
+    return {key: decoded(value) for key, value in json.loads(text).items()}
 
 
 @contextmanager
@@ -235,8 +221,8 @@ def observation_hdus(observation: Observation, frame: int) -> tuple[dict[str, An
 
 def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Observation:
     """Make an observation from the metadata and extensions of `observation_hdus`."""
-    angles, date, middle = facts["position_angles"], facts["date"], facts.get("mid_date")
-    offset, first_pixel = facts.get("star_offset"), facts.get("first_pixel")
+    angles, date, middle = facts["position_angles"], facts["date"], facts["mid_date"]
+    offset, first_pixel = facts["star_offset"], facts["first_pixel"]
     return Observation.from_arrays(
         image(hdus, "DATA", frame),
         image(hdus, "ERROR", frame),
@@ -304,10 +290,6 @@ def linear_of(hdus: fits.HDUList, frames: int, name: str) -> LinearModel:
     for k in range(frames):
         arrays: dict[str, Tensor] = {}
         for key in _FRAME_ARRAYS:
-            if key == "light" and ("LINEAR_LIGHT", k + 1) not in hdus:
-                # Files of earlier versions have no correlated error.
-                arrays[key] = torch.zeros_like(arrays["residual"])
-                continue
             data = hdus[f"LINEAR_{key}", k + 1].data
             kind = {"jacobian": np.float32, "rows": np.int64, "drift": np.int64}.get(
                 key, np.float64
@@ -321,7 +303,7 @@ def linear_of(hdus: fits.HDUList, frames: int, name: str) -> LinearModel:
     )
     curvature = torch.from_numpy(native_float64(hdus["CURVATURE"].data))
     header = hdus["CURVATURE"].header
-    correlated = CorrelatedError(header.get("SHARED", 0.0), header.get("OWN", 0.0))
+    correlated = CorrelatedError(header["SHARED"], header["OWN"])
     count = len(unknowns)
     wrong = curvature.shape != (count, count) or any(
         len(part.jacobian) != len(part.rows)

@@ -78,15 +78,13 @@ def check_opd(opd: Array, amplitude: Array, name: str) -> None:
         )
 
 
-def opd_to_hdus(opd: Any, diameter: float = JWST_DIAMETER) -> fits.HDUList:
+def opd_to_hdus(opd: Any) -> fits.HDUList:
     """An OPD as an HDUList that poppy and stpsf read, for ``nircam.pupilopd`` or a file.
 
     Parameters
     ----------
     opd : OPDMap, Tensor, Quantity or array, (npix, npix)
         Bare numbers are metres. The header records the origin of an `OPDMap`.
-    diameter : float
-        Side of the array, m.
 
     Returns
     -------
@@ -96,8 +94,8 @@ def opd_to_hdus(opd: Any, diameter: float = JWST_DIAMETER) -> fits.HDUList:
     values = to_metres(opd, "opd")
     header = fits.Header()
     header["BUNIT"] = "m"
-    header["PUPLDIAM"] = (diameter, "[m] side of the array")
-    header["PUPLSCAL"] = (diameter / values.shape[-1], "[m / pixel]")
+    header["PUPLDIAM"] = (JWST_DIAMETER, "[m] side of the array")
+    header["PUPLSCAL"] = (JWST_DIAMETER / values.shape[-1], "[m / pixel]")
     header["CONTENTS"] = "OTE OPD, entrance pupil orientation"
     if isinstance(opd, OPDMap):
         header["OPDFILE"] = (fits_text(opd.name), "Origin of the map")

@@ -122,7 +122,7 @@ def read_opd(
     return _checked(OPDMap(data, date, path.name, sha256(path)))
 
 
-def as_opd_map(opd: Any, name: str = "array") -> OPDMap:
+def as_opd_map(opd: Any) -> OPDMap:
     """Make an `OPDMap` of a path, Quantity, array, tensor, map or "flat"; bare numbers are metres.
 
     Raises
@@ -132,6 +132,7 @@ def as_opd_map(opd: Any, name: str = "array") -> OPDMap:
     """
     if isinstance(opd, OPDMap):
         return opd
+    name = "array"
     if isinstance(opd, str) and opd == FLAT:
         opd, name = np.zeros((_FLAT_SAMPLES, _FLAT_SAMPLES)), "flat wavefront"
     if isinstance(opd, str | os.PathLike):

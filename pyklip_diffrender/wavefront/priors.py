@@ -41,6 +41,10 @@ _SCALE_LIMITS = (1e-4, 100.0)
 zero; without a ceiling, a bright companion that is missing from the model makes the prior so wide
 that the equations cannot be solved."""
 
+_RIDGE = 1e-3
+"""Ridge of the fit of modes to maps, relative to the norms of the modes. Modes that are degenerate
+on the mirror share what they explain."""
+
 _ENOUGH_MODES = 20.0
 """Smallest number of determined modes that constrain the scale of a group."""
 
@@ -173,7 +177,6 @@ def learn_prior(
     *,
     diameter: float = JWST_DIAMETER,
     npix: int = 128,
-    ridge: float = 1e-3,
 ) -> WavefrontPrior:
     """Derive a prior from the differences of successive wavefront maps.
 
@@ -186,9 +189,6 @@ def learn_prior(
         Side of the maps, m.
     npix : int
         Samples on which modes are fitted; the maps are averaged onto them.
-    ridge : float
-        Ridge of the fit, relative to the norms of the modes. Modes that are degenerate on the
-        mirror share what they explain.
 
     Returns
     -------
@@ -220,7 +220,7 @@ def learn_prior(
     lit = torch.from_numpy(np.abs(averaged).max(axis=0) > 0)
     inside = basis.modes(grid, 0, len(basis))[:, lit]
     system = inside @ inside.T
-    system.diagonal().mul_(1 + ridge)
+    system.diagonal().mul_(1 + _RIDGE)
     right = inside @ torch.from_numpy(averaged)[:, lit].T
     coefficients = torch.linalg.solve(system, right).square().mean(dim=1).sqrt().numpy()
     frequency, group = basis.frequencies.numpy(), basis.group_index.numpy()
