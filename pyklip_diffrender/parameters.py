@@ -87,8 +87,8 @@ LEVELS = (
     ),
     Parameter(
         "pedestal", "", 1, 0.0, 0.0, -inf, inf, inf,
-        "light per pixel that the pattern of the model's error multiplies besides the star, in "
-        "units of the image",
+        "light per pixel that the flat-field pattern multiplies besides the star, in units of the "
+        "image",
     ),
 )  # fmt: skip
 """Free parameters of an observation, besides those of the optics."""

@@ -50,9 +50,11 @@ def axes_for(ax: Any, count: int) -> Sequence[Axes]:
 def new_figure(rows: int, columns: int) -> tuple[Figure, NDArray[Any]]:
     """Make a figure for a file, with a grid of axes, (rows, columns)."""
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     size = (4.6 * columns, 4.0 * rows)
-    figure = Figure(figsize=size, layout="compressed")
+    # Colour bars and their labels are outside the axes that the layout knows.
+    figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(compress=True, w_pad=0.15))
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 

@@ -1,4 +1,4 @@
-"""Copies of reduced frames to which faint sources were added: what the star takes, without a fit.
+"""Copies of reduced frames to which faint sources were added: self-subtraction without a fit.
 
 A contrast curve by injection reduces the same frames a hundred times, with other planets in each.
 Light that is added to the data changes the star by the image of H^-1 G (light), to first order (see

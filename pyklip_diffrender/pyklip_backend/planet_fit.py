@@ -1,7 +1,7 @@
 """The planet of a forward model as the linear model of the fit measures it.
 
 A fit of the product, such as `pyklip.fitpsf.FMAstrometry`, has to estimate the noise from an
-annulus about the star. The linear model knows the noise of every pixel and what the star takes, so
+annulus about the star. The linear model knows the noise of every pixel and the self-subtraction, so
 that its values are more precise and its errors are those of the values.
 """
 

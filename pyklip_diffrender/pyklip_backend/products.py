@@ -139,7 +139,7 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         (
             "DRSYST",
             _shared(r.subtraction.systematics for r in records),
-            "pattern of the model's error",
+            "flat-field pattern",
         ),
         (
             "DRREFS",

@@ -90,7 +90,7 @@ class DiffrenderSettings:
     start : dict, optional
         Starting values by parameter name; see `refine`.
     systematics : Systematics, "auto", "references" or "off", optional
-        Pattern of the model's error. "auto", the default for real NIRCam frames, takes that of the
+        Flat-field pattern. "auto", the default for real NIRCam frames, takes that of the
         library, and fits the reference frames only where it has none; "references" fits them in
         any case and uses both; see `reduce`. Reference frames are those of a psf_library that
         `JWSTData` has read, if the mode contains RDI, and any in the dataset.

@@ -5,11 +5,12 @@ the star, but some is fitted as starlight, and subtracted. To first order the un
 change by H^-1 G p, where G is the whitened Jacobian and H the curvature of the penalised
 chi-squared (see `linear.model`), and the star by the image of that change.
 
-The star takes more of a source's wings than of its core, so that the fraction that is left depends
-on how the source is measured. Here it is the fraction of the peak: 1 - g . change / g . p with a
-Gaussian g of half the width of the source. `pyklip.fakes.gaussfit2d`, by which pyKLIP and spaceKLIP
-measure injected sources, adapts its Gaussian to the narrower core that is left, and agrees with
-this within 2 % (1 sigma) on NIRCam frames; a fit of the whole image would have about 18 % less.
+Self-subtraction is larger in a source's wings than in its core, so that the fraction that is left
+depends on how the source is measured. Here it is the fraction of the peak: 1 - g . change / g . p
+with a Gaussian g of half the width of the source. `pyklip.fakes.gaussfit2d`, by which pyKLIP and
+spaceKLIP measure injected sources, adapts its Gaussian to the narrower core that is left, and
+agrees with this within 2 % (1 sigma) on NIRCam frames; a fit of the whole image would have about 18
+% less.
 """
 
 from __future__ import annotations

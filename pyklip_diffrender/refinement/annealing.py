@@ -399,5 +399,5 @@ class Annealing:
         )
 
     def _with_companions(self, state: State, added: Sequence[Planet]) -> State:
-        _log.info("companions given parameters of their own: %s", added)
+        _log.info("possible sources, fitted with the star: %s", added)
         return self.objective.at(*state.unknowns.with_companions(added, state.vector))

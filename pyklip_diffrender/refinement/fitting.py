@@ -63,7 +63,7 @@ def refine(
         Starting values by parameter name, for all observations or one by one. "detector_shift"
         is by default that of the star in the observation.
     systematics : Systematics, optional
-        Known pattern of the model's error, see `learn_systematics`.
+        Known flat-field pattern, see `learn_systematics`.
     plan : "auto" or "off"
         Has no effect: the fit uses `model` and the modes of the settings, whatever the noise. It is
         accepted because earlier versions chose a coarser model where the noise allowed one.

@@ -36,7 +36,7 @@ class Point:
     image : Tensor, (ny, nx)
         The star at flux 1.
     light : Tensor, (ny, nx)
-        The star in the data's unit, with the known pattern of the model's error (also that of the
+        The star in the data's unit, with the known flat-field pattern (also that of the
         pedestal, see `Systematics`).
     star : Tensor, (ny, nx)
         The same with the background.
@@ -55,7 +55,7 @@ class Point:
 
     @property
     def multiplied(self) -> Tensor:
-        """Light that the pattern of the model's error multiplies, (ny, nx)."""
+        """Light that the flat-field pattern multiplies, (ny, nx)."""
         return self.light + self.unknowns.level("pedestal", self.vector)
 
 

@@ -46,7 +46,7 @@ class FrameFit:
         Every parameter but the wavefront and its standard deviation (NaN where it was not
         fitted), in the units of the parameter table.
     gain : ndarray, (ny, nx)
-        Known pattern of the model's error, which multiplies the star; 1 without systematics.
+        Known flat-field pattern, which multiplies the star; 1 without systematics.
     coefficients : ndarray or None
         Coefficients of the wavefront modes, nm.
     """
@@ -129,7 +129,7 @@ class FrameFit:
         Returns
         -------
         ndarray, (ny, nx)
-            In the unit of the observation, without the pattern of the model's error.
+            In the unit of the observation, without the flat-field pattern.
         """
         model, values = self.on_pixels(fov_pixels, center)
         if source is not None:

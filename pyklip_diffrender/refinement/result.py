@@ -103,7 +103,7 @@ class Refinement:
         Logarithm of the evidence of the linearised model, up to a constant of the data. Differences
         compare priors.
     systematics : Systematics or None
-        Assumed pattern of the model's error.
+        Assumed flat-field pattern.
     stored_linear : LinearModel or None
         The linear model; None if the fit was read from a file without it.
     history : list of dict

@@ -32,7 +32,7 @@ _REDUCED = {
     "seconds": ("DRSECS", "duration of the refinement, s"),
     "opd": ("DROPD", "wavefront map at the start"),
     "opd_sha256": ("DRSHA256", ""),
-    "systematics": ("DRSYST", "pattern of the model's error"),
+    "systematics": ("DRSYST", "flat-field pattern"),
     "scatter": ("DRERRFAC", "median factor of the errors"),
     "threshold": ("DRTHRESH", "smallest S/N of a candidate"),
     "star_flux_density_jy": ("DRSTARJY", "flux density of the star, Jy"),
