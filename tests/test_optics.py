@@ -15,7 +15,7 @@ from pyklip_diffrender.errors import (
     ShapeError,
     UnitError,
 )
-from pyklip_diffrender.instrument.masks import FILTERS, ROUND_MASKS
+from pyklip_diffrender.instrument.masks import FILTERS, MASKS
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, filter_throughput
 from pyklip_diffrender.io.units import ARCSEC
@@ -257,7 +257,7 @@ PROFILES = {
 @pytest.mark.parametrize("name", PROFILES)
 def test_occulter_complement_keeps_its_digits_near_the_centre(name: str) -> None:
     mpmath = pytest.importorskip("mpmath")
-    mask = ROUND_MASKS[name]
+    mask = MASKS[name]
     for r in (0.0, 1e-9, 1e-5, 1e-2, 0.3, 1.0, 0.999 * mask.radius):
         s = mpmath.mpf(r) * mpmath.mpf(PROFILES[name][0])
         exact = 1 if s == 0 else (2 * mpmath.besselj(1, s) / s) ** 2
@@ -267,7 +267,7 @@ def test_occulter_complement_keeps_its_digits_near_the_centre(name: str) -> None
 
 @pytest.mark.parametrize("name", PROFILES)
 def test_occulter_is_exactly_clear_beyond_its_radius(name: str) -> None:
-    mask = ROUND_MASKS[name]
+    mask = MASKS[name]
     beyond = torch.tensor([mask.radius * (1 + 1e-12), 4.0, 10.0], dtype=torch.float64)
     assert not mask.complement(beyond, torch.zeros(3)).any()
 
@@ -276,7 +276,7 @@ def test_occulter_is_exactly_clear_beyond_its_radius(name: str) -> None:
 def test_half_of_the_light_passes_where_the_mask_is_named_for(name: str) -> None:
     """Krist's half width at half maximum is that of the intensity, and rounded to a percent."""
     radius = torch.linspace(0, 1.2, 1201, dtype=torch.float64)
-    passed = (1 - ROUND_MASKS[name].complement(radius, torch.zeros(1))) ** 2
+    passed = (1 - MASKS[name].complement(radius, torch.zeros(1))) ** 2
     found = float(radius[(passed < 0.5).sum()])
     assert found == pytest.approx(PROFILES[name][1], rel=0.015)
 
@@ -492,8 +492,9 @@ def test_every_filter_has_a_throughput() -> None:
     [
         ({"monochromatic": 4.5}, "metres"),
         ({"monochromatic": 2e-6}, "outside F444W"),
-        ({"image_mask": "MASKLWB"}, "round masks.*from_webbpsf"),
-        ({"pupil_mask": "MASKLWB"}, "MASKRND.*from_webbpsf"),
+        ({"image_mask": "MASKXWB"}, "MASK210R.*MASKLWB"),
+        ({"pupil_mask": "MASKLWB"}, "MASKRND.*MASKBAR"),
+        ({"image_mask": "MASKLWB", "bar_place": "F210M"}, "bar_place.*'F210M'.*F444W.*NARROW"),
         ({"pupil": "RevW"}, "'design' or 'flight'"),
         ({"defaults": {"star_offset": (0.1, 0.0)}}, "belongs to a source"),
         ({"fov_pixels": 10, "fov_arcsec": 1.0}, "not both"),

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction import summarise, write_report
@@ -67,7 +68,10 @@ def reduction(planet: bool = True, target: str = "HD 1") -> dr.Reduction:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("products")
-    assert [each.name for each in reduction().write(path)][-2:] == ["report.html", "summary.json"]
+    for name in ("wide_field.fits", "systematics.fits"):
+        (path / name).write_text("of another star", encoding="utf-8")
+    written = reduction().write(path, overwrite=True)
+    assert [each.name for each in written][-2:] == ["report.html", "summary.json"]
     return path
 
 
@@ -76,6 +80,14 @@ def sources(places: NDArray[np.float64]) -> QTable:
     x, y = places.T
     angle = np.rad2deg(np.arctan2(-x, y)) % 360
     return QTable({"x": x * u.arcsec, "y": y * u.arcsec, "frame_angle": angle * u.deg})
+
+
+def test_products_of_another_reduction_are_removed_or_refused(folder: Path) -> None:
+    assert not (folder / "wide_field.fits").exists()
+    assert not (folder / "systematics.fits").exists()
+    assert (folder / "fit.fits").exists()
+    with pytest.raises(IncompatibleSetupError, match=r"fit\.fits.*overwrite=True"):
+        reduction().write(folder)
 
 
 class Tags(HTMLParser):
@@ -193,6 +205,9 @@ def test_candidates_in_line_suggest_a_disk() -> None:
     flat = np.zeros((4, 4))
     patterned = replace(poor, systematics=dr.Systematics(flat, flat, (1.0, 1.0), 0.02))
     assert "far above the noise" in str(patterned)
+    hopeless = replace(crowded, fit=replace(whole.fit, chi2_per_pixel=1.2e5))
+    assert "the star is behind the mask where the header says" in hopeless.remark
+    assert "disk=True" not in hopeless.remark
     # One candidate, an unknown pattern, or light of a disk that was fitted already.
     fitted = [replace(each, disk=cast(dr.Disk, object())) for each in (crowded, patterned)]
     assert [each.remark for each in (whole, poor, *fitted)] == [""] * 4

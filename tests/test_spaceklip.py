@@ -170,7 +170,7 @@ def test_a_failure_is_reported_after_the_others(
         "miri": concatenation(["c"], INSTRUME="MIRI", EXP_TYPE="MIR_4QPM"),
         "raw": concatenation(["d"], DATAMODL="STAGE1"),
         "references": concatenation(["e"], TYPE="REF"),
-        "bar": concatenation(["f"], CORONMSK="MASKALWB"),
+        "clear": concatenation(["f"], CORONMSK="NONE"),
     }
     database = StandIn(tmp_path, obs)
 
@@ -197,7 +197,7 @@ def test_a_failure_is_reported_after_the_others(
     assert "no such filter" in caplog.text
     reasons = [str(each.message) for each in skipped]
     for reason, words in zip(
-        reasons, ("MIR_4QPM", "STAGE1", "no frames of a target", "MASKALWB"), strict=True
+        reasons, ("MIR_4QPM", "STAGE1", "no frames of a target", "mask NONE"), strict=True
     ):
         assert "is skipped" in reason
         assert words in reason

@@ -171,8 +171,8 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "header-roll", "the position angle of +y follows from ROLL_REF and V3I_YANG",
-            'return roll - angle * (-1.0 if parity is None else parity)',
-            'return roll + angle * (-1.0 if parity is None else parity)',
+            'turned = roll - angle * (-1.0 if parity is None else parity)',
+            'turned = roll + angle * (-1.0 if parity is None else parity)',
             "observation admission",
         ),
         Breakage(

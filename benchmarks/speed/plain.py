@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.masks import MASKS
 
 __all__ = ["plain_poppy", "plain_stpsf"]
 
@@ -49,7 +49,7 @@ def plain_poppy(
     class Occulter(poppy.optics.AnalyticImagePlaneElement):
         def get_transmission(self, wave: Any) -> Array:
             y, x = (torch.from_numpy(np.asarray(a)) for a in self.get_coordinates(wave))
-            return np.asarray(1 - ROUND_MASKS["MASK335R"].complement(x, y))
+            return np.asarray(1 - MASKS["MASK335R"].complement(x, y))
 
     def optic(name: str, transmission: NDArray[Any], path: NDArray[Any]) -> Any:
         # As the exit pupil has them: y inverted.

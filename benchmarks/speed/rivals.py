@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.speed.setting import WAVELENGTH, Arrays
-from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.masks import MASKS
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.fourier import kernel
 from pyklip_diffrender.optics.grid import PupilGrid
@@ -46,7 +46,7 @@ def paper_recipe(arrays: Arrays, device: str, pad: int = 2) -> Callable[[Tensor]
     size = pad * npix
     axis = torch.fft.fftfreq(size, dtype=torch.float64) * size * (WAVELENGTH / arrays.diameter)
     angle = axis / pad / ARCSEC
-    mask = (1 - ROUND_MASKS["MASK335R"].complement(angle[None, :], angle[:, None])).to(device)
+    mask = (1 - MASKS["MASK335R"].complement(angle[None, :], angle[:, None])).to(device)
     amplitude = torch.from_numpy(arrays.amplitude).to(device)
     stop = torch.from_numpy(arrays.stop).to(device)
     grid = PupilGrid.full(npix, arrays.diameter)
@@ -95,7 +95,7 @@ def prysm_image(arrays: Arrays) -> Image:
     npix, cells = len(arrays.amplitude), arrays.cells
     amplitude, stop, opd = (_mirrored(a) for a in (arrays.amplitude, arrays.stop, arrays.opd))
     axis = torch.from_numpy((np.arange(cells) - cells // 2) * (arrays.cell / ARCSEC))
-    blocked = ROUND_MASKS["MASK335R"].complement(axis[None, :], axis[:, None]).numpy()
+    blocked = MASKS["MASK335R"].complement(axis[None, :], axis[:, None]).numpy()
     # prysm has mm in pupils and microns in images and for the wavelength; a focal length of 1 m.
     spacing, focal, wave = arrays.diameter / npix * 1e3, 1e3, WAVELENGTH * 1e6
     cell, pixel = arrays.cell * 1e6, arrays.pixel * 1e6
@@ -131,7 +131,7 @@ def hcipy_image(arrays: Arrays) -> Image:
     focus = hcipy.make_uniform_grid([cells, cells], [cells * arrays.cell] * 2)
     pixels = hcipy.make_uniform_grid([arrays.pixels] * 2, [arrays.pixels * arrays.pixel] * 2)
     x, y = (torch.from_numpy(np.asarray(axis)) / ARCSEC for axis in (focus.x, focus.y))
-    mask = hcipy.Field(1 - ROUND_MASKS["MASK335R"].complement(x, y).numpy(), focus)
+    mask = hcipy.Field(1 - MASKS["MASK335R"].complement(x, y).numpy(), focus)
     amplitude, stop, opd = (
         hcipy.Field(_mirrored(a).ravel(), pupil)
         for a in (arrays.amplitude, arrays.stop, arrays.opd)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.speed.case import Accuracy
-from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.masks import MASKS
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE, nircam_coronagraph
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.grid import PupilGrid
@@ -196,6 +196,6 @@ class Setting:
             diameter=model.diameter,
             cell=cell,
             pixel=NIRCAM_LW_PIXELSCALE * ARCSEC,
-            cells=2 * int(np.ceil(ROUND_MASKS["MASK335R"].radius * ARCSEC / cell)) + 2,
+            cells=2 * int(np.ceil(MASKS["MASK335R"].radius * ARCSEC / cell)) + 2,
             pixels=self.fov,
         )

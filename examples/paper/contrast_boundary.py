@@ -32,7 +32,7 @@ from matplotlib.figure import Figure
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.metrics import aperture_sum
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.instrument.masks import ROUND_MASKS
+from pyklip_diffrender.instrument.masks import MASKS
 from pyklip_diffrender.refinement import Refinement
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -83,9 +83,7 @@ def noise_limit(setup: Setting, shot: Frame, separation: float) -> float:
         np.abs(separations(setup) - separation) <= HALF_WIDTH * setup.model.detector.pixelscale[0]
     )
     position = torch.tensor(separation, dtype=torch.float64)
-    passed = (
-        1 - float(ROUND_MASKS["MASK335R"].complement(position, torch.zeros_like(position)))
-    ) ** 2
+    passed = (1 - float(MASKS["MASK335R"].complement(position, torch.zeros_like(position)))) ** 2
     return 5 * float(shot.noise[ring].mean()) / Star().peak_photons / passed
 
 

@@ -8,11 +8,13 @@ from pyklip_diffrender.instrument.jwst import (
     is_jwst_pupil,
     jwst_pupil,
     jwst_segments,
+    maskbar_openings,
     maskrnd_openings,
 )
 from pyklip_diffrender.instrument.masks import (
     FILTERS,
-    ROUND_MASKS,
+    MASKS,
+    BarMask,
     detector_place,
     filter_shift,
     is_short_wave,
@@ -27,9 +29,10 @@ from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, fi
 __all__ = [
     "FILTERS",
     "FLIGHT_ALIGNMENT",
+    "MASKS",
     "NIRCAM_LW_PIXELSCALE",
-    "ROUND_MASKS",
     "TABULATED_GAP",
+    "BarMask",
     "ChromaticAberration",
     "blackbody",
     "detector_place",
@@ -41,6 +44,7 @@ __all__ = [
     "is_short_wave",
     "jwst_pupil",
     "jwst_segments",
+    "maskbar_openings",
     "maskrnd_openings",
     "nircam_coronagraph",
 ]

@@ -72,7 +72,7 @@ def internal_wavefront_error(
     Parameters
     ----------
     mask : str
-        A name of `ROUND_MASKS`.
+        A name of `MASKS`.
     flip : bool
         Flip the map vertically, as stpsf does from 2.2.0 on, because that matches images in flight
         better. False uses the tabulated orientation, that of the exit pupil, as stpsf did before.

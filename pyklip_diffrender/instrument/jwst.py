@@ -1,4 +1,4 @@
-"""The JWST primary mirror and NIRCam's Lyot stop, from embedded tables of their outlines.
+"""The JWST primary mirror and NIRCam's Lyot stops, from embedded tables of their outlines.
 
 Orientation: entrance pupil, x along +V2 and y along +V3 (see `pyklip_diffrender.optics.grid`).
 """
@@ -15,7 +15,14 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import embedded_table
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, widen_polygon
 
-__all__ = ["TABULATED_GAP", "is_jwst_pupil", "jwst_pupil", "jwst_segments", "maskrnd_openings"]
+__all__ = [
+    "TABULATED_GAP",
+    "is_jwst_pupil",
+    "jwst_pupil",
+    "jwst_segments",
+    "maskbar_openings",
+    "maskrnd_openings",
+]
 
 TABULATED_GAP = 7.68e-3
 """Distance between neighbouring segments of the embedded outlines, m."""
@@ -44,6 +51,12 @@ def jwst_segments() -> dict[str, Tensor]:
 def maskrnd_openings() -> list[Tensor]:
     """Outlines of the 14 openings of the MASKRND Lyot stop, (vertices, 2) in m at the primary."""
     return list(_polygons("nircam_maskrnd_openings", "opening").values())
+
+
+@lru_cache(maxsize=1)
+def maskbar_openings() -> list[Tensor]:
+    """Outlines of the 14 openings of the MASKBAR Lyot stop, (vertices, 2) in m at the primary."""
+    return list(_polygons("nircam_maskbar_openings", "opening").values())
 
 
 @lru_cache(maxsize=4)

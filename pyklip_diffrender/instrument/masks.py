@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Self
 
 import torch
+from numpy.polynomial import Polynomial
 from scipy.special import j1
 from torch import Tensor
 
@@ -14,7 +17,8 @@ from pyklip_diffrender.io.files import embedded_table
 
 __all__ = [
     "FILTERS",
-    "ROUND_MASKS",
+    "MASKS",
+    "BarMask",
     "DetectorPlace",
     "RoundMask",
     "detector_place",
@@ -54,10 +58,18 @@ class RoundMask:
     name: str
     sigma: float
 
+    stop = "MASKRND"
+    """The Lyot stop that is made for it."""
+
     @property
     def radius(self) -> float:
         """Radius beyond which the mask is clear, arcsec."""
         return _SECOND_ZERO_OF_J1 / self.sigma
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Half the sides of the square beyond which the mask is clear, arcsec."""
+        return self.radius, self.radius
 
     def complement(self, x: Tensor, y: Tensor) -> Tensor:
         """Amplitude that the mask removes, 1 - t.
@@ -75,12 +87,86 @@ class RoundMask:
         return torch.where(s < _SECOND_ZERO_OF_J1, jinc**2, 0.0)
 
 
-ROUND_MASKS = {
+@dataclass(frozen=True)
+class BarMask:
+    """A bar of 20 arcsec along x that becomes wider in its middle part, a wedge.
+
+    Its amplitude transmission is ``t = 1 - (sin(s) / s)^2`` with ``s = sigma(x) |y|`` up to 2 pi,
+    and 1 beyond, and beyond the ends of the bar (Krist et al., see `RoundMask`).
+
+    Attributes
+    ----------
+    name : str
+    widens : int
+        Whether the bar becomes wider towards +x (1) or -x (-1), in the image.
+    scale : Polynomial
+        ``sigma``, per arcsec, as a function of the half width of the bar in lambda/D (stpsf
+        2.2.0, class ``NIRCam_BandLimitedCoron``).
+    offset : float
+        x of the star from the middle of the bar, arcsec.
+    """
+
+    name: str
+    widens: int
+    scale: Polynomial
+    offset: float = 0.0
+
+    stop = "MASKBAR"
+    """The Lyot stop that is made for it."""
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Half the sides of the rectangle about the star beyond which the mask is clear, arcsec."""
+        return _HALF_BAR + abs(self.offset), 2 * math.pi / float(self.scale(_WIDTHS[1]))
+
+    def complement(self, x: Tensor, y: Tensor) -> Tensor:
+        """Amplitude that the mask removes, 1 - t.
+
+        Parameters
+        ----------
+        x, y : Tensor
+            Angles from the star's place on the bar, arcsec, broadcast against each other.
+        """
+        x, y = torch.broadcast_tensors(x + self.offset, y)
+        narrow, wide = _WIDTHS
+        along = 0.5 + self.widens * x / (2 * _HALF_WEDGE)
+        width = (narrow + (wide - narrow) * along).clamp(narrow, wide)
+        s = torch.as_tensor(self.scale(width.numpy())) * y.abs()
+        inside = (s < 2 * math.pi) & (x.abs() <= _HALF_BAR)
+        return torch.where(inside, torch.sinc(s / math.pi) ** 2, 0.0)
+
+    def at(self, offset: float) -> Self:
+        """Return the mask with the star at another place along the bar, arcsec from its middle."""
+        return replace(self, offset=offset)
+
+
+_HALF_BAR = 10.0
+"""Half the length of a bar, arcsec."""
+
+_HALF_WEDGE = 7.5
+"""Half the length of the part in which its width changes, arcsec."""
+
+_WIDTHS = (2.0, 6.0)
+"""Half width at half maximum of the narrow and of the wide end, lambda/D."""
+
+# Highest power first, as in stpsf.
+_SHORT_BAR = (
+    2.01210737e-04, -7.18758337e-03, 1.12381516e-01, -1.00877701e00, 5.72538509e00,
+    -2.12943497e01, 5.18745152e01, -7.97815606e01, 7.02728734e01,
+)  # fmt: skip
+_LONG_BAR = (
+    9.16195583e-05, -3.27354831e-03, 5.11960734e-02, -4.59674047e-01, 2.60963397e00,
+    -9.70881273e00, 2.36585911e01, -3.63978587e01, 3.20703511e01,
+)  # fmt: skip
+
+MASKS: dict[str, RoundMask | BarMask] = {
     mask.name: mask
     for mask in (
         RoundMask("MASK210R", 5.253),
         RoundMask("MASK335R", 3.2927866),
         RoundMask("MASK430R", 2.58832),
+        BarMask("MASKSWB", 1, Polynomial(_SHORT_BAR[::-1])),
+        BarMask("MASKLWB", -1, Polynomial(_LONG_BAR[::-1])),
     )
 }
 """The masks of `nircam_coronagraph` by name."""
@@ -93,6 +179,8 @@ class DetectorPlace:
     Attributes
     ----------
     mask : str
+    place : str
+        Place along a bar: a filter, at whose fiducial it is, or "NARROW"; "-" is the middle.
     detector : str
         As SIAF names it: NRCA2 or NRCA4 (short wave) or NRCA5 (long wave).
     center : tuple of float
@@ -103,18 +191,33 @@ class DetectorPlace:
     siaf_shear : float
         Growth of the ideal y with the ideal x, from the SIAF polynomial: the mean over +-40
         pixels.
+    offset : float
+        x of the place from the middle of a bar, arcsec.
     """
 
     mask: str
+    place: str
     detector: str
     center: tuple[float, float]
     siaf_pixelscale: tuple[float, float]
     siaf_shear: float
+    offset: float
 
     @property
     def pixelscale(self) -> float:
         """Scale in arcsec per pixel, the square scale that stpsf 2.2.0 uses before distortion."""
         return sum(self.siaf_pixelscale) / 2
+
+    @property
+    def field(self) -> float:
+        """Least period of the star's image, arcsec, for a copy of it not to touch the mask."""
+        bar = isinstance(MASKS[self.mask], BarMask)
+        return _HALF_BAR + abs(self.offset) + 2.0 if bar else 0.0
+
+    @property
+    def header_detector(self) -> str:
+        """The detector as headers name it (DETECTOR)."""
+        return "NRCALONG" if self.detector == "NRCA5" else self.detector
 
     @property
     def short_wave(self) -> bool:
@@ -123,19 +226,20 @@ class DetectorPlace:
 
 
 @lru_cache(maxsize=1)
-def _places() -> dict[tuple[str, bool], DetectorPlace]:
+def _places() -> dict[tuple[str, str, bool], DetectorPlace]:
     places = (
         DetectorPlace(
             str(row["mask"]),
+            str(row["place"]),
             str(row["detector"]),
             (float(row["x"]) - 1, float(row["y"]) - 1),
             (float(row["x_scale"]), float(row["y_scale"])),
             float(row["shear"]),
+            float(row["offset"]),
         )
         for row in embedded_table("nircam_masks")
-        if row["place"] == "-"
     )
-    return {(place.mask, place.short_wave): place for place in places}
+    return {(each.mask, each.place, each.short_wave): each for each in places}
 
 
 def is_short_wave(filter: str) -> bool:
@@ -154,23 +258,22 @@ def is_short_wave(filter: str) -> bool:
     return filter.upper() in SHORT_WAVE
 
 
-def require_mask(mask: str) -> RoundMask:
+def require_mask(mask: str) -> RoundMask | BarMask:
     """Return the mask of this name.
 
     Raises
     ------
     IncompatibleSetupError
-        For a name that is not one of `ROUND_MASKS`.
+        For a name that is not one of `MASKS`.
     """
-    if mask not in ROUND_MASKS:
+    if mask not in MASKS:
         raise IncompatibleSetupError(
-            f"image_mask: got {mask!r}, expected None or one of the round masks "
-            f"{', '.join(ROUND_MASKS)}. Bar masks come through from_webbpsf"
+            f"image_mask: got {mask!r}, expected None or one of {', '.join(MASKS)}"
         )
-    return ROUND_MASKS[mask]
+    return MASKS[mask]
 
 
-def detector_place(mask: str | None, filter: str) -> DetectorPlace:
+def detector_place(mask: str | None, filter: str, place: str | None = None) -> DetectorPlace:
     """Where a mask is imaged in a filter, and the pixels there.
 
     Parameters
@@ -180,11 +283,14 @@ def detector_place(mask: str | None, filter: str) -> DetectorPlace:
         (MASK210R or MASK335R).
     filter : str
         Filter, in any case.
+    place : str, optional
+        Place of the star along a bar: a filter of its channel, at whose fiducial it is, "NARROW",
+        or "-", the middle. Default the fiducial of `filter`, or the middle if it has none.
 
     Raises
     ------
     IncompatibleSetupError
-        For an unknown mask or filter.
+        For an unknown mask, filter or place.
 
     Examples
     --------
@@ -195,7 +301,17 @@ def detector_place(mask: str | None, filter: str) -> DetectorPlace:
     short_wave = is_short_wave(filter)
     if mask is None:
         mask = "MASK210R" if short_wave else "MASK335R"
-    return _places()[require_mask(mask).name, short_wave]
+    require_mask(mask)
+    places = _places()
+    own = filter.upper() if (mask, filter.upper(), short_wave) in places else "-"
+    key = (mask, own if place is None else place.upper(), short_wave)
+    if key not in places:
+        known = [each.place for each in places.values() if each.mask == mask]
+        raise IncompatibleSetupError(
+            f"bar_place: got {place!r}, expected a place along {mask}: "
+            f"{', '.join(dict.fromkeys(known))}"
+        )
+    return places[key]
 
 
 def mask_of_header(value: object) -> str:

@@ -18,8 +18,8 @@ from pyklip_diffrender.instrument.aberrations import (
     internal_wavefront_error,
     parity_in_y,
 )
-from pyklip_diffrender.instrument.jwst import jwst_pupil, maskrnd_openings
-from pyklip_diffrender.instrument.masks import DetectorPlace, detector_place, require_mask
+from pyklip_diffrender.instrument.jwst import jwst_pupil, maskbar_openings, maskrnd_openings
+from pyklip_diffrender.instrument.masks import BarMask, DetectorPlace, detector_place, require_mask
 from pyklip_diffrender.instrument.spectrum import filter_bandpass, filter_throughput
 from pyklip_diffrender.io.units import Bound, to_metres, to_number, to_pair
 from pyklip_diffrender.optics.bandpass import Bandpass
@@ -68,6 +68,10 @@ _IPC_NRCA5 = np.array(
 _PPC_NRCA5 = np.array([[0.0, 0.99876965, 0.00123035]])
 
 
+_OPENINGS = {"MASKRND": maskrnd_openings, "MASKBAR": maskbar_openings}
+"""The Lyot stops, in both channels."""
+
+
 @lru_cache(maxsize=4)
 def _pupil(npix: int, segment_gap: float | None, pupil: str) -> Tensor:
     return jwst_pupil(npix, segment_gap, pupil)
@@ -86,7 +90,8 @@ def nircam_coronagraph(
     shear: float = 0.0,
     crosstalk: bool = False,
     image_mask: str | None = "MASK335R",
-    pupil_mask: str | None = "MASKRND",
+    bar_place: str | None = None,
+    pupil_mask: str | None = "auto",
     pupil: str = "design",
     segment_gap: float | None = None,
     si_wfe: bool | ArrayLike = True,
@@ -99,7 +104,7 @@ def nircam_coronagraph(
     dtype: torch.dtype = torch.float64,
     device: str | torch.device = "cpu",
 ) -> OpticalSystem:
-    """NIRCam's coronagraph with a round mask and the MASKRND stop as a differentiable system.
+    """NIRCam's coronagraph as a differentiable system.
 
     Lengths, angles and temperatures may be Quantities.
 
@@ -130,9 +135,14 @@ def nircam_coronagraph(
         Couple neighbouring pixels as in the detector NRCA5 (interpixel capacitance and post-pixel
         coupling), which the pipeline does not remove from calibrated JWST frames.
     image_mask : str or None
-        "MASK210R", "MASK335R" or "MASK430R", each with the filters of both channels, or None for
-        no occulter (a planet far from the star).
-    pupil_mask : "MASKRND" or None
+        "MASK210R", "MASK335R", "MASK430R", or the bars "MASKSWB" and "MASKLWB", each with the
+        filters of both channels, or None for no occulter (a planet far from the star).
+    bar_place : str, optional
+        Where along a bar the star is: at the fiducial of a filter, such as "F460M", at the
+        "NARROW" end, or in the middle, "-". Default the fiducial of `filter`, or the middle if
+        it is one of the other channel.
+    pupil_mask : "auto", "MASKRND", "MASKBAR" or None
+        Lyot stop; "auto" is that of the mask.
     pupil : "design" or "flight"
         Obscurations of the primary mirror, see `jwst_pupil`.
     segment_gap : float, optional
@@ -177,11 +187,13 @@ def nircam_coronagraph(
     (24, 24)
     """
     recipe = _in_plain_numbers(dict(locals()))
-    place = detector_place(image_mask, filter)
+    place = detector_place(image_mask, filter, bar_place)
+    if pupil_mask == "auto":
+        recipe["pupil_mask"] = require_mask(place.mask).stop
     _require_supported(place, recipe)
     bandpass = _bandpass(recipe)
     detector = _detector(place, recipe)
-    _require_samples(npix, detector, bandpass)
+    _require_samples(npix, place if image_mask else None, detector, bandpass)
     amplitude = _pupil(npix, recipe["segment_gap"], pupil).to(detector.device)
     return OpticalSystem(
         EntrancePupil(amplitude, JWST_DIAMETER, dtype, name="JWST pupil"),
@@ -217,10 +229,10 @@ def _in_plain_numbers(recipe: dict[str, Any]) -> dict[str, Any]:
 
 
 def _require_supported(place: DetectorPlace, recipe: Mapping[str, Any]) -> None:
-    if recipe["pupil_mask"] not in ("MASKRND", None):
+    if recipe["pupil_mask"] not in (None, *_OPENINGS):
         raise IncompatibleSetupError(
-            f"pupil_mask: got {recipe['pupil_mask']!r}, expected 'MASKRND' or None. Other stops "
-            "come through from_webbpsf"
+            f"pupil_mask: got {recipe['pupil_mask']!r}, expected 'auto', 'MASKRND', 'MASKBAR' or "
+            "None"
         )
     if recipe["crosstalk"] and place.short_wave:
         raise IncompatibleSetupError(
@@ -265,9 +277,11 @@ def _detector(place: DetectorPlace, recipe: Mapping[str, Any]) -> Detector:
     )
 
 
-def _require_samples(npix: int, detector: Detector, bandpass: Bandpass) -> None:
+def _require_samples(
+    npix: int, place: DetectorPlace | None, detector: Detector, bandpass: Bandpass
+) -> None:
     (ny, nx), (x, y) = detector.shape, detector.pixelscale
-    field = max(nx * x, ny * y)
+    field = max(nx * x, ny * y, 0.0 if place is None else place.field)
     needed = samples_for_field(field, min(bandpass.wavelengths))
     if npix < needed:
         raise IncompatibleSetupError(
@@ -282,15 +296,17 @@ def _planes(place: DetectorPlace, bandpass: Bandpass, recipe: Mapping[str, Any])
     planes: list[Plane] = []
     if recipe["image_mask"] is not None:
         mask, sampling = require_mask(place.mask), recipe["occulter_sampling"]
+        if isinstance(mask, BarMask):
+            mask = mask.at(place.offset)
         planes.append(
             CompactOcculter(
-                mask.complement, mask.radius, sampling, JWST_DIAMETER, dtype, device, mask.name
+                mask.complement, mask.reach, sampling, JWST_DIAMETER, dtype, device, mask.name
             )
         )
     if recipe["pupil_mask"] is not None:
         planes.append(
             LyotStop(
-                maskrnd_openings(),
+                _OPENINGS[recipe["pupil_mask"]](),
                 recipe["npix"],
                 JWST_DIAMETER,
                 dtype,

@@ -306,18 +306,18 @@ class InternalAberration(Plane):
 
 
 class CompactOcculter(Plane):
-    """A focal-plane mask whose complement 1 - t is zero outside a disc.
+    """A focal-plane mask whose complement 1 - t is zero outside a disc or a rectangle.
 
-    The field behind it, back in the pupil, is E - F^-1[(1 - t) F[E]]. Only the disc is ever
-    sampled, in cells of ``1 / sampling`` of lambda/D.
+    The field behind it, back in the pupil, is E - F^-1[(1 - t) F[E]]. Only the square about the
+    disc, or the rectangle, is ever sampled, in cells of ``1 / sampling`` of lambda/D.
 
     Parameters
     ----------
     complement : callable
         From angles (x, y) in arcsec to the amplitude 1 - t, computed directly in double precision
         because 1 - t from t would lose digits by cancellation.
-    radius : float
-        arcsec; `complement` vanishes beyond.
+    radius : float or (x, y)
+        arcsec; `complement` vanishes beyond. Two numbers are half the sides of a rectangle.
     sampling : float, optional
         Cells per lambda / `diameter`; default 4.
     """
@@ -327,7 +327,7 @@ class CompactOcculter(Plane):
     def __init__(
         self,
         complement: Callable[[Tensor, Tensor], Tensor],
-        radius: float,
+        radius: float | tuple[float, float],
         sampling: float | None,
         diameter: float,
         dtype: torch.dtype,
@@ -340,42 +340,43 @@ class CompactOcculter(Plane):
                 "(below that the cells alias the pupil onto itself; 2 to 4 is usual)"
             )
         self.name = name
-        self.complement, self.radius, self.sampling = complement, radius, sampling
+        self.complement, self.sampling = complement, sampling
+        self.reach = radius if isinstance(radius, tuple) else (radius, radius)
+        self.radius = max(self.reach)
         self.diameter = diameter
         self.dtype, self.device = dtype, device
-        self._cells: Cache[float, tuple[Tensor, Tensor]] = Cache()
+        self._cells: Cache[float, tuple[Tensor, Tensor, Tensor]] = Cache()
         self._transforms: Cache[tuple[float, PupilGrid], MatrixFourier] = Cache()
 
     def compact(self, wavelength: float, dtype: torch.dtype, device: torch.device) -> Self:
         return self
 
-    def cells(self, wavelength: float) -> tuple[Tensor, Tensor]:
-        """Cell positions along one axis (radians) and 1 - t on the cells."""
+    def cells(self, wavelength: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Cell positions along x and along y (radians), and 1 - t on the cells."""
 
-        def make() -> tuple[Tensor, Tensor]:
+        def make() -> tuple[Tensor, Tensor, Tensor]:
             spacing = wavelength / self.diameter / (self.sampling or 4.0)
-            half = math.ceil(self.radius * ARCSEC / spacing)
-            axis = torch.arange(-half, half + 1, dtype=torch.float64) * spacing
-            angle = axis / ARCSEC
-            complement = self.complement(angle[None, :], angle[:, None])
-            return axis, complement.to(self.device, self.dtype)
+            counts = [math.ceil(half * ARCSEC / spacing) for half in self.reach]
+            x, y = (torch.arange(-n, n + 1, dtype=torch.float64) * spacing for n in counts)
+            complement = self.complement(x[None, :] / ARCSEC, y[:, None] / ARCSEC)
+            return x, y, complement.to(self.device, self.dtype)
 
         return self._cells.kept(wavelength, make)
 
     def _transform(self, wavelength: float, grid: PupilGrid) -> MatrixFourier:
         def make() -> MatrixFourier:
-            axis = self.cells(wavelength)[0].to(self.device)
-            return MatrixFourier(grid, axis, axis, wavelength, self.dtype.to_complex())
+            x, y = (axis.to(self.device) for axis in self.cells(wavelength)[:2])
+            return MatrixFourier(grid, x, y, wavelength, self.dtype.to_complex())
 
         return self._transforms.kept((wavelength, grid), make)
 
     def focal_field(self, wavefront: Wavefront) -> Tensor:
-        """The field in front of the mask, on the cells of the disc."""
+        """The field in front of the mask, on the cells."""
         return self._transform(wavefront.wavelength, wavefront.grid).forward(wavefront.field)
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """E - F^-1[(1 - t) F[E]] on the window `onto`."""
-        axis, complement = self.cells(wavefront.wavelength)
+        axis, _, complement = self.cells(wavefront.wavelength)
         cell = float(axis[1] - axis[0]) ** 2
         blocked = complement * self.focal_field(wavefront)
         removed = self._transform(wavefront.wavelength, onto).inverse(blocked, cell)

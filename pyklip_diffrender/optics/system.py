@@ -46,7 +46,7 @@ class OpticalSystem(Propagation):
         Makes another system from the arguments in `recipe`, some of them changed.
     route : "auto", "lattice" or "planes"
         How light gets to the detector: by a convolution on cells that fit the detector, which
-        needs a single round occulter between pupils, or plane by plane, which always works.
+        needs a single compact occulter between pupils, or plane by plane, which always works.
         "auto" takes the first if possible, unless the detector is very fine.
     defaults : mapping of str to value, optional
         Values of named parameters for calls that do not give them, in the units of the parameter

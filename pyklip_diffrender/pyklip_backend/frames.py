@@ -24,7 +24,7 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
     ShapeError,
 )
-from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
+from pyklip_diffrender.instrument.masks import FILTERS, detector_place
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pyklip_backend.admitted import admit
 from pyklip_diffrender.pyklip_backend.pointings import (
@@ -283,14 +283,18 @@ def _gather(
     name = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
     usable = _usable(valid, name)
     wavelength = float(np.asarray(dataset.wvs)[index[0]])
+    passband = settings.filter or _filter_name(dataset, header, wavelength)
+    if pixelscale is None:
+        known = passband is not None and passband.upper() in FILTERS
+        pixelscale = detector_place(None, passband if passband and known else "F444W").pixelscale
     observation = Observation.from_arrays(
         data[usable],
         error[usable],
         valid=valid[usable],
         unit=u.dimensionless_unscaled if unit is None else unit,
-        pixelscale=NIRCAM_LW_PIXELSCALE if pixelscale is None else pixelscale,
+        pixelscale=pixelscale,
         center=centers[usable],
-        filter=settings.filter or _filter_name(dataset, header, wavelength),
+        filter=passband,
         date=beginning(header, name),
         position_angles=native_float64(dataset.PAs)[index][usable],
         name=name,

@@ -24,6 +24,10 @@ __all__ = ["GaussNewton", "settings_for"]
 _REACH = 40
 """Pixels from the star to the edge of the square that `reduce` fits."""
 
+_MOST_CYCLES = 32
+"""Highest spatial frequency of the preset: 3,200 modes. Each of them takes a float for every pixel,
+and the time of a step grows with their square."""
+
 _LONG_WAVE = 2.4e-6
 """m; beyond, NIRCam has its long-wave detectors, whose pixels are twice as wide."""
 
@@ -259,7 +263,9 @@ class GaussNewton:
         return replace(self, prior=self.prior.widened(ratios), drift=drift)
 
     @classmethod
-    def nircam(cls, filter: str | None = None, **changes: Any) -> GaussNewton:
+    def nircam(
+        cls, filter: str | None = None, *, reach: int = _REACH, **changes: Any
+    ) -> GaussNewton:
         """Return the settings for real NIRCam frames, for which the model is not exact.
 
         The prior's scales are fixed unless they are much too small, the pupil's amplitude is free
@@ -274,9 +280,12 @@ class GaussNewton:
         Parameters
         ----------
         filter : str, optional
-            Such as "F356W". The finest modes move light by 40 pixels, to the edge of the square
-            that `reduce` fits: 18 cycles in F444W, 22 in F356W and 32 in F250M. Default as in
-            F444W.
+            Such as "F356W"; default as in F444W. In the short-wave channel, for which no alignment
+            of the Lyot stop in flight is published, its prior is three times as wide.
+        reach : int
+            Pixels by which the finest modes move light, but at most with 32 cycles: by default to
+            the edge of the square that `reduce` fits. These are 18 cycles in F444W and F210M, 22
+            in F356W and 32 in F250M.
         **changes
             Fields with other values.
 
@@ -291,6 +300,8 @@ class GaussNewton:
         >>> GaussNewton.nircam("F356W", max_iterations=60).cycles
         (22.0,)
         """
+        wavelength = _wavelength("F444W" if filter is None else filter)
+        loose = 1.0 if wavelength > _LONG_WAVE else 3.0
         preset = cls(
             free=(
                 "star_offset",
@@ -314,10 +325,14 @@ class GaussNewton:
             ),
             widen_prior=True,
             # Finer modes cost time and leave chi-squared within 3 %.
-            cycles=(_cycles_to_edge("F444W" if filter is None else filter),),
+            cycles=(_cycles_to_edge(wavelength, reach),),
             grow_basis=False,
             coarse_first=False,
-            deviations={"star_offset": 0.003, "lyot_shift": 0.004, "lyot_rotation": 0.2},
+            deviations={
+                "star_offset": 0.003,
+                "lyot_shift": loose * 0.004,
+                "lyot_rotation": loose * 0.2,
+            },
             max_companions=1,
             companion_threshold=3.0,
             # Peaks may be due to the model error.
@@ -346,16 +361,23 @@ def _require_positive(settings: GaussNewton, *names: str) -> None:
 
 def settings_for(observation: Observation) -> GaussNewton:
     """Return the default settings for an observation: the NIRCam preset for real NIRCam frames."""
-    return GaussNewton.nircam(observation.filter) if observation.is_nircam else GaussNewton()
+    if not observation.is_nircam:
+        return GaussNewton()
+    reach = max(_REACH, min(observation.shape) // 2)
+    return GaussNewton.nircam(observation.filter, reach=reach)
 
 
-def _cycles_to_edge(filter: str) -> float:
-    """Spatial frequency that moves light of a filter of NIRCam by `_REACH` pixels."""
+def _wavelength(filter: str) -> float:
+    """Wavelength of a filter of NIRCam by its name, m."""
     name = re.match(r"F(\d{3})(W2?|M|N)$", filter)
     if name is None:
         raise IncompatibleSetupError(
             f"filter: got {filter!r}, expected the name of one of NIRCam's filters, such as F444W"
         )
-    wavelength = int(name[1]) * 1e-8
+    return int(name[1]) * 1e-8
+
+
+def _cycles_to_edge(wavelength: float, reach: int) -> float:
+    """Spatial frequency that moves light by `reach` pixels of NIRCam, if it is not too high."""
     pixel = 0.063 if wavelength > _LONG_WAVE else 0.031
-    return float(int(_REACH * pixel * ARCSEC * JWST_DIAMETER / wavelength))
+    return float(min(_MOST_CYCLES, int(reach * pixel * ARCSEC * JWST_DIAMETER / wavelength)))

@@ -24,7 +24,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.instrument.masks import detector_place, filter_shift
 from pyklip_diffrender.io.headers import header_number, header_text
 from pyklip_diffrender.io.units import native_float64, require_finite
-from pyklip_diffrender.scene.exposure import detector_of, image_mask
+from pyklip_diffrender.scene.exposure import bar_place, detector_of, image_mask
 
 __all__ = [
     "SHIFTS",
@@ -49,9 +49,6 @@ _AT_CENTER = 0.01
 
 _PAD = 5
 """Rows and columns that are mirrored at every edge before a shift, as many as in the alignment."""
-
-_APERTURES = {"NRCALONG": "NRCA5", "NRCBLONG": "NRCB5"}
-"""Detectors by the names that apertures have."""
 
 _SIDE = 2048
 """Rows and columns of a detector."""
@@ -151,8 +148,8 @@ def mask_place(header: fits.Header, name: str) -> NDArray[np.float64] | None:
         return None
     try:
         passband = header_text(header, "FILTER", name) or ""
-        place = detector_place(mask, passband)
-        if place.detector != _APERTURES.get(detector, detector):
+        place = detector_place(mask, passband, bar_place(header, name))
+        if place.header_detector != detector:
             return None
         return np.add(place.center, filter_shift(passband))
     except IncompatibleSetupError:

@@ -25,6 +25,7 @@ from pyklip_diffrender.scene.catalogue_star import CatalogueStar, star_of
 
 __all__ = [
     "Exposure",
+    "bar_place",
     "beginning",
     "detector_of",
     "image_mask",
@@ -219,6 +220,25 @@ def image_mask(header: fits.Header, name: str) -> str | None:
             "file again"
         )
     return next(iter(stated.values()), None)
+
+
+def bar_place(header: fits.Header, name: str) -> str | None:
+    """Place of the star along a bar mask, from APERNAME.
+
+    Returns
+    -------
+    str or None
+        A filter or "NARROW", see `detector_place`; None where the header does not say.
+
+    Examples
+    --------
+    >>> from astropy.io import fits
+    >>> bar_place(fits.Header({"APERNAME": "NRCA5_MASKLWB_F460M"}), "a.fits")
+    'F460M'
+    """
+    text = (header_text(header, "APERNAME", name) or "").upper()
+    match = re.search(r"MASK[LS]WB_(F\d{3}W2?|F\d{3}M|F\d{3}N|NARROW)$", text)
+    return match[1] if match else None
 
 
 def _flag(header: fits.Header, key: str) -> bool | None:

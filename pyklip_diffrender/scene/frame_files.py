@@ -30,7 +30,6 @@ _NOT_USABLE = {
     "psfstack": "a stack of reference stars (psfstack)",
 }
 
-_CORONAGRAPHIC = ("NRC_CORON", "MIR_LYOT", "MIR_4QPM", "NIS_CORON")
 
 _OTHER_TYPES = {
     "NRC_TACQ": "an image for acquiring the target",
@@ -156,7 +155,12 @@ def _why_unusable(exposure: Exposure) -> str:
     if level is not None and level not in _USABLE:
         what = _NOT_USABLE.get(level, f"a product of another kind ({level})")
         return f"it is {what}; expected frames of stage 2 (calints)"
-    if kind is not None and kind not in _CORONAGRAPHIC:
+    if exposure.instrument not in (None, "NIRCAM"):
+        return (
+            f"it was taken with {exposure.instrument}; only NIRCam's coronagraph is built in. For "
+            "another one, make the model with from_webbpsf or from_poppy, and fit with refine"
+        )
+    if kind not in (None, "NRC_CORON"):
         what = _OTHER_TYPES.get(kind, "no coronagraphic exposure")
         return f"EXP_TYPE is {kind}: {what}; expected NRC_CORON"
     if exposure.background:

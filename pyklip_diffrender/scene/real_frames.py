@@ -6,13 +6,13 @@ from functools import lru_cache
 from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.masks import ROUND_MASKS, detector_place
+from pyklip_diffrender.instrument.masks import MASKS, detector_place
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.optics.grid import samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.scene.exposure import image_mask
+from pyklip_diffrender.scene.exposure import bar_place, detector_of, image_mask
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["model_for"]
@@ -26,7 +26,7 @@ fit absorbs it: with 256 and 512 samples the residual of real frames was the sam
 _CELLS = 1.2
 """Cells of the occulter per lambda/D. The round masks have no structure finer than several
 lambda/D, so that this changes images by 3e-7 of their peak or less, and one cell per pixel is
-enough in all filters from F250M on; two cells per pixel take four times as long."""
+enough in all filters of both channels; two cells per pixel take four times as long."""
 
 
 def model_for(observation: Observation, size: int | None = None, **overrides: Any) -> OpticalSystem:
@@ -89,19 +89,28 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
                 f"{observation.name}: the header does not say behind which mask the star is. Add "
                 "CORONMSK, such as MASKA335R, or give image_mask"
             )
-        if name not in ROUND_MASKS:
+        if name not in MASKS:
             raise IncompatibleSetupError(
                 f"{observation.name}: these frames have image mask {mask_name}, expected one of "
-                f"{', '.join(ROUND_MASKS)}. Other masks come through from_webbpsf"
+                f"{', '.join(MASKS)}"
             )
-        place = detector_place(name, observation.filter)
+        along = bar_place(observation.header, observation.name)
+        place = detector_place(name, observation.filter, along)
+        detector = detector_of(observation.header, observation.name)
+        if detector not in (None, place.header_detector):
+            raise IncompatibleSetupError(
+                f"{observation.name}: these frames are of the detector {detector}, expected "
+                f"{place.header_detector}, on which {name} is imaged in {observation.filter}. "
+                "Module B, whose coronagraph is not used, is not modelled"
+            )
         shortest = float(filter_throughput(observation.filter)[0][0])
         (ny, nx), (x, y) = observation.shape, place.siaf_pixelscale
         npix = _NPIX
-        while npix < samples_for_field(max(nx * x, ny * y), shortest):
+        while npix < samples_for_field(max(nx * x, ny * y, place.field), shortest):
             npix *= 2
         arguments |= {
             "image_mask": name,
+            "bar_place": place.place,
             "pixelscale": place.siaf_pixelscale,
             "shear": place.siaf_shear,
             "nlambda": 7,

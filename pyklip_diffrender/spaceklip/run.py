@@ -19,7 +19,7 @@ from pyklip_diffrender.errors import (
     DiffrenderWarning,
     IncompatibleSetupError,
 )
-from pyklip_diffrender.instrument.masks import ROUND_MASKS, mask_of_header
+from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.units import require_bound
 from pyklip_diffrender.pyklip_backend.jwst_files import reduce_jwst_files
 from pyklip_diffrender.refinement import to_jansky, with_star_flux
@@ -202,10 +202,10 @@ def why_unsupported(table: Table) -> str | None:
         return "it has no frames of a target (TYPE is SCI)"
     first = table[list(table["TYPE"]).index("SCI")]
     mask = mask_of_header(first["CORONMSK"])
-    if first["INSTRUME"] != "NIRCAM" or first["EXP_TYPE"] != "NRC_CORON" or mask not in ROUND_MASKS:
+    if first["INSTRUME"] != "NIRCAM" or first["EXP_TYPE"] != "NRC_CORON" or mask not in MASKS:
         return (
             f"{first['INSTRUME']} {first['EXP_TYPE']} with mask {first['CORONMSK']}; only NIRCam's "
-            f"round masks are modelled ({', '.join(ROUND_MASKS)})"
+            f"coronagraph is modelled ({', '.join(MASKS)})"
         )
     if first["DATAMODL"] != "STAGE2":
         return f"its frames are {first['DATAMODL']}; only STAGE2 (calints) can be used"

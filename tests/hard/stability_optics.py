@@ -25,8 +25,8 @@ from hard_cases import (
 )
 
 from pyklip_diffrender.instrument import (
+    MASKS,
     NIRCAM_LW_PIXELSCALE,
-    ROUND_MASKS,
     jwst_pupil,
     maskrnd_openings,
 )
@@ -84,7 +84,7 @@ def occulter(dtype: torch.dtype) -> float:
         s = [mpmath.mpf(float(r)) * mpmath.mpf(reference.SIGMA) for r in radii]
         exact = [1.0 if x == 0 else float((2 * mpmath.besselj(1, x) / x) ** 2) for x in s]
     x = torch.from_numpy(radii)
-    got = ROUND_MASKS["MASK335R"].complement(x, torch.zeros_like(x)).to(dtype)
+    got = MASKS["MASK335R"].complement(x, torch.zeros_like(x)).to(dtype)
     return float(np.abs(array(got) / exact - 1).max())
 
 

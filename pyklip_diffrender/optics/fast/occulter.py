@@ -1,4 +1,4 @@
-"""A round occulter by convolution on a lattice aligned with the detector's samples.
+"""An occulter by convolution on a lattice aligned with the detector's samples.
 
 Notation: E is the field in the pupil in front of the occulter, t the occulter's transmission, L the
 product of all planes behind it, F the transform from the pupil to the sky, * a convolution. Behind
@@ -8,7 +8,7 @@ the occulter the field in the pupil is E - F^-1[(1 - t) F[E]] (`planes`). Behind
       = F[L E] - F[L] * ((1 - t) F[E])                   a product in the pupil is a convolution
     A(x) = F[L E](x) - (cell / lambda) sum_c F[L](x - c) (1 - t)(c) F[E](c),
 
-summed over the cells c, of solid angle `cell`, in the disc of the mask. The terms:
+summed over the cells c, of solid angle `cell`, within the reach of the mask. The terms:
 
     F[L E](x)      matrix transform to the detector's samples             `LatticeRoute.field`
     F[E](c)        matrix transform to the cells                          `OcculterLattice.focus`
@@ -140,11 +140,15 @@ def _axes(
 ) -> tuple[_Axis, _Axis]:
     """Cells and samples along x and y."""
     finest = wavelength / occulter.diameter / sampling
-    reach = occulter.radius * ARCSEC * (1 + abs(detector.shear))
+    half_x, half_y = occulter.reach
+    shear = abs(detector.shear)
+    reaches = (half_x * (1 + shear), half_y + half_x * shear)
     k = detector.oversample
     x, y = (
-        _Axis.fit(count * k, scale * ARCSEC / k, k, finest, reach)
-        for count, scale in zip(detector.shape[::-1], detector.pixelscale, strict=True)
+        _Axis.fit(count * k, scale * ARCSEC / k, k, finest, reach * ARCSEC)
+        for count, scale, reach in zip(
+            detector.shape[::-1], detector.pixelscale, reaches, strict=True
+        )
     )
     return x, y
 

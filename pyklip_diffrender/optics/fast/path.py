@@ -1,4 +1,4 @@
-"""Propagation through a coronagraph with one round occulter, by convolution (see `occulter`).
+"""Propagation through a coronagraph with one compact occulter, by convolution (see `occulter`).
 
 All of it are ordinary torch operations, which have derivatives of all kinds.
 """
@@ -34,7 +34,7 @@ __all__ = ["LatticeRoute"]
 
 
 class LatticeRoute:
-    """Propagation through planes with one round occulter by `OcculterLattice`.
+    """Propagation through planes with one compact occulter by `OcculterLattice`.
 
     Parameters
     ----------

@@ -1,0 +1,143 @@
+"""The short-wave arm: frames like those of MAST, from reading to the planet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+from astropy.io import fits
+
+from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender.instrument import detector_place, filter_shift, nircam_coronagraph
+from pyklip_diffrender.reduction import reduce
+from pyklip_diffrender.refinement import GaussNewton, settings_for
+from pyklip_diffrender.scene import Observation, Planet, Sequence, model_for
+from pyklip_diffrender.wavefront import random_opd
+
+SIZE = 36
+PLANET = Planet(3e-4, 0.45, 60.0)
+PHOTONS = 1e10  # Of the star, in a frame.
+NOISE = 30.0
+STAR = (0.002, -0.002)  # arcsec from the middle of the mask.
+
+
+def calints(
+    folder: Path, roll: float, *, filter: str = "F210M", mask: str = "MASK335R", seed: int = 0
+) -> Path:
+    """A simulated frame of 64 x 64 pixels of NRCA2, with a planet, as MAST delivers it."""
+    place = detector_place(mask, filter)
+    star = np.array([31.3, 32.6])
+    model = nircam_coronagraph(
+        filter,
+        image_mask=mask,
+        npix=256,
+        nlambda=5,
+        fov_pixels=64,
+        pixelscale=place.siaf_pixelscale,
+        shear=place.siaf_shear,
+        # Not where the fit starts.
+        defaults={"lyot_shift": (-0.006, 0.004), "lyot_rotation": 0.2},
+    )
+    opd = random_opd(1, npix=256).data + random_opd(2, npix=256, rms=5e-9).data
+    moved = {"detector_shift": tuple((star - 31.5) * place.siaf_pixelscale)}
+    planet = PLANET.rotated(-roll).offset
+    with torch.no_grad():
+        light = model(opd, STAR, **moved)
+        light += PLANET.contrast * model(opd, tuple(np.add(STAR, planet)), **moved)
+    counts = PHOTONS * light.numpy()
+    sigma = np.sqrt(counts + NOISE**2)
+    counts = counts + sigma * np.random.default_rng(seed).normal(size=sigma.shape)
+    corner = np.round(np.add(place.center, filter_shift(filter)) - star) + 1
+    primary = {
+        "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON", "CHANNEL": "SHORT",
+        "DETECTOR": place.detector, "MODULE": "A", "FILTER": filter, "PUPIL": "MASKRND",
+        "CORONMSK": mask.replace("MASK", "MASKA"), "SUBARRAY": f"SUB320A{mask[4:]}",
+        "APERNAME": f"{place.detector}_{mask}", "TARGPROP": "HD 1",
+        "SUBSTRT1": int(corner[0]), "SUBSTRT2": int(corner[1]),
+        "DATE-BEG": f"2024-03-0{seed + 1}T00:00:00",
+    }  # fmt: skip
+    science = {
+        "BUNIT": "MJy/sr", "PIXAR_A2": float(np.prod(place.siaf_pixelscale)),
+        "PIXAR_SR": float(np.prod(place.siaf_pixelscale)) * 2.35e-11,
+        "CRPIX1": star[0] + 1, "CRPIX2": star[1] + 1, "ROLL_REF": roll, "V3I_YANG": 0.0,
+        "VPARITY": -1,
+    }  # fmt: skip
+    hdus = fits.HDUList(
+        [
+            fits.PrimaryHDU(header=fits.Header(primary)),
+            fits.ImageHDU(counts[None] / 1e3, fits.Header(science), name="SCI"),
+            fits.ImageHDU(sigma[None] / 1e3, name="ERR"),
+            fits.ImageHDU(np.zeros((1, 64, 64), "i4"), name="DQ"),
+        ]
+    )
+    path = folder / f"jw01000001001_03106_0000{seed + 1}_{place.detector.lower()}_calints.fits"
+    hdus.writeto(path)
+    return path
+
+
+@pytest.mark.slow
+def test_a_planet_is_where_it_is_and_nothing_else(tmp_path: Path) -> None:
+    """A map that is 5 nm rms off, a star and a stop off their places, and no flat-field pattern."""
+    settings = GaussNewton.nircam("F210M", cycles=(7.0,), max_iterations=10)
+    frame, opd = calints(tmp_path, 0.0), random_opd(1, npix=256)
+    result = reduce([frame], opd, size=SIZE, settings=settings)
+    assert result.systematics is None
+    table = result.detection.table
+    assert len(table) == 1
+    # Seven times the stated error, and the tenth by which the star's flux is uncertain.
+    assert table["separation"][0].to_value(u.arcsec) == pytest.approx(PLANET.separation, abs=0.008)
+    assert table["position_angle"][0].to_value(u.deg) == pytest.approx(60.0, abs=1.0)
+    assert float(table["contrast"][0]) == pytest.approx(PLANET.contrast, rel=0.1)
+
+
+def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path: Path) -> None:
+    (frame,) = Sequence.from_files([calints(tmp_path, 0.0)]).science
+    assert frame.first_pixel is not None  # The star is where the mask is on NRCA2.
+    model = model_for(frame, SIZE)
+    place = detector_place("MASK335R", "F210M")
+    assert model.setup["filter"] == "F210M"
+    assert model.detector.pixelscale == place.siaf_pixelscale
+    assert model.planes[0].name == "MASK335R"
+    assert not model.defaults
+    long = GaussNewton.nircam("F444W")
+    short = settings_for(frame)
+    assert short.cycles == long.cycles == (18.0,)
+    assert short.deviations["lyot_shift"] > 2 * long.deviations["lyot_shift"]
+    wide = Observation.from_arrays(
+        np.ones((160, 160)), np.ones((160, 160)), pixelscale=0.031, filter="F182M",
+        header=fits.Header({"INSTRUME": "NIRCAM"}),
+    )  # fmt: skip
+    # 44 cycles reach the edge; memory and time set the bound.
+    assert settings_for(wide).cycles == (32.0,)
+
+
+def test_other_instruments_and_module_b_are_refused(tmp_path: Path) -> None:
+    path = calints(tmp_path, 0.0)
+    (frame,) = Sequence.from_files([path]).science
+    frame.header["DETECTOR"] = "NRCB1"
+    with pytest.raises(IncompatibleSetupError, match=r"detector NRCB1, expected NRCA2"):
+        model_for(frame, SIZE)
+    fits.setval(path, "INSTRUME", value="MIRI")
+    with pytest.raises(NoValidPixelsError, match="taken with MIRI; only NIRCam"):
+        Sequence.from_files([path])
+
+
+def test_the_place_along_a_bar_is_that_of_the_header() -> None:
+    ones = np.ones((24, 24))
+    header = fits.Header(
+        {"INSTRUME": "NIRCAM", "CORONMSK": "MASKALWB", "APERNAME": "NRCA5_MASKLWB_NARROW"}
+    )
+    frame = Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F335M", header=header)
+    model = model_for(frame, monochromatic=3.35e-6)
+    assert model.setup["pupil_mask"] == "MASKBAR"
+    # The narrow end is 8.3 arcsec from the middle of a bar of 20.
+    assert model.planes[0].reach[0] == pytest.approx(18.30, abs=0.01)
+    # With fewer samples a copy of the star would be hidden as well, and be taken off twice.
+    with pytest.raises(IncompatibleSetupError, match="npix: got 128"):
+        model_for(frame, npix=128)
+    opd = random_opd(1, npix=256)
+    hidden, beside = (float(model(opd, (0.0, y)).sum()) for y in (0.0, 0.6))
+    assert hidden < 0.05 * beside
