@@ -161,7 +161,7 @@ def test_psf_writes_the_image_of_the_model(
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        (["--filter", "F200W"], ["F200W", "MASK335R", "F444W"]),
+        (["--filter", "F090W"], ["F090W", "F200W", "F444W"]),
         (["--monochromatic", "4.5"], ["4.5", "metres"]),
         (["--size", "0"], ["at least 1"]),
         (["--opd", "nowhere.fits"], ["nowhere.fits", "no such file"]),

@@ -29,6 +29,7 @@ from pyklip_diffrender.pattern import (
     read_patterns,
     write_patterns,
 )
+from pyklip_diffrender.scene.star_place import measured_offset
 
 SIDE = 320
 SHIFTS = np.array([[10.6, -13.3], [10.4, -13.4]])
@@ -417,3 +418,14 @@ def test_the_prior_of_the_pattern_does_not_hang_on_the_stated_noise() -> None:
     slope = (known.pattern * truth).sum() / (truth**2).sum()
     # 0.02^2 / (0.02^2 + 0.05^2 / 2): from squares it would be 0.6, from squares less noise 0.05.
     assert slope == pytest.approx(0.24, abs=0.04)
+
+
+@pytest.mark.parametrize("x", [-0.4, 0.0, 0.3, 1.7])
+def test_a_star_is_measured_to_a_tenth_of_a_pixel(x: float) -> None:
+    """About a stated position between the pixels."""
+    columns, rows = np.meshgrid(np.arange(101.0), np.arange(101.0))
+    stated = np.array([50.3, 49.6])
+    distance = np.hypot(columns - stated[0] - x, rows - stated[1])
+    star = 1e3 * np.exp(-((distance / 4) ** 2)) * (1 + 0.5 * np.cos(distance))
+    away = measured_offset(star, np.ones_like(star), star > -1, stated, 0.063)
+    assert away == pytest.approx([x, 0.0], abs=0.1)

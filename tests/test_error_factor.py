@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -114,6 +116,8 @@ def test_a_source_is_judged_without_its_own_light(separation: float) -> None:
         # Not where it is not allowed, and not where it is known.
         assert judge.next_peak(snr, GRID[pixel][None], 5.0, everywhere) is None
         assert judge.next_peak(snr, NOTHING, 5.0, ~everywhere) is None
+        wide = replace(judge, inner=separation + 3 * PIXEL)
+        assert wide.next_peak(snr, NOTHING, 5.0, everywhere) is None
 
 
 def test_noise_passes_as_rarely_as_gaussian_noise_would() -> None:

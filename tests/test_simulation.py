@@ -231,3 +231,12 @@ def test_the_papers_scene_behind_the_official_stop_is_fainter_than_published(
     separation = np.hypot(x - 39.5, y - 39.5) * 0.062424185
     ring = np.abs(separation - 0.7) <= 0.2
     assert 0.5 < star[ring].mean() / 1.2e6 < 0.9
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "angle"), [(0.0, 0.5, 0.0), (-0.5, 0.0, 90.0), (0.0, -0.5, 180.0), (0.5, 0.0, 270.0)]
+)
+def test_position_angles_are_counter_clockwise_from_up(x: float, y: float, angle: float) -> None:
+    planet = Planet.from_offset(1e-4, x, y)
+    assert planet.position_angle % 360 == pytest.approx(angle)
+    assert planet.offset == pytest.approx((x, y), abs=1e-12)

@@ -56,9 +56,9 @@ BEHIND_THE_MASK = 0.1
 _SCALES = (0.031, 0.063)
 """arcsec of a pixel of NIRCam's short-wave and long-wave detectors, to 2 %."""
 
-_MISPLACED = 1.2
-"""Pixels of a star from its stated position beyond which that is wrong: it is measured to half a
-pixel, and stars are a few tenths of a pixel from the mask."""
+_MISPLACED = 0.3
+"""Pixels of a star from its stated position beyond which that may be wrong by a pixel: the star is
+measured to a tenth of a pixel, and is within 0.2 pixel of the mask."""
 
 _CROPPED = 32
 """Whole pixels beyond which frames were cropped, and not only aligned."""

