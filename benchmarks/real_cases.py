@@ -12,7 +12,7 @@ other stars, the best of 1 to 5 modes), both without and with their small-sample
 "by ring": those of `reduce` with the noise of KLIP's curve, the scatter of the map of contrasts in
 a ring of width lambda/D with the correction of Mawet et al. (2014). "closed" is the part of the gap
 between KLIP's limit and that of a known star which is closed, (KLIP - ours) / (KLIP - known star)
-without corrections, after Godoy et al. (2024).
+without corrections; the limit of a known star is that of Godoy et al. (2024, arXiv:2409.03485).
 """
 
 from __future__ import annotations
