@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 
@@ -56,9 +55,18 @@ class Maps:
         self._stores = 4.0 * frames * (ny * nx) ** 2 <= min(_STORE, self._spare())
         self._stored: dict[tuple[int, int], dict[int, Tensor]] = {}
         total, light = np.zeros((3, ny * nx)), np.zeros((2, ny * nx))
+        steps = np.linspace(0, 1, _PLACES + 2)[1:-1]
+        rows, columns = np.meshgrid((ny * steps).astype(int), (nx * steps).astype(int))
+        self._places = rows.ravel(), columns.ravel()
+        cleaned = self._cleaned(
+            [templates.at_pixels(*self._places) for _, templates in self.groups]
+        )
+        between = np.zeros((len(rows.ravel()), ny * nx))
         for g, pixels, images in self._batches("S/N map"):
             total[:, pixels] += torch.stack(self.groups[g][0].weigh(images)).numpy()
             light[:, pixels] += self._starlight(g, images)
+            between[:, pixels] += _products(cleaned[g], images)
+        self._between = between.reshape(-1, ny, nx)
         self.numerator, self.information, self.photon = total.reshape(3, ny, nx)
         with np.errstate(invalid="ignore"):
             self.starlight = (light[0] / light[1]).reshape(ny, nx)
@@ -78,29 +86,17 @@ class Maps:
     @cached_property
     def correlation(self) -> Image:
         """Autocorrelation of the S/N of noise, by distance in pixels, mean over the field."""
-        ny, nx = self.shape
-        reach = np.arange(-_REACH, _REACH + 1)
-        total, count = np.zeros((2, len(reach), len(reach)))
-        steps = np.linspace(0, 1, _PLACES + 2)[1:-1]
-        for row, column in itertools.product((ny * steps).astype(int), (nx * steps).astype(int)):
-            rows, columns = (axis.ravel() for axis in np.meshgrid(row + reach, column + reach,
-                                                                  indexing="ij"))  # fmt: skip
-            inside = (rows >= 0) & (rows < ny) & (columns >= 0) & (columns < nx)
-            if not self.information[row, column] > 0:
-                continue
-            middle = int(np.flatnonzero((rows[inside] == row) & (columns[inside] == column))[0])
-            products = np.zeros((2, inside.sum()))
-            for linear, templates in self.groups:
-                matrix, _ = linear.normal_equations(
-                    templates.at_pixels(rows[inside], columns[inside])
-                )
-                products += torch.stack([matrix[middle], matrix.diagonal()]).numpy()
-            # Behind the mask the information is 0, and by rounding may be below it.
-            known = (products[1] > 0) & (products[0, middle] > 0)
-            pixels = np.flatnonzero(inside)[known]
-            deviation = np.sqrt(products[1, known] * products[0, middle])
-            total.ravel()[pixels] += products[0, known] / deviation
-            count.ravel()[pixels] += 1
+        side = 2 * _REACH + 1
+        total, count = np.zeros((2, side, side))
+        # Behind the mask the information is 0, and by rounding may be below it.
+        information = np.pad(np.maximum(self.information, 0.0), _REACH)
+        for row, column, products in zip(*self._places, self._between, strict=True):
+            window = np.s_[row : row + side, column : column + side]
+            size = np.sqrt(information[window] * self.information[row, column].clip(0.0))
+            total += np.divide(
+                np.pad(products, _REACH)[window], size, out=np.zeros_like(size), where=size > 0
+            )
+            count += size > 0
         return np.divide(total, count, out=np.zeros_like(total), where=count > 0)
 
     def _spare(self) -> float:
@@ -155,17 +151,29 @@ class Maps:
         light : sequence of mapping of int to Tensor, (k, ny, nx)
             Images by frame, for each group.
         """
-        cleaned = [linear.clean(part) for (linear, _), part in zip(self.groups, light, strict=True)]
+        cleaned = self._cleaned(light)
         ny, nx = self.shape
         total = np.zeros((len(cleaned[0][0]), ny * nx))
         for g, pixels, images in self._batches("candidates"):
-            for k, planets in images.items():
-                whitened = (self.groups[g][0].frames[k].weight * cleaned[g][k]).float()
-                products = whitened.flatten(1) @ planets.flatten(1).T
-                total[:, pixels] += products.double().numpy()
+            total[:, pixels] += _products(cleaned[g], images)
         return total.reshape(-1, ny, nx)
+
+    def _cleaned(self, light: Sequence[Mapping[int, Tensor]]) -> list[dict[int, Tensor]]:
+        """C^-1 of the parts of images that the unknowns cannot reproduce, by group and frame."""
+        return [
+            {k: linear.frames[k].weight * image for k, image in linear.clean(part).items()}
+            for (linear, _), part in zip(self.groups, light, strict=True)
+        ]
 
     def snr(self, numerator: Image | None = None) -> Image:
         """Amplitude over its standard deviation; NaN where there is no information."""
         information = np.where(self.information > 0, self.information, np.nan)
         return (self.numerator if numerator is None else numerator) / np.sqrt(information)
+
+
+def _products(cleaned: Mapping[int, Tensor], planets: Mapping[int, Tensor]) -> Image:
+    """Inner products of images with planets, summed over the frames, (images, planets)."""
+    total = torch.tensor(0.0, dtype=torch.float64)
+    for k, images in planets.items():
+        total = total + (cleaned[k].float().flatten(1) @ images.flatten(1).T).double()
+    return np.asarray(total.numpy())
