@@ -83,7 +83,11 @@ def pulls(fit: Refinement, k: int, truth: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("grown", "count"),
-    [pytest.param(False, 1, marks=pytest.mark.slow), (True, 1), (False, 2)],
+    [
+        pytest.param(False, 1, marks=pytest.mark.slow),
+        pytest.param(True, 1, marks=pytest.mark.slow),
+        (False, 2),
+    ],
 )
 def test_every_way_a_fit_can_go_on(grown: bool, count: int) -> None:
     """Basis grown, where the wavefront has finer modes, or not, one frame or two."""

@@ -1049,6 +1049,7 @@ def test_a_contrast_curve_outside_the_field_is_refused(one: Detection) -> None:
     assert curve["separation"].to_value("arcsec").tolist() == [0.5]
 
 
+@pytest.mark.slow
 def test_all_errors_have_the_factor_of_their_position(empty: list[Detection]) -> None:
     """A fit that does not explain its data is searched with the scatter of its S/N."""
     (fit,) = empty[0].fits

@@ -234,7 +234,7 @@ def test_a_dithered_star_is_fitted_where_the_file_says() -> None:
     assert fits_[1].chi2_per_pixel < 1.1
 
 
-@pytest.mark.parametrize("name", ["F356W", "F444W"])
+@pytest.mark.parametrize("name", [pytest.param("F356W", marks=pytest.mark.slow), "F444W"])
 def test_real_stars_are_off_the_mask_by_what_the_files_say(shared_data: Path, name: str) -> None:
     """The star moves by a third of a pixel, the mask stays on its pixels of the detector."""
     files = [Observation.from_fits(path) for path in sorted((shared_data / "gto1184").glob("*"))]

@@ -95,6 +95,7 @@ def test_contrasts_refer_to_the_catalogues_star(fit: Refinement, share: float) -
     assert 0.05 < now["contrast_error"] / now["contrast"] < 0.08
 
 
+@pytest.mark.slow
 def test_a_prior_that_agrees_changes_nothing_but_the_error(fit: Refinement) -> None:
     before = dr.detect(fit)
     assert before.sky.star is not None

@@ -124,7 +124,7 @@ def test_two_callers_of_a_padded_mask_at_two_wavelengths() -> None:
         np.testing.assert_allclose(first.result().real, 4.0, rtol=1e-12)
 
 
-@pytest.mark.parametrize("suffix", [".fits", ".fits.gz"])
+@pytest.mark.parametrize("suffix", [".fits", pytest.param(".fits.gz", marks=pytest.mark.slow)])
 def test_a_process_killed_in_the_middle_of_the_file_leaves_the_old_one(
     tmp_path: Path, suffix: str, killed: Callable[[str, Path], None]
 ) -> None:
