@@ -282,7 +282,7 @@ def _namesake(folder: Folder, name: str, rng: np.random.Generator) -> None:
 def _crpix(folder: Folder, name: str, rng: np.random.Generator) -> None:
     def change(hdus: fits.HDUList, rng: np.random.Generator) -> None:
         for key in ("CRPIX1", "CRPIX2"):
-            _set(hdus, **{key: float(_card(hdus, key)[key]) + rng.uniform(-3, 3)})
+            _set(hdus, **{key: round(float(_card(hdus, key)[key]) + rng.uniform(-3, 3), 4)})
 
     folder.change(name, change, rng)
     folder.doubtful.add(name)

@@ -242,13 +242,14 @@ PLACES = {
 def test_the_embedded_occulter_is_that_of_stpsf(stpsf_path: Path, name: str) -> None:
     """On and off the axis, everything else being stpsf's, cells of 1/4 lambda/D in both.
 
-    The ends of a bar are sharp, and stpsf's FFT has its points half a cell elsewhere. A bar that
-    was mirrored, or 0.1 arcsec away, would change more than a percent.
+    On the axis the image is 1e3 to 1e5 times fainter, and errors are stated of that. The ends of a
+    bar are sharp, and stpsf's FFT has its points half a cell elsewhere. A bar that was mirrored, or
+    0.1 arcsec away, would change more than a percent off the axis.
     """
     aperture, band, wavelength = PLACES[name]
     mask, place = (*aperture.split("_")[2:], None)[:2]
     call = {**FULL, "fft_oversample": 4, "fov_pixels": 60, "monochromatic": wavelength}
-    for star in ((0.0, 0.0), (0.35, -0.2)):
+    for star, limit, limit_of_bars in (((0.0, 0.0), 2e-7, 1e-2), ((0.35, -0.2), 1e-8, 1e-3)):
         options = {**BARE, "source_offset_x": star[0], "source_offset_y": star[1]}
         instrument = nircam(stpsf_path, band=band, image_mask=mask, aperture=aperture, **options)
         truth = instrument.calc_psf(**call)[1].data
@@ -261,8 +262,8 @@ def test_the_embedded_occulter_is_that_of_stpsf(stpsf_path: Path, name: str) -> 
         assert embedded.planes[0] in planes
         system = OpticalSystem(model.entrance, planes, model.detector, model.bandpass)
         image = system().numpy()  # The star is where stpsf has it, as part of the entrance.
-        limit = 1e-8 if place is None else 1e-3
-        assert np.abs(image - truth).max() <= limit * truth.max()
+        allowed = limit if place is None else limit_of_bars
+        assert np.abs(image - truth).max() <= allowed * truth.max()
 
 
 @pytest.mark.parametrize("name", PLACES)

@@ -197,11 +197,11 @@ def test_pyklip_chooses_as_a_reduction_does(
 
 @pytest.mark.slow
 def test_a_reduction_keeps_the_references_that_it_fitted() -> None:
-    rolls = tuple(frame("TARGET", ELSEWHERE, seed=k) for k in (1, 2))
-    references = tuple(frame("REF", ELSEWHERE, seed=k) for k in (3, 4))
+    rolls = tuple(frame("TARGET", LIBRARY, seed=k) for k in (1, 2))
+    references = tuple(frame("REF", LIBRARY, seed=k) for k in (3, 4))
     sequence = dr.Sequence("TARGET", rolls, references)
-    result = dr.reduce(sequence, OPD, size=24, settings=ALIGNED)
+    result = dr.reduce(sequence, OPD, size=24, settings=ALIGNED, systematics="references")
     assert [len(each.frames) for each in result.references] == [2]
     assert result.systematics is result.fit.systematics
     assert result.systematics is not None
-    assert result.systematics.provenance["stars"] == ["REF"]
+    assert "REF" in result.systematics.provenance["stars"]
