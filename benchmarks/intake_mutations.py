@@ -89,7 +89,7 @@ def _set(hdus: fits.HDUList, **cards: Any) -> None:
             if key in header:
                 del header[key]
         else:
-            header[key] = value
+            header[key] = (value, "")  # A comment may not fit beside a long name.
 
 
 def _nothing(hdus: fits.HDUList, rng: np.random.Generator) -> None:
