@@ -175,12 +175,12 @@ def _copy(folder: Folder, name: str, rng: np.random.Generator) -> None:
 # -- cards -----------------------------------------------------------------------------------------
 
 
-def _cards(**cards: Any) -> Mutation:
-    """Cards that make a file unusable."""
+def _cards(bad: bool = True, /, **cards: Any) -> Mutation:
+    """Cards that make a file unusable, or that say the same in other words, or nothing."""
 
     def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
         folder.change(name, lambda hdus, _: _set(hdus, **cards), rng)
-        folder.bad.add(name)
+        (folder.bad if bad else folder.doubtful).add(name)
 
     return mutate
 
@@ -248,19 +248,9 @@ for _keys in (
     MUTATIONS[f"without {', '.join(_keys)}"] = _missing(*_keys)
 
 
-def _same_cards(**cards: Any) -> Mutation:
-    """Cards that say the same in other words, or nothing."""
-
-    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
-        folder.change(name, lambda hdus, _: _set(hdus, **cards), rng)
-        folder.doubtful.add(name)
-
-    return mutate
-
-
-MUTATIONS["another spelling of the unit"] = _same_cards(BUNIT="MJy sr-1")
-MUTATIONS["a middle of zero"] = _same_cards(EXPMID=0.0)
-MUTATIONS["SUBSTRT of the full frame"] = _same_cards(SUBSTRT1=1, SUBSTRT2=1)
+MUTATIONS["another spelling of the unit"] = _cards(False, BUNIT="MJy sr-1")
+MUTATIONS["a middle of zero"] = _cards(False, EXPMID=0.0)
+MUTATIONS["SUBSTRT of the full frame"] = _cards(False, SUBSTRT1=1, SUBSTRT2=1)
 
 
 @_mutation("APERNAME of the full frame")
