@@ -34,7 +34,13 @@ def measure(options: argparse.Namespace, policy: str, threads: int | None) -> di
         environment.pop(name, None)
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "products"
-        command = [sys.executable, "-m", "pyklip_diffrender.cli", "reduce", *map(str, options.rolls)]
+        command = [
+            sys.executable,
+            "-m",
+            "pyklip_diffrender.cli",
+            "reduce",
+            *map(str, options.rolls),
+        ]
         command += ["--opd", str(options.opd), "-o", str(output), "--quiet"]
         command += [] if threads is None else ["--threads", str(threads)]
         before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
@@ -62,9 +68,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = []
     for busy in options.busy:
-        others = [
-            subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)
-        ]
+        others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
         try:
             for policy, threads in CASES:
                 rows.append({"busy": busy, **measure(options, policy, threads)})

@@ -176,8 +176,8 @@ def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation])
             if each.reference or len(sequence.science) > 1:
                 faults.append(f"{name} is used beside others")
             continue
-        if name in folder.scaled:
-            # A factor of two is seen only beside other frames of the star.
+        if name in folder.unlike:
+            # A factor of two, or a mirror, is seen only beside other frames of the star.
             if sum(other.target == each.target for other in _all(sequence)) > 1:
                 faults.append(f"{name} is used")
             continue
