@@ -26,7 +26,7 @@ pixel."""
 
 
 def starlight(offset: tuple[float, float] = (0.0, 0.0), side: int = SIDE) -> np.ndarray:
-    """A ring of speckles about the star, nearly symmetric about it, as behind a mask; x, y in pixels.
+    """A ring of speckles about a star behind a mask, nearly symmetric about it; x, y in pixels.
 
     Mirrored or turned it looks different, as on real frames.
     """

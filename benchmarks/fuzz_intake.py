@@ -173,7 +173,8 @@ def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation])
         source = folder.sources[name]
         used[source] += 1
         if name in folder.other:
-            if each.reference or len(sequence.science) > 1:
+            # Files that were changed alike may be used together.
+            if any(_source(other.name) not in folder.other for other in _all(sequence)):
                 faults.append(f"{name} is used beside others")
             continue
         if name in folder.unlike:

@@ -30,6 +30,7 @@ from pyklip_diffrender.detection.field import (
 from pyklip_diffrender.detection.groups import groups_of, weigh
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.measurement import contrasts_at
+from pyklip_diffrender.detection.raised_peaks import with_raised_peaks
 from pyklip_diffrender.detection.relinearise import (
     lacks_candidates,
     with_companions,
@@ -124,6 +125,13 @@ def detect(
     maps = Maps(groups_of(fits), progress)
     known = Candidates.of_fit(fits[0])
     candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
+    if not len(candidates):
+        better = with_raised_peaks(fits, maps, inner, progress)
+        if better is not None:
+            fits = better
+            maps = Maps(groups_of(fits), progress)
+            known = Candidates.of_fit(fits[0])
+            candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
     if not all(fit.status.calibrated for fit in fits):
         relinearise = min(relinearise, threshold)
     bright = candidates.snr(factor) > relinearise
