@@ -231,6 +231,8 @@ def _requested_pattern(
     IncompatibleSetupError
         If "references" is asked for without any.
     """
+    from pyklip_diffrender.pattern import as_request
+
     requested = settings.systematics
     if requested is None:
         return "auto" if observation.is_nircam else "off"
@@ -240,7 +242,7 @@ def _requested_pattern(
             "psflib_filepaths after register(), and RDI in the mode and psf_library= to "
             "klip_dataset"
         )
-    return requested
+    return as_request(requested)
 
 
 def _refined(

@@ -34,6 +34,7 @@ __all__ = [
     "exclude_copies",
     "exclude_other_setups",
     "exclude_unoriented",
+    "frames_by_star",
     "judge_frames",
 ]
 
@@ -73,7 +74,7 @@ def choose_target(
         If the target cannot be decided, with the choices.
     """
     usable = admissible(files)
-    stars = _by_star(usable)
+    stars = frames_by_star(usable)
     for star, frames in stars.items():
         for each in frames:
             each.star = star
@@ -150,7 +151,7 @@ def _require_no_lost_target(
         )
 
 
-def _by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
+def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
     """Group frames by star, by the proposer's name that most of them have."""
     groups: list[list[FrameFile]] = []
     for each in files:

@@ -40,7 +40,8 @@ class Options:
     size : int
     threshold : float
     systematics : str
-        "auto", "references", "off", or the path of a file of `Systematics.write`.
+        "auto", "references", "off", or the path of a file of `Systematics.write`, of a library of
+        patterns, or of a folder with such libraries.
     wide, disk, completeness : bool
         Search the whole frames as well, fit extended light together with the star, and compute the
         fraction of planets that the search finds.
@@ -295,7 +296,7 @@ def _options(table: _Table, default: Options) -> Options:
 
     pattern = table.take(
         "systematics", default.systematics,
-        "'auto', 'references', 'off' or a systematics.fits that exists", systematics,
+        "'auto', 'references', 'off', or an existing file or folder with patterns", systematics,
     )  # fmt: skip
     wide, disk, completeness = (
         table.take(key, getattr(default, key), "true or false", _flag)
