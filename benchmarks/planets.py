@@ -42,7 +42,7 @@ def verdict(seed: int) -> tuple[str, str]:
     frame = dr.simulate(model, dr.Scene(planets=(planet,)), now, seed=seed)
     found = dr.detect(dr.refine(model, frame, before, settings=dr.GaussNewton(cycles=12)))
     words = f"{seed}: {contrast:.2g} at {separation:.2f} arcsec, {found.fits[0].status.name}"
-    places = np.stack([found.table["x"].value, found.table["y"].value], axis=1)
+    places = np.stack([found.candidates["x"].value, found.candidates["y"].value], axis=1)
     away = np.hypot(*(places - planet.offset).T)
     if (away < 0.5 * model.resolution).any():
         return "found", words

@@ -116,7 +116,7 @@ def detect(
     >>> scene = dr.Scene(planets=(dr.Planet(1e-5, 0.6, 120.0),))
     >>> frames = dr.simulate(model, scene, opd, seed=3)
     >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=6))
-    >>> len(dr.detect(fit).table)
+    >>> len(dr.detect(fit).candidates)
     1
     """
     fits = _checked(fits)
@@ -174,7 +174,7 @@ def detect(
         snr=maps.snr() / factors,
         residual_snr=maps.snr(maps.without(candidates)) / factors,
         error_factor=factor,
-        candidates=candidates,
+        sources=candidates,
         false_alarm=false_alarm,
         rings=chi2_by_ring(maps.groups, candidates.offsets, factor),
         threshold=threshold,

@@ -80,7 +80,7 @@ def hdus_of(detection: Any) -> fits.HDUList:
         "false_alarm": detection.false_alarm,
         "rings": _table_facts(detection.rings),
         "rolls": detection.rolls,
-        "candidates": vars(detection.candidates),
+        "candidates": vars(detection.sources),
         "calibration_errors": detection._calibration_errors,
         "sky": vars(detection.sky),
         "contrast_curve": _table_facts(detection.contrast_curve),
@@ -148,7 +148,7 @@ def searched_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
     """
     return {
         "threshold": facts["threshold"],
-        "candidates": _candidates_of(facts["candidates"]),
+        "sources": _candidates_of(facts["candidates"]),
         "false_alarm": np.array(facts["false_alarm"], dtype=float),
         "rings": _table_of(facts["rings"]),
         "contrast_curve": described(_table_of(facts["contrast_curve"])),

@@ -95,7 +95,7 @@ class Overview:
         scale = np.sqrt(np.prod(observation.pixelscale))
         self.grid = scale * np.stack([x, y], axis=-1)
         self._on_frame = self.grid @ to_sky
-        table = detection.table
+        table = detection.candidates
         self._places = np.stack([table["x"].value, table["y"].value], axis=1) @ to_sky.T
         self._labels = [f"S/N {each:.1f}" for each in table["snr"]]
         self.image, self._error = self._combined(reduction)

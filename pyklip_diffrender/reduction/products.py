@@ -69,17 +69,17 @@ def write_products(
     -------
     list of Path
     """
-    written = reduction.detection.write(folder)
+    written = reduction.detection.write(folder, overwrite=True)
     if fit:
         # The fit that was searched: with the candidates in the model, if the star was fitted again.
         searched = reduction.detection.fits[0]
-        written.append(searched.write(folder / "fit.fits", linear=derivatives))
+        written.append(searched.write(folder / "fit.fits", linear=derivatives, overwrite=True))
     if reduction.wide is not None:
-        written += reduction.wide.write(folder)
+        written += reduction.wide.write(folder, overwrite=True)
     if reduction.disk is not None:
-        written.append(reduction.disk.write(folder))
+        written.append(reduction.disk.write(folder, overwrite=True))
     if reduction.systematics is not None:
-        written.append(reduction.systematics.write(folder / "systematics.fits"))
+        written.append(reduction.systematics.write(folder / "systematics.fits", overwrite=True))
     tables = {"injections": reduction.injections, "completeness": reduction.completeness}
     for name, table in tables.items():
         if table is not None:

@@ -36,6 +36,7 @@ __all__ = [
     "exclude_copies",
     "exclude_other_setups",
     "exclude_unoriented",
+    "frames_by_star",
     "judge_frames",
 ]
 
@@ -75,7 +76,7 @@ def choose_target(
         If the target cannot be decided, with the choices.
     """
     usable = admissible(files)
-    stars = _by_star(usable)
+    stars = frames_by_star(usable)
     for star, frames in stars.items():
         for each in frames:
             each.star = star
@@ -152,7 +153,7 @@ def _require_no_lost_target(
         )
 
 
-def _by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
+def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
     """Group frames by star, by the proposer's name that most of them have."""
     groups: list[list[FrameFile]] = []
     for each in files:
