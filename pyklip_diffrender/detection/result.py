@@ -249,7 +249,7 @@ class Detection:
         table["false_alarm_probability"] = self.false_alarm[order]
         table["false_alarm_probability"].info.format = ".1e"
         table["false_alarm_probability"].info.description = "of a peak anywhere; NaN if not known"
-        table.meta = dict(self._provenance)
+        table.meta = dict(self.provenance)
         return table
 
     @cached_property
@@ -349,7 +349,8 @@ class Detection:
         return tuple(digest(fit) for fit in self.fits)
 
     @cached_property
-    def _provenance(self) -> dict[str, object]:
+    def provenance(self) -> dict[str, object]:
+        """Facts about the fits and the search, by name."""
         return {
             "software": f"pyklip_diffrender {__version__}",
             "observations": [f.observation.name for fit in self.fits for f in fit.frames],

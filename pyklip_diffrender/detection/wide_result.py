@@ -159,7 +159,7 @@ class WideField:
         wcs = world_coordinates(self.grid, self.observation)
         hdus = fits.HDUList(
             [
-                primary_hdu(self.observation, about._provenance, about.sky.mjd),
+                primary_hdu(self.observation, about.provenance, about.sky.mjd),
                 image_hdu(self.snr, "SNR", "", wcs),
                 image_hdu(self.contrast, "CONTRAST", "", wcs),
                 image_hdu(self.error, "CONTRAST_ERROR", "", wcs),

@@ -43,7 +43,7 @@ def overview_pictures(overview: Overview, summary: Mapping[str, Any]) -> list[Pi
     words = [
         (
             f"Image of {summary['target']} without the star, all frames combined, {up}.",
-            f"All frames without the star, turned {up} and averaged. "
+            f"{overview.images.words}, {up}. "
             + ("Circles mark the candidates. " if count else "")
             + "The scale is linear near 0 and logarithmic beyond.",
         ),
