@@ -21,6 +21,7 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
 from astropy.time import Time
+from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
@@ -32,6 +33,7 @@ from pyklip_diffrender.reduction import summarise, write_report
 from pyklip_diffrender.reduction.extended import looks_extended
 from pyklip_diffrender.reduction.overview import Klip, Overview
 from pyklip_diffrender.reduction.page import page
+from pyklip_diffrender.reduction.sky_images import SkyImages
 from pyklip_diffrender.reduction.words import (
     advice,
     plus_minus,
@@ -54,7 +56,9 @@ def reduction(planet: bool = True, target: str = "HD 1") -> dr.Reduction:
     scene = dr.Scene(dr.Star(exposure=20.0), (on_frame,) if planet else ())
     frame = replace(
         dr.simulate(model, scene, opd, seed=3),
-        header=fits.Header({"TARGPROP": target, "INSTRUME": "TEST"}),
+        header=fits.Header(
+            {"TARGPROP": target, "INSTRUME": "TEST", "CRVAL1": 100.0, "CRVAL2": 20.0}
+        ),
         position_angles=np.array([ROLL - 360]),
         date=Time("2022-10-03T00:00:00"),
         filter="F444W",
@@ -494,10 +498,12 @@ def test_images_have_north_up() -> None:
     klip = Klip.of(replace(whole, sequence=replace(whole.sequence, references=(alone,))))
     assert klip is not None
     assert klip.label == "KLIP RDI (1 reference frame, 1 mode)"
-    overview = Overview(whole, klip)
+    images = SkyImages(whole)
+    overview = Overview(images, klip)
     wrong = [replace(PLANET, position_angle=angle).offset for angle in (10.0, 70.0, -40.0, 220.0)]
-    for image, grid in ((overview.image, overview.grid), (klip.image, klip.grid),
-                        (overview._snr(), overview.grid)):  # fmt: skip
+    for image, grid in ((images.combined[0], images.grid), (images.posterior_mean, images.grid),
+                        (klip.image, klip.grid),
+                        (images.turned(whole.detection.snr), images.grid)):  # fmt: skip
         # Its position on the frame, turned twice, mirrored, and on the other side.
         light, *others = (
             np.nansum(image[np.hypot(*(grid - place).T).T < 0.1]) for place in
@@ -507,6 +513,32 @@ def test_images_have_north_up() -> None:
     # Four standard deviations.
     (circled,) = overview._places
     assert np.hypot(*(circled - PLANET.offset)) < 0.05
+
+
+def test_images_of_the_sky_are_written_with_coordinates(tmp_path: Path) -> None:
+    whole = reduction()
+    images = SkyImages(whole)
+    with fits.open(images.write(tmp_path / "images.fits")) as hdus:
+        names = [hdu.name for hdu in hdus[1:]]
+        assert names == [
+            "COMBINED", "COMBINED_ERROR", "POSTERIOR_MEAN", "CONTRAST", "CONTRAST_ERROR", "SNR",
+        ]  # fmt: skip
+        (row,) = whole.detection.candidates
+        image, wcs = np.nan_to_num(hdus["SNR"].data), WCS(hdus["POSTERIOR_MEAN"].header)
+        y, x = np.unravel_index(image.argmax(), image.shape)
+        star = wcs.pixel_to_world(images.grid.shape[1] // 2, images.grid.shape[0] // 2)
+        peak = wcs.pixel_to_world(int(x), int(y))
+        # To a pixel of 0.063 arcsec, at 0.6 arcsec.
+        assert star.separation(peak).arcsec == pytest.approx(row["separation"].value, abs=0.07)
+        angle = star.position_angle(peak).deg
+        assert angle == pytest.approx(row["position_angle"].value, abs=8.0)
+        np.testing.assert_array_equal(hdus["POSTERIOR_MEAN"].data, images.posterior_mean)
+        ratio = hdus["CONTRAST"].data[y, x] / hdus["CONTRAST_ERROR"].data[y, x]
+        # The ratio of interpolated values, and the interpolated ratio.
+        assert ratio == pytest.approx(hdus["SNR"].data[y, x], rel=0.05)
+        # The mean has the noise of the frames.
+        noise = np.nanmedian(hdus["COMBINED_ERROR"].data)
+        assert 0.5 < noise / np.nanmedian(whole.detection.observation.error) < 2
 
 
 @pytest.mark.usefixtures("_few_pictures")

@@ -12,7 +12,7 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Detection, Disk, WideField, draw_curve, draw_search
 from pyklip_diffrender.reduction.html import Picture
 from pyklip_diffrender.reduction.overview import Overview
-from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.summary import wavefronts
 from pyklip_diffrender.reduction.words import number
 
@@ -43,7 +43,7 @@ def overview_pictures(overview: Overview, summary: Mapping[str, Any]) -> list[Pi
     words = [
         (
             f"Image of {summary['target']} without the star, all frames combined, {up}.",
-            f"All frames without the star, turned {up} and averaged. "
+            f"{overview.images.words}, {up}. "
             + ("Circles mark the candidates. " if count else "")
             + "The scale is linear near 0 and logarithmic beyond.",
         ),

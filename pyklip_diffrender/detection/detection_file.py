@@ -21,7 +21,7 @@ from pyklip_diffrender.detection.groups import Group, groups_of
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.storage import (
+from pyklip_diffrender.refinement.fit_file import (
     image,
     observation_hdus,
     observation_of,
@@ -85,12 +85,12 @@ def hdus_of(detection: Any) -> fits.HDUList:
         "sky": vars(detection.sky),
         "contrast_curve": _table_facts(detection.contrast_curve),
         "observation": about,
-        "provenance": detection._provenance,
+        "provenance": detection.provenance,
         "fits": detection._digests,
     }
     return fits.HDUList(
         [
-            primary_hdu(detection.observation, detection._provenance, detection.sky.mjd),
+            primary_hdu(detection.observation, detection.provenance, detection.sky.mjd),
             *(
                 image_hdu(getattr(detection, attribute), name, "", wcs)
                 for name, attribute in _MAPS.items()
