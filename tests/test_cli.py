@@ -108,6 +108,7 @@ def test_help_of_a_command_has_sections_and_examples(
         (["psf", "x.fits", "--threads", "0"], "--threads"),
         (["psf", "x.fits", "--size", "0"], "--size"),
         (["demo", "--hours", "-1"], "--hours"),
+        (["demo", "--contrast", "-1"], "--contrast"),
         (["demo", "--separation", "9"], "--separation"),
     ],
 )
@@ -656,8 +657,6 @@ def test_impossible_arguments_are_messages(
     tmp_path: Path, frames: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     products = ["-o", str(tmp_path / "products")]
-    assert main(["demo", "--contrast", "-1", *products]) == 1
-    assert "contrast: got -1, expected 0 or more" in capsys.readouterr().err
     assert main(["detect", str(frames), "--opd", "nowhere.fits", *products]) == 1
     assert "is a folder, expected a file; the command reduce" in capsys.readouterr().err
 
