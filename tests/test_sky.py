@@ -376,7 +376,7 @@ def test_the_companion_of_hip_65426_is_on_its_side_of_the_star(shared_data: Path
     frames = shared_data / "hip65426_f444w_calints.fits.gz"
     opd = shared_data / "opd_2022-07-30.fits.gz"
     detection = dr.reduce(frames, opd, size=48).detection
-    row = detection.table[0]
+    row = detection.candidates[0]
     assert row["separation"].to_value("mas") == pytest.approx(820, abs=25)
     header = detection.observation.header
     star = SkyCoord(header["CRVAL1"], header["CRVAL2"], unit="deg")

@@ -119,7 +119,7 @@ def fake_detection(offset: tuple[float, float], north: float) -> Any:
     table = candidate_table(
         candidates, ErrorFactor.constant(2.0), np.zeros((2, 2)), Sky(north, star=(0.5, 0.01))
     )
-    return SimpleNamespace(table=table, contrast_curve=QTable(curve))
+    return SimpleNamespace(candidates=table, contrast_curve=QTable(curve))
 
 
 def test_candidates_become_rows_of_spaceklips_table(tmp_path: Path) -> None:
@@ -305,7 +305,7 @@ def test_a_concatenation_from_frames_to_sources(
     np.testing.assert_allclose(rolls.mean(axis=0)[seen], image[seen], rtol=1e-5, atol=1e-3)
     assert np.abs(rolls[0] - rolls[1])[seen].max() > 10
     assert (product.parent / f"{KEY}.dat").exists()
-    assert Detection.read(product.parent / f"ADI_NANNU1_NSUBS1_{KEY}").table["snr"][0] > 5
+    assert Detection.read(product.parent / f"ADI_NANNU1_NSUBS1_{KEY}").candidates["snr"][0] > 5
 
 
 @pytest.mark.slow
@@ -325,7 +325,7 @@ def test_a_catalogues_star_is_that_of_the_search(
         plan="off", fit=ALIGNED, star_flux={"F444W": "450 mJy"}, star_flux_error=0.3,
     )  # fmt: skip
     assert tied == [(pytest.approx(0.45), 0.3)]
-    table = detections[KEY].table
+    table = detections[KEY].candidates
     assert table["contrast_error"][0] / table["contrast"][0] == pytest.approx(0.3, rel=0.1)
 
 

@@ -84,13 +84,13 @@ def demo(
         f"Refinement: {result.fit.status.message}.\n\n"
         "Point sources with the wavefront marginalised, which loses none of the planet:"
     )
-    for row in result.detection.table:
+    for row in result.detection.candidates:
         click.echo(
             f"  {row['separation'].to_value('arcsec'):.3f} arcsec at "
             f"{row['position_angle'].to_value('deg'):.1f} deg: contrast {row['contrast']:.2e} +- "
             f"{row['contrast_error']:.1e}, S/N {row['snr']:.1f}"
         )
-    if not len(result.detection.table):
+    if not len(result.detection.candidates):
         click.echo(f"  none above {result.detection.threshold:g} sigma")
     for path in (*written, figure):
         click.echo(f"wrote {path}")

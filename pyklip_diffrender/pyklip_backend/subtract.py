@@ -303,13 +303,13 @@ def _with_companions(
     # No relinearisation: the star is refined again below.
     tell("searching for companions")
     detection = detect(result, relinearise=math.inf)
-    logger.info("companions kept out of the star: %s", detection.table)
-    number = _counted(len(detection.candidates), "companion")
-    if not lacks_candidates([result], detection.candidates):
+    logger.info("companions kept out of the star: %s", detection.candidates)
+    number = _counted(len(detection.sources), "companion")
+    if not lacks_candidates([result], detection.sources):
         tell(f"{number} detected, as many as the fit has")
         return result, detection.error_factor
     tell(f"{number} detected, {len(result.companions)} in the fit: the star is fitted again")
-    (result,) = with_companions([result], detection.candidates)
+    (result,) = with_companions([result], detection.sources)
     tell(_described(result))
     return result, detection.error_factor
 

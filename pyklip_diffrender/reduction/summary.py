@@ -185,7 +185,7 @@ def _rows(table: QTable) -> list[dict[str, Any]]:
 
 def _candidates(reduction: Reduction) -> list[dict[str, Any]]:
     """Candidates; those that look like extended light have no false-alarm probability."""
-    rows = _rows(reduction.detection.table)
+    rows = _rows(reduction.detection.candidates)
     if reduction.extended:
         rows = [each | {"false_alarm_probability": None} for each in rows]
     return rows
@@ -193,7 +193,7 @@ def _candidates(reduction: Reduction) -> list[dict[str, Any]]:
 
 def _wide_field(wide: WideField) -> dict[str, Any]:
     """Candidates and limits in the whole frames."""
-    return {"candidates": _rows(wide.table), "contrast_curve": _curve(wide.contrast_curve)}
+    return {"candidates": _rows(wide.candidates), "contrast_curve": _curve(wide.contrast_curve)}
 
 
 def _disk(disk: Disk) -> dict[str, Any]:

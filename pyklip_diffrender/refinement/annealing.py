@@ -382,6 +382,8 @@ class Annealing:
     def _significant(self, course: _Course) -> list[Planet]:
         """Companions in the residual of the alignment."""
         most, threshold = self._room(course), self.settings.companion_threshold
+        if most < 1 and self.settings.companions_if_stalled:
+            most, threshold = min(1, most + _MOST_BRIGHT), _BRIGHT
         return bright_companions(
             self.objective, course.state, course.kappa, most=most, threshold=threshold
         )

@@ -23,6 +23,7 @@ from pyklip_diffrender.scene.pixel_checks import (
     why_no_star,
     why_odd_unit,
     why_other_brightness,
+    why_turned,
 )
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "choose_filter",
     "choose_target",
     "compare_brightness",
+    "compare_orientation",
     "epochs_of",
     "exclude_copies",
     "exclude_other_setups",
@@ -267,7 +269,25 @@ def compare_brightness(
         If half of the frames or more are, and nothing says which are right.
     """
     usable = admissible(files)
-    odd = why_other_brightness([_known(frames[id(each)]) for each in usable])
+    _exclude(usable, why_other_brightness([_known(frames[id(each)]) for each in usable]))
+
+
+def compare_orientation(
+    files: Iterable[FrameFile], frames: Mapping[int, Observation | None]
+) -> None:
+    """Exclude frames whose pixels are mirrored or turned, unlike those of most others.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If half of the frames or more are, and nothing says which are right.
+    """
+    usable = admissible(files)
+    _exclude(usable, why_turned([_known(frames[id(each)]) for each in usable]))
+
+
+def _exclude(usable: Sequence[FrameFile], odd: Mapping[int, str]) -> None:
+    """Exclude frames with a reason, by index, if those without one can be right."""
     if 2 * len(odd) >= len(usable) and odd and not usable[0].exposure.reference:
         names = ", ".join(each.name for each in usable)
         raise IncompatibleSetupError(

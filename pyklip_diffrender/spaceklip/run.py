@@ -270,8 +270,8 @@ def _reduced(
         write_rolls(product, dataset, files[kinds == "SCI"])
     write_snr(folder / f"{prefix}-snr.fits", detection, product)
     write_contrast(product, detection)
-    detection.write(folder / prefix)
-    detection.fits[0].write(folder / prefix / "fit.fits")
+    detection.write(folder / prefix, overwrite=True)
+    detection.fits[0].write(folder / prefix / "fit.fits", overwrite=True)
     source_table(detection, product).write(
         folder / f"{prefix}-results.ecsv", format="ascii.ecsv", overwrite=True
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.geometry import full_circle
 from pyklip_diffrender.io.opd_map import FLAT
 
 __all__ = ["Config", "Injections", "Options", "SequenceConfig", "read_config"]
@@ -349,7 +350,7 @@ def _injections(table: _Table, default: Injections) -> Injections:
     if own and bool(contrasts) != bool(separations):
         table.complain("", "one of contrasts and separations", "both, or neither")
     table.finish()
-    return Injections(contrasts, separations, angles)
+    return Injections(contrasts, separations, tuple(map(full_circle, angles)))
 
 
 # -- values ----------------------------------------------------------------------------------------
