@@ -5,11 +5,11 @@ Run from the root of the project, with stpsf installed and its data named by STP
     STPSF_PATH=... python -m benchmarks.masks [NAME ...]
 
 Images are monochromatic, of 80 x 80 pixels, of a star on the axis, with 1024 samples across the
-pupil. stpsf computes with 2 and 4 points per lambda/D in the plane of the mask, and this package with
-2 cells. The error of either is the largest difference from its own limit (stpsf's optics with 8
-points, by the converted model, which agrees with stpsf to rounding; this package with 8 cells), over
-the peak of the image, which the mask has made fainter. Times are those of the processor with one
-thread, after a first image that fills caches; of this package, the best of three.
+pupil. stpsf computes with 2 and 4 points per lambda/D in the plane of the mask, and this package
+with 2 cells. The error of either is the largest difference from its own limit (stpsf's optics with
+8 points, by the converted model, which agrees with stpsf to rounding; this package with 8 cells),
+over the peak of the image, which the mask has made fainter. Times are those of the processor with
+one thread, after a first image that fills caches; of this package, the best of three.
 
 Prints a row for each mask.
 """
