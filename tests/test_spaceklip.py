@@ -20,16 +20,20 @@ from pyklip.parallelized import klip_dataset
 from benchmarks.calints_files import calints
 from pyklip_diffrender import spaceklip
 from pyklip_diffrender.detection import Candidates, Detection
+from pyklip_diffrender.detection.candidate_tables import candidate_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.sky import Sky
-from pyklip_diffrender.detection.tables import candidate_table
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.pyklip_backend import backend, reduction
+from pyklip_diffrender.pyklip_backend import backend, klip_call
 from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.spaceklip import run
-from pyklip_diffrender.spaceklip.products import complete_header, write_contrast, write_database
+from pyklip_diffrender.spaceklip.database_files import (
+    complete_header,
+    write_contrast,
+    write_database,
+)
 from pyklip_diffrender.spaceklip.sources import source_table
 from pyklip_diffrender.wavefront import random_opd
 
@@ -380,7 +384,7 @@ def test_spaceklips_own_injections_need_one_fit(
         dataset = JWST.JWSTData(files, None, highpass=False)
         before = copy.deepcopy(dataset)
         klip_dataset(dataset, fileprefix="once", **options)
-    monkeypatch.setattr(reduction, "subtract_by_refinement", None)
+    monkeypatch.setattr(klip_call, "subtract_by_refinement", None)
     y, x = np.indices((25, 25)) - 12
     peak = 1e-3 * FLUX * float(model(OPD.data, star_offset=(0.8, 0.0)).max())
     with backend(injected_into=dataset, image="subtracted"):

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pyklip_diffrender.cli.options import (
+from pyklip_diffrender.cli.session import Run
+from pyklip_diffrender.cli.shared_options import (
     Command,
     archive,
     common,
@@ -18,7 +19,6 @@ from pyklip_diffrender.cli.options import (
     search,
     wavefront,
 )
-from pyklip_diffrender.cli.run import Run
 from pyklip_diffrender.errors import IncompatibleSetupError
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def reduce_frames(
             )
         return Sequence.by_filter_and_epoch(files, target=target, filter=filter)
 
-    from pyklip_diffrender.cli.reduction import run_reduction
+    from pyklip_diffrender.cli.reducing import run_reduction
 
     run_reduction(run, read, **options)
 
@@ -185,7 +185,7 @@ def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
             )
         return (Sequence.from_files([frames]),)
 
-    from pyklip_diffrender.cli.reduction import run_reduction
+    from pyklip_diffrender.cli.reducing import run_reduction
 
     run_reduction(run, read, **options)
 

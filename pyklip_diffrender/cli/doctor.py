@@ -17,8 +17,8 @@ import click
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.cli.machine import free_memory
-from pyklip_diffrender.cli.options import Command, common
-from pyklip_diffrender.cli.run import Run
+from pyklip_diffrender.cli.session import Run
+from pyklip_diffrender.cli.shared_options import Command, common
 from pyklip_diffrender.errors import DiffrenderError
 
 __all__ = ["Check", "doctor"]

@@ -32,11 +32,11 @@ from scipy.optimize import minimize
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.combination import combine_frames
+from pyklip_diffrender.detection.detection_file import image_hdu
 from pyklip_diffrender.detection.field import Image, separation_of
 from pyklip_diffrender.detection.groups import groups_of, has_only_reference_stars
 from pyklip_diffrender.detection.relinearise import without_light
 from pyklip_diffrender.detection.sky import Sky
-from pyklip_diffrender.detection.storage import image_hdu
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import require_new, write_fits

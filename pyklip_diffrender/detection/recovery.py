@@ -11,7 +11,7 @@ from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import NDArray
 
-from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.io.geometry import full_circle
 from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.scene.objects import Planet

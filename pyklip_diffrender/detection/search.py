@@ -10,6 +10,7 @@ import torch
 from astropy.table import QTable
 from numpy.typing import ArrayLike
 
+from pyklip_diffrender.detection.candidate_tables import measured_table
 from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
@@ -35,10 +36,9 @@ from pyklip_diffrender.detection.relinearise import (
     lacks_candidates,
     with_companions,
 )
-from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.detection.sky import Sky
-from pyklip_diffrender.detection.tables import measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.refinement import Refinement

@@ -23,7 +23,7 @@ from pyklip_diffrender.detection.field import Image, curve_separations, far_from
 from pyklip_diffrender.detection.groups import groups_of
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.recovery import CLEAR
-from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.progress import ProgressBar

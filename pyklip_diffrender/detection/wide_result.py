@@ -15,12 +15,12 @@ from astropy.table import QTable
 from numpy.typing import NDArray
 
 from pyklip_diffrender import drawing
+from pyklip_diffrender.detection.candidate_tables import in_words
+from pyklip_diffrender.detection.detection_file import image_hdu
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.figure import draw_search
-from pyklip_diffrender.detection.result import RENAMED, Detection
-from pyklip_diffrender.detection.storage import image_hdu
-from pyklip_diffrender.detection.tables import in_words
+from pyklip_diffrender.detection.search_result import RENAMED, Detection
 from pyklip_diffrender.io.files import replacing, require_new, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.observation import Observation

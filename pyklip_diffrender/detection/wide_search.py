@@ -11,13 +11,13 @@ import torch
 from astropy.table import QTable, vstack
 from numpy.typing import NDArray
 
+from pyklip_diffrender.detection.candidate_tables import candidate_table
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image, far_from, ring_pixels, separation_of
-from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.significance import Significance
-from pyklip_diffrender.detection.tables import candidate_table
 from pyklip_diffrender.detection.whole_frames import WholeFrame
 from pyklip_diffrender.detection.wide_result import WideField
 from pyklip_diffrender.errors import IncompatibleSetupError

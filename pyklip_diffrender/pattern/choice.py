@@ -24,8 +24,8 @@ from pyklip_diffrender.pattern.library import (
 )
 from pyklip_diffrender.pattern.placement import place_on_detector
 from pyklip_diffrender.pattern.presence import lacks_pattern
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
-from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics

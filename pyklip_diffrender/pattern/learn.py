@@ -30,8 +30,8 @@ from pyklip_diffrender.pattern.library import PatternLibrary, known_systematics
 from pyklip_diffrender.pattern.measure import flat_of, measure_patterns
 from pyklip_diffrender.pattern.pedestal import pattern_pedestal
 from pyklip_diffrender.pattern.presence import pattern_size
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
-from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.scene.admission import frames_by_star
 from pyklip_diffrender.scene.exposure import detector_of, image_mask

@@ -31,7 +31,7 @@ from pyklip_diffrender.pattern.measure import (
     flat_of,
     measure_patterns,
 )
-from pyklip_diffrender.refinement.result import Refinement
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.scene.catalogue_star import star_of
 from pyklip_diffrender.scene.exposure import detector_of, image_mask
 from pyklip_diffrender.scene.observation import Observation

@@ -19,8 +19,8 @@ from pyklip_diffrender.pattern.pedestal import (
     pattern_pedestal,
     rings_about,
 )
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.scene.catalogue_star import CatalogueStar, star_of
 from pyklip_diffrender.scene.exposure import detector_of, image_mask
 from pyklip_diffrender.scene.observation import Observation

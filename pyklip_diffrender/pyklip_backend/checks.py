@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
-from pyklip_diffrender.pyklip_backend.frames import require_frames
-from pyklip_diffrender.pyklip_backend.images import IMAGES
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.dataset_frames import require_frames
+from pyklip_diffrender.pyklip_backend.product_images import IMAGES
 
 __all__ = ["check_arguments", "check_dataset", "check_settings"]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import draw_curve
-from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.sky_images import SkyImages
 
 __all__ = ["Klip", "Overview"]

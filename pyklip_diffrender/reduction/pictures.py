@@ -12,7 +12,7 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Detection, Disk, WideField, draw_curve, draw_search
 from pyklip_diffrender.reduction.html import Picture
 from pyklip_diffrender.reduction.overview import Overview
-from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.summary import wavefronts
 from pyklip_diffrender.reduction.words import number
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.io.files import replacing
-from pyklip_diffrender.reduction.injections import completeness_section, injections_section
 from pyklip_diffrender.reduction.overview import Klip, Overview
 from pyklip_diffrender.reduction.page import page
 from pyklip_diffrender.reduction.pictures import (
@@ -20,7 +19,8 @@ from pyklip_diffrender.reduction.pictures import (
     wavefront_pictures,
     wide_pictures,
 )
-from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.recovery_sections import completeness_section, injections_section
+from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.sky_images import SkyImages
 from pyklip_diffrender.reduction.summary import summarise
 

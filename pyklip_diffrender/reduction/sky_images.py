@@ -18,7 +18,7 @@ from pyklip_diffrender.detection import Detection, combine_frames, image_hdu
 from pyklip_diffrender.imaging import SkyModel
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.geometry import rotation_matrix
-from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
 __all__ = ["SkyImages"]
@@ -67,7 +67,7 @@ class SkyImages:
 
     @cached_property
     def posterior_mean(self) -> Image:
-        """What is neither star nor detector, in the frames' unit, see `imaging.sky`.
+        """What is neither star nor detector, in the frames' unit, see `imaging.sky_model`.
 
         Of faint sources it has 0.4 to 0.8 of the peak.
         """

@@ -16,7 +16,7 @@ from pyklip_diffrender.io.names import same_name, unknown_name
 from pyklip_diffrender.scene.catalogue_star import CatalogueStar
 from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.frame_files import FrameFile, admissible, require_some
-from pyklip_diffrender.scene.noise import why_odd_noise
+from pyklip_diffrender.scene.measured_noise import why_odd_noise
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.pixel_checks import (
     copies,

@@ -25,7 +25,7 @@ from pyklip_diffrender.scene.checked_frames import checked_frames
 from pyklip_diffrender.scene.exposure import instrument_of
 from pyklip_diffrender.scene.integrations import judge_pointings, pointings
 from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints, without_empty
-from pyklip_diffrender.scene.noise import calibrated_errors, weighted_mean
+from pyklip_diffrender.scene.measured_noise import calibrated_errors, weighted_mean
 from pyklip_diffrender.scene.window import Window
 
 __all__ = ["Observation"]
@@ -175,8 +175,8 @@ class Observation:
         of aligned frames (IMSHIFTS, or CENTER_SHIFT and ALIGN_SHIFT): they are undone, so that the
         pixels are those of the detector, whose flat-field errors then stay in their pixels.
         Errors of NIRCam frames are corrected for the noise that is measured far from the star, see
-        `pyklip_diffrender.scene.noise.calibrated_errors`. Integrations that are empty are left out,
-        and three or more are compared with each other, see
+        `pyklip_diffrender.scene.measured_noise.calibrated_errors`. Integrations that are empty are
+        left out, and three or more are compared with each other, see
         ``scene.integrations.judge_integrations``; `remarks` says what was left out.
 
         Parameters

@@ -21,10 +21,10 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.units import require_bound
-from pyklip_diffrender.pyklip_backend.jwst_files import reduce_jwst_files
+from pyklip_diffrender.pyklip_backend.reduce_files import reduce_jwst_files
 from pyklip_diffrender.refinement import to_jansky, with_star_flux
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.spaceklip.products import (
+from pyklip_diffrender.spaceklip.database_files import (
     complete_header,
     write_contrast,
     write_database,

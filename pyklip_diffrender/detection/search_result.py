@@ -21,7 +21,16 @@ from numpy.typing import ArrayLike, NDArray
 from pyklip_diffrender import drawing
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection.calibration import calibration_errors
+from pyklip_diffrender.detection.candidate_tables import candidate_table, in_words, measured_table
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.detection_file import (
+    computed_of,
+    digest,
+    fit_beside,
+    groups_of_searched,
+    hdus_of,
+    searched_of,
+)
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.figure import draw_search
@@ -34,20 +43,11 @@ from pyklip_diffrender.detection.measurement import (
 from pyklip_diffrender.detection.orbits import write_astrometry
 from pyklip_diffrender.detection.relinearise import unconfirmed_companions
 from pyklip_diffrender.detection.sky import Sky
-from pyklip_diffrender.detection.storage import (
-    computed_of,
-    digest,
-    fit_beside,
-    groups_of_searched,
-    hdus_of,
-    searched_of,
-)
-from pyklip_diffrender.detection.tables import candidate_table, in_words, measured_table
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.io.files import replacing, require_new, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.storage import reading
+from pyklip_diffrender.refinement.fit_file import reading
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["RENAMED", "Detection"]

@@ -21,7 +21,7 @@ from pyklip_diffrender.detection.groups import Group, groups_of
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.storage import (
+from pyklip_diffrender.refinement.fit_file import (
     image,
     observation_hdus,
     observation_of,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pyklip_diffrender.cli.options import (
+from pyklip_diffrender.cli.session import Run
+from pyklip_diffrender.cli.shared_options import (
     Command,
     archive,
     file_type,
@@ -16,7 +17,6 @@ from pyklip_diffrender.cli.options import (
     require_frames,
     wavefront,
 )
-from pyklip_diffrender.cli.run import Run
 
 if TYPE_CHECKING:
     from pyklip_diffrender.wavefront.map_choice import Rule
@@ -99,7 +99,7 @@ def learn(
     require_frames(frames, program)
     run.claim_file(output, overwrite)
     from pyklip_diffrender.archive import fetch_calints
-    from pyklip_diffrender.cli.reduction import map_for
+    from pyklip_diffrender.cli.reducing import map_for
     from pyklip_diffrender.pattern import learn_library
 
     files = list(frames)

@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from pyklip_diffrender.cli.estimate import describe_plan, size_of_products
-from pyklip_diffrender.cli.run import Run, with_options
+from pyklip_diffrender.cli.session import Run, with_options
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument.star_flux import star_flux_density
 from pyklip_diffrender.io.opd_map import OPDMap

@@ -26,10 +26,7 @@ from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.linear.noise import UNCORRELATED, CorrelatedError
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import LEVELS, parameter
-from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.settings import GaussNewton
-from pyklip_diffrender.refinement.status import Status
-from pyklip_diffrender.refinement.storage import (
+from pyklip_diffrender.refinement.fit_file import (
     linear_hdus,
     linear_of,
     model_facts,
@@ -37,6 +34,9 @@ from pyklip_diffrender.refinement.storage import (
     reading,
     text_hdu,
 )
+from pyklip_diffrender.refinement.frame_fit import FrameFit
+from pyklip_diffrender.refinement.settings import GaussNewton
+from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.product_headers import primary_hdu
 from pyklip_diffrender.scene.systematics import Systematics

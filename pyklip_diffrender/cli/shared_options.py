@@ -10,7 +10,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from pyklip_diffrender.cli.run import Run
+from pyklip_diffrender.cli.session import Run
 
 __all__ = [
     "COMMON",
