@@ -342,7 +342,7 @@ def _page(
                 "and is that of a source that moves with the star, or stays on the sky. The colour "
                 "is the AB magnitude in the first filter minus that in the second, without errors "
                 "of the photometric calibration. Orbits, the star's parallax and errors of its "
-                f"proper motion are neglected. Proper motion of the star to east and north: {known}."
+                f"proper motion are neglected. Proper motion to east and north: {known}."
             ),
         ),
     ]  # fmt: skip
