@@ -218,7 +218,6 @@ def reduced(case: Case, folder: Path, references: int = 0) -> dict[str, Any]:
     began = time.process_time()
     reduction = dr.reduce(sequence, before, size=case.size)
     seconds = time.process_time() - began
-    reduction.write(folder / "products", overwrite=True)
     result = compare(case, reduction) | {
         "cpu_stpsf": made,
         "cpu": seconds,

@@ -13,7 +13,7 @@ from astropy.io import fits
 from benchmarks.calints_files import calints
 from pyklip_diffrender.cli import main
 from pyklip_diffrender.reduction import compare_reductions, write_comparison
-from pyklip_diffrender.reduction.comparison import sources_of
+from pyklip_diffrender.reduction.several import sources_of
 
 MOTION = (0.28, -0.36)
 """Of AU Mic, arcsec per year."""
@@ -166,8 +166,9 @@ def test_the_command_takes_every_filter_of_the_target(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frames = tmp_path / "frames"
-    calints(frames / "a.fits")
-    short = {"FILTER": "F356W", "ACT_ID": "07"}
+    pixel = {"PIXAR_SR": 9.2e-14}
+    calints(frames / "a.fits", cards=pixel)
+    short = {"FILTER": "F356W", "ACT_ID": "07", **pixel}
     calints(frames / "b.fits", date="2022-10-03T07:00:00", cards=short)
     # A filter of a reference star alone.
     alone = {"FILTER": "F300M", "IS_PSF": True, "ACT_ID": "08"}

@@ -1,6 +1,6 @@
 """`reduce`: from a sequence of frames to planets, with a report."""
 
-from pyklip_diffrender.reduction.comparison import (
+from pyklip_diffrender.reduction.several import (
     COMPARISON,
     compare_reductions,
     write_comparison,
