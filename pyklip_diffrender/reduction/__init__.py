@@ -1,10 +1,5 @@
 """`reduce`: from a sequence of frames to planets, with a report."""
 
-from pyklip_diffrender.reduction.several import (
-    COMPARISON,
-    compare_reductions,
-    write_comparison,
-)
 from pyklip_diffrender.reduction.options import ReduceOptions
 from pyklip_diffrender.reduction.pipeline import Preparation, prepare, reduce
 from pyklip_diffrender.reduction.products import (
@@ -14,6 +9,11 @@ from pyklip_diffrender.reduction.products import (
     write_report,
 )
 from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.several import (
+    COMPARISON,
+    compare_reductions,
+    write_comparison,
+)
 from pyklip_diffrender.reduction.summary import summarise
 
 __all__ = [
