@@ -20,13 +20,24 @@ PLACES = {"HD 1": (100.0, 20.0), "HD 2": (101.5, 19.0), "BD+20-1790": (110.0, 20
 """Right ascension and declination of stars, degrees."""
 
 
+_WAVES = ((0.9, 0.3, 0.3), (-0.8, 0.5, -0.3), (0.2, -1.2, 0.3), (-0.6, -0.7, -0.3))
+"""Wave numbers along x and y of the field of the speckles, and growth of their phases, radians per
+pixel."""
+
+
 def starlight(offset: tuple[float, float] = (0.0, 0.0), side: int = SIDE) -> np.ndarray:
-    """A ring of speckles about the star, symmetric about it, as behind a mask; x, y in pixels."""
+    """A ring of speckles about a star behind a mask, nearly symmetric about it; x, y in pixels.
+
+    Mirrored or turned it looks different, as on real frames.
+    """
     y, x = np.indices((side, side))
     dx, dy = x - CENTER[0] - offset[0], y - CENTER[1] - offset[1]
     r = np.hypot(dx, dy)
-    speckles = 1 + 0.5 * np.cos(6 * np.arctan2(dy, dx)) * np.cos(r)
-    return np.asarray(40 * np.exp(-(((r - 6) / 5) ** 2)) * speckles)
+    field = np.ones_like(r)
+    for kx, ky, phase in _WAVES:
+        # The farther out, the less symmetric.
+        field += 0.5 * np.cos(kx * dx + ky * dy + phase * np.maximum(r - 5, 0))
+    return np.asarray(28 * np.exp(-(((r - 6) / 5) ** 2)) * field**2)
 
 
 def calints(

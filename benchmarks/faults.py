@@ -90,7 +90,7 @@ WORK: dict[str, Callable[[Job, Path], dict[str, Any]]] = {
 
 def run_client(config: str, output: str, work: str, scheduler: str | None) -> int:
     """Run a survey as the command line does, without the page, whose imports take longer."""
-    page = ModuleType("pyklip_diffrender.surveys.page")
+    page = ModuleType("pyklip_diffrender.surveys.survey_page")
     page.page = lambda *_: "no page"  # type: ignore[attr-defined]
     sys.modules[page.__name__] = page
     try:

@@ -173,11 +173,12 @@ def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation])
         source = folder.sources[name]
         used[source] += 1
         if name in folder.other:
-            if each.reference or len(sequence.science) > 1:
+            # Files that were changed alike may be used together.
+            if any(_source(other.name) not in folder.other for other in _all(sequence)):
                 faults.append(f"{name} is used beside others")
             continue
-        if name in folder.scaled:
-            # A factor of two is seen only beside other frames of the star.
+        if name in folder.unlike:
+            # A factor of two, or a mirror, is seen only beside other frames of the star.
             if sum(other.target == each.target for other in _all(sequence)) > 1:
                 faults.append(f"{name} is used")
             continue

@@ -33,8 +33,8 @@ class Folder:
         Files that must not be used.
     doubtful : set of str
         Files that may be used if the result is that of the unmutated file, or excluded.
-    scaled : set of str
-        Files whose unit is wrong by so little that only other frames of the star show it.
+    unlike : set of str
+        Files that are wrong in a way which only other frames of the star show.
     other : set of str
         Files that belong to another set-up or epoch: wrong beside others, right alone.
     done : list of str
@@ -45,7 +45,7 @@ class Folder:
     sources: dict[str, str]
     bad: set[str] = field(default_factory=set)
     doubtful: set[str] = field(default_factory=set)
-    scaled: set[str] = field(default_factory=set)
+    unlike: set[str] = field(default_factory=set)
     other: set[str] = field(default_factory=set)
     done: list[str] = field(default_factory=list)
 
@@ -335,6 +335,17 @@ def _moved(hdus: fits.HDUList, rng: np.random.Generator) -> None:
         hdus[key].data = np.roll(hdus[key].data, tuple(by), axis=(1, 2))
 
 
+def _mirrored(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    axes = ((1,), (2,), (1, 2))[rng.integers(3)]
+    for key in ("SCI", "ERR", "DQ"):
+        hdus[key].data = np.flip(hdus[key].data, axes).copy()
+    ny, nx = hdus["SCI"].data.shape[1:]
+    header = hdus["SCI"].header
+    for axis, size, key in ((1, ny, "CRPIX2"), (2, nx, "CRPIX1")):
+        if axis in axes and key in header:
+            header[key] = size + 1 - header[key]
+
+
 def _errors(hdus: fits.HDUList, rng: np.random.Generator) -> None:
     hdus["ERR"].data = hdus["ERR"].data * np.float32(rng.choice([0.03, 30.0]))
 
@@ -379,17 +390,18 @@ for _factor in (1e-3, 1e3):
     MUTATIONS[f"pixels times {_factor:g}"] = _pixels(_scaled(_factor), bad=True)
 
 
-def _another_unit(factor: float) -> Mutation:
+def _unlike_others(change: Change) -> Mutation:
     def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
-        folder.change(name, _scaled(factor), rng)
+        folder.change(name, change, rng)
         folder.doubtful.add(name)
-        folder.scaled.add(name)
+        folder.unlike.add(name)
 
     return mutate
 
 
-MUTATIONS["pixels times 0.4"] = _another_unit(0.4)
-MUTATIONS["pixels times 2.5"] = _another_unit(2.5)
+MUTATIONS["pixels times 0.4"] = _unlike_others(_scaled(0.4))
+MUTATIONS["pixels times 2.5"] = _unlike_others(_scaled(2.5))
+MUTATIONS["mirrored or turned"] = _unlike_others(_mirrored)
 MUTATIONS["star off the mask"] = _pixels(_moved, bad=True)
 MUTATIONS["errors of another unit"] = _pixels(_errors, bad=True)
 MUTATIONS["negative pixels"] = _pixels(_negative, bad=True)

@@ -83,9 +83,9 @@ def reduce_case(star: str, band: str, rolls: str, data: Path, planets: int, fold
         "candidates": " ".join(
             f"{s:.2f}@{r:.3f},{p:.1f}"
             for s, r, p in zip(
-                detection.table["snr"],
-                detection.table["separation"].value,
-                detection.table["position_angle"].value,
+                detection.candidates["snr"],
+                detection.candidates["separation"].value,
+                detection.candidates["position_angle"].value,
                 strict=True,
             )
         ),
@@ -110,8 +110,9 @@ def reduce_case(star: str, band: str, rolls: str, data: Path, planets: int, fold
     if result.injections is not None:
         about = summarise(result)["injections"]
         row["injections"] = {key: each for key, each in about.items() if key != "planets"}
-    result.write(folder / "products")
-    result.fit.write(folder / "fit.fits")  # With the derivatives, for `benchmarks.false_alarms`.
+    result.write(folder / "products", overwrite=True)
+    # With the derivatives, for `benchmarks.false_alarms`.
+    result.fit.write(folder / "fit.fits", overwrite=True)
     (folder / "row.json").write_text(json.dumps(row))
 
 

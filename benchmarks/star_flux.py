@@ -40,7 +40,7 @@ def main() -> None:
         fit = first if share == 1 else with_star_flux(first, share * float(jansky), 0.05)
         seen = [
             f"contrast {row['contrast']:.3e}, {row['flux_density']:.3e}, S/N {row['snr']:.1f}"
-            for row in dr.detect(fit).table
+            for row in dr.detect(fit).candidates
         ]
         print(f"{share:.1f}  {fit.chi2_per_pixel:.4f}  {'; '.join(seen) or 'none'}", flush=True)
 

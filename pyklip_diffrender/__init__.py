@@ -30,7 +30,13 @@ if TYPE_CHECKING:
     from pyklip_diffrender.instrument.star_flux import star_flux_density
     from pyklip_diffrender.linear.model import LinearModel
     from pyklip_diffrender.optics.system import OpticalSystem
-    from pyklip_diffrender.pattern import known_systematics, learn_systematics
+    from pyklip_diffrender.pattern import (
+        PatternLibrary,
+        combine_libraries,
+        known_systematics,
+        learn_library,
+        learn_systematics,
+    )
     from pyklip_diffrender.pyklip_backend import (
         DiffrenderSettings,
         backend,
@@ -64,6 +70,7 @@ __all__ = [
     "LinearModel",
     "Observation",
     "OpticalSystem",
+    "PatternLibrary",
     "Planet",
     "Reduction",
     "Refinement",
@@ -77,6 +84,7 @@ __all__ = [
     "__version__",
     "backend",
     "choose_map",
+    "combine_libraries",
     "completeness",
     "contrast_curve",
     "detect",
@@ -85,6 +93,7 @@ __all__ = [
     "from_poppy",
     "from_webbpsf",
     "known_systematics",
+    "learn_library",
     "learn_prior",
     "learn_systematics",
     "list_calints",
@@ -115,7 +124,7 @@ _NAMES = {
     "optics.system": "OpticalSystem",
     "pyklip_backend": "DiffrenderSettings backend observation_from_dataset register unregister",
     "reduction": "Reduction reduce",
-    "pattern": "known_systematics learn_systematics",
+    "pattern": "PatternLibrary combine_libraries known_systematics learn_library learn_systematics",
     "refinement": "GaussNewton Refinement Status refine",
     "scene.objects": "Planet Scene Star",
     "scene.observation": "Observation",

@@ -14,6 +14,7 @@ __all__ = [
     "CorruptFileError",
     "DiffrenderError",
     "DiffrenderWarning",
+    "ExistingFileError",
     "IncompatibleSetupError",
     "MissingFileError",
     "MissingOPDError",
@@ -59,6 +60,10 @@ class CorruptFileError(DiffrenderError, OSError):
 
 class MissingFileError(CorruptFileError, FileNotFoundError):
     """There is no such file."""
+
+
+class ExistingFileError(DiffrenderError, FileExistsError):
+    """A file would be replaced, and nobody asked for that with `overwrite`."""
 
 
 class ArchiveError(DiffrenderError, OSError):

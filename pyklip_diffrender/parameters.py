@@ -31,6 +31,8 @@ class Parameter:
         Bounds of every component.
     prior : float
         Prior standard deviation about the start, generous as without any earlier measurement.
+    label : str
+        A few words for tables in a terminal, with ``{}`` for the component: x, y or its number.
     description : str
         One line.
     """
@@ -43,34 +45,40 @@ class Parameter:
     lower: float
     upper: float
     prior: float
+    label: str
     description: str
+
+    def labels(self) -> list[str]:
+        """Label of every component."""
+        names = "xy" if self.size == 2 else range(1, self.size + 1)
+        return [self.label.format(name) for name in names]
 
 
 OPTICAL_PARAMETERS = (
     Parameter(
-        "star_offset", "arcsec", 2, 0.0, 0.0, -5.0, 5.0, 0.1,
+        "star_offset", "arcsec", 2, 0.0, 0.0, -5.0, 5.0, 0.1, "star {} from occulter",
         "position (x, y) of the star relative to the occulter, image orientation",
     ),
     Parameter(
-        "lyot_shift", "", 2, 0.0, 0.0, -0.05, 0.05, 0.02,
+        "lyot_shift", "", 2, 0.0, 0.0, -0.05, 0.05, 0.02, "Lyot stop {} / pupil",
         "shift (x, y) of the Lyot stop as a fraction of the pupil diameter",
     ),
     Parameter(
-        "lyot_rotation", "deg", 1, 0.0, 0.0, -5.0, 5.0, 2.0,
+        "lyot_rotation", "deg", 1, 0.0, 0.0, -5.0, 5.0, 2.0, "Lyot stop rotation",
         "rotation of the Lyot stop, counter-clockwise in entrance-pupil orientation",
     ),
     Parameter(
-        "si_zernikes", "m", 36, 0.0, 0.0, -1e-6, 1e-6, 3e-8,
+        "si_zernikes", "m", 36, 0.0, 0.0, -1e-6, 1e-6, 3e-8, "Noll Zernike {}",
         "Noll Zernike coefficients added to the instrument's internal wavefront error",
     ),
     Parameter(
-        "detector_shift", "arcsec", 2, 0.0, 0.0, -5.0, 5.0, 0.1,
+        "detector_shift", "arcsec", 2, 0.0, 0.0, -5.0, 5.0, 0.1, "axis {} from array centre",
         "displacement (x, y) of the optical axis from the centre of the pixel array",
     ),
     # Pixel and charge diffusion, 0.29 pixel each, make 0.42 pixel together. At 0 the derivative
     # of the image vanishes, so no fit could start there.
     Parameter(
-        "blur", "arcsec", 1, 0.0, 0.026, 0.0, 0.1, 0.02,
+        "blur", "arcsec", 1, 0.0, 0.026, 0.0, 0.1, 0.02, "sigma of a Gaussian blur",
         "standard deviation of a Gaussian blur on the detector (jitter, charge diffusion)",
     ),
 )  # fmt: skip
@@ -78,15 +86,15 @@ OPTICAL_PARAMETERS = (
 
 LEVELS = (
     Parameter(
-        "flux", "", 1, 1.0, 1.0, 0.0, inf, inf,
+        "flux", "", 1, 1.0, 1.0, 0.0, inf, inf, "starlight in the pupil",
         "light of the star collected by the pupil, in the unit of the image",
     ),
     Parameter(
-        "background", "", 1, 0.0, 0.0, -inf, inf, inf,
+        "background", "", 1, 0.0, 0.0, -inf, inf, inf, "background per pixel",
         "uniform background per pixel, in units of the image",
     ),
     Parameter(
-        "pedestal", "", 1, 0.0, 0.0, -inf, inf, inf,
+        "pedestal", "", 1, 0.0, 0.0, -inf, inf, inf, "light besides the star",
         "light per pixel that the flat-field pattern multiplies besides the star, in units of the "
         "image",
     ),

@@ -24,7 +24,7 @@ BACKGROUND = 3.0
 def in_place_of_fits(monkeypatch: pytest.MonkeyPatch, subtract: Callable[..., Any]) -> None:
     """Give the backend another subtractor, which gets the references as the default one does."""
     monkeypatch.setattr(
-        "pyklip_diffrender.pyklip_backend.reduction.subtract_by_refinement", subtract
+        "pyklip_diffrender.pyklip_backend.klip_call.subtract_by_refinement", subtract
     )
 
 

@@ -102,10 +102,10 @@ def search(device: Any, frames: Sequence[dr.Observation], **model: object) -> li
     changes = {**QUICK, "drift": WavefrontPrior(scales={"texture": 0.05})}
     fit = fitted(device, frames, changes, **model)
     detection = dr.detect(fit, inner=0.1)
-    assert len(detection.table) > 0
+    assert len(detection.candidates) > 0
     return [
         *reached(fit),
-        *np.asarray(detection.table["contrast"]),
+        *np.asarray(detection.candidates["contrast"]),
         *np.asarray(dr.measure(fit, [PLANET.offset])["contrast"]),
         *np.asarray(dr.contrast_curve(fit)["contrast"]),
         float(np.nanstd(detection.subtracted[0])),

@@ -385,6 +385,17 @@ def noisy(arrays: dict[str, np.ndarray]) -> None:
     arrays["ERR"] /= 20
 
 
+def mirrored(arrays: dict[str, np.ndarray]) -> None:
+    # About the star.
+    for name, array in arrays.items():
+        arrays[name] = np.roll(array[..., ::-1], -3, axis=-1)
+
+
+def turned(arrays: dict[str, np.ndarray]) -> None:
+    for name, array in arrays.items():
+        arrays[name] = np.roll(array[..., ::-1, ::-1], (3, -3), axis=(-2, -1))
+
+
 def subtracted(arrays: dict[str, np.ndarray]) -> None:
     y, x = np.indices((SIDE, SIDE))
     arrays["SCI"] -= starlight() * (1 - 0.3 * np.sin(x) * np.sin(y))
@@ -399,8 +410,10 @@ def subtracted(arrays: dict[str, np.ndarray]) -> None:
         (None, noisy, "scatter 20 times as much as ERR says"),
         (None, subtracted, "the star was subtracted"),
         (0.0 * starlight(), None, "no light of a star"),
+        (None, mirrored, "pixels are mirrored left to right"),
+        (None, turned, "pixels are turned by 180 degrees"),
     ],
-    ids=["off the mask", "unit", "factor", "errors", "subtracted", "empty"],
+    ids=["off the mask", "unit", "factor", "errors", "subtracted", "empty", "mirror", "turned"],
 )
 def test_frames_whose_pixels_contradict_the_others_are_excluded(
     folder: Path, light: Any, change: Any, words: str
@@ -420,6 +433,14 @@ def test_of_two_frames_that_differ_in_brightness_none_is_right(folder: Path) -> 
         folder / SECOND, observation=2, roll=80.0, date="2022-10-03T09:00:00", change=scaled(2.5)
     )
     with pytest.raises(IncompatibleSetupError, match=f"{FIRST}, {SECOND} contradict each other"):
+        dr.Sequence.from_files(folder)
+
+
+def test_of_two_frames_of_different_orientation_none_is_right(folder: Path) -> None:
+    (folder / SECOND).unlink()
+    next(folder.glob("jw01184003*")).unlink()
+    calints(folder / SECOND, observation=2, roll=80.0, date="2022-10-03T09:00:00", change=turned)
+    with pytest.raises(IncompatibleSetupError, match=f"{FIRST}, {SECOND} contradict .* turned"):
         dr.Sequence.from_files(folder)
 
 

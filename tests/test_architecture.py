@@ -6,6 +6,7 @@ import ast
 import json
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -46,7 +47,7 @@ Imports in functions and under TYPE_CHECKING count. One of them goes the other w
 Inside a package, and inside packages of that package, imports must form no circle.
 """
 
-LATE = ("reduction.result", "reduction.products")
+LATE = ("reduction.reduction_result", "reduction.products")
 """`Reduction.write` imports the products, which know the class, when it is called."""
 
 OWNERS = {
@@ -199,6 +200,11 @@ def test_imports_go_one_way() -> None:
     assert violations(package_sources()) == []
 
 
+def test_no_two_modules_have_one_name() -> None:
+    names = Counter(path.stem for path in package_sources())
+    assert {name for name, count in names.items() if count > 1} <= {"__init__", "__main__"}
+
+
 def test_the_table_lists_the_modules_that_there_are() -> None:
     modules = {path.parts[0].removesuffix(".py") for path in package_sources()} - {"__init__"}
     assert modules == set(PACKAGES)
@@ -231,7 +237,11 @@ GUARDED = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from {}"
         ("io/a.py", METHOD.format("from pyklip_diffrender import drawing"), "drawing comes after"),
         ("io/a.py", GUARDED.format("pyklip_diffrender.demo import Demo"), "demo comes after io"),
         ("io/a.py", METHOD.format("from matplotlib import pyplot"), "only drawing may import"),
-        ("reduction/result.py", METHOD.format("from ..cli import main"), "cli comes after"),
+        (
+            "reduction/reduction_result.py",
+            METHOD.format("from ..cli import main"),
+            "cli comes after",
+        ),
     ],
 )
 def test_a_planted_violation_is_found(path: str, text: str, complaint: str) -> None:
@@ -257,8 +267,8 @@ def test_what_is_allowed_is_not_reported(path: str, text: str) -> None:
 
 
 def test_one_circle_is_allowed_and_only_inside_a_method() -> None:
-    result, products = Path("reduction/result.py"), Path("reduction/products.py")
-    back = "from pyklip_diffrender.reduction.result import A"
+    result, products = Path("reduction/reduction_result.py"), Path("reduction/products.py")
+    back = "from pyklip_diffrender.reduction.reduction_result import A"
     late = METHOD.format("from pyklip_diffrender.reduction.products import write")
     assert violations({result: late, products: back}) == []
     assert len(violations({result: late.replace("class A:\n", "if True:\n"), products: back})) == 1

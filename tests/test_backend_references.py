@@ -29,7 +29,7 @@ from pyklip_diffrender.pyklip_backend import (
     subtract_by_refinement,
     unregister,
 )
-from pyklip_diffrender.pyklip_backend.frames import frames_of
+from pyklip_diffrender.pyklip_backend.dataset_frames import frames_of
 from pyklip_diffrender.scene.observation import Observation
 
 CARDS = {"SUBSTRT1": 492, "SUBSTRT2": 1502, "DETECTOR": "NRCALONG"}

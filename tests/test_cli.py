@@ -27,7 +27,7 @@ from astropy.time import Time
 from pyklip_diffrender import __version__
 from pyklip_diffrender.cli import application, main
 from pyklip_diffrender.cli.estimate import steps_of
-from pyklip_diffrender.cli.options import read_config
+from pyklip_diffrender.cli.shared_options import read_config
 from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
@@ -658,7 +658,7 @@ def test_mast_is_asked_for_the_map_of_the_date(
             raise MissingOPDError("no wavefront map from MAST (no route to host)")
         return random_opd(1, npix=64)
 
-    monkeypatch.setattr("pyklip_diffrender.cli.reduction.load_wss_opd_by_date", retrieve)
+    monkeypatch.setattr("pyklip_diffrender.cli.reducing.load_wss_opd_by_date", retrieve)
     arguments = ["detect", str(frames / "one_calints.fits"), "-o", str(tmp_path / "products")]
     arguments += ["--size", "8", "--opd", "mast"]
     assert main(arguments) == 0

@@ -1,4 +1,4 @@
-"""Companions of fits, compared with the candidates of a search."""
+"""Companions of fits, compared with the candidates of a search, and planets that a fit hides."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import pyklip_diffrender as dr
+from benchmarks.planets import verdict
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.raised_peaks import with_raised_peaks
 from pyklip_diffrender.detection.relinearise import lacks_candidates, unconfirmed_companions
 
 FOUND = Candidates.at([[0.6, 0.3]], [3e-4])
@@ -62,3 +65,21 @@ def test_every_fit_has_an_orientation_of_its_own() -> None:
 
 def test_fits_of_reference_stars_have_no_candidates() -> None:
     assert not lacks_candidates([fit((3e-4, 0.6, 0.3)), fit(reference=True)], FOUND)
+
+
+def test_nothing_is_tried_where_the_data_are_explained() -> None:
+    explained = SimpleNamespace(status=dr.Status.CONVERGED)
+    assert with_raised_peaks([explained], None, 0.2) is None  # type: ignore[list-item, arg-type]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(27, id="1.2e-3 at 0.26 arcsec, which bends the wavefront"),
+        pytest.param(34, id="1e-2 at 1 arcsec, brighter than the star's residual"),
+    ],
+)
+def test_a_planet_that_ends_a_fit_at_a_wrong_wavefront_is_found(seed: int) -> None:
+    result, words = verdict(seed)
+    assert result == "found", words

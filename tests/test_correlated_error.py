@@ -15,7 +15,7 @@ from torch import Tensor
 from pyklip_diffrender.linear import LinearFrame, LinearModel, Unknown
 from pyklip_diffrender.linear.noise import UNCORRELATED, CorrelatedError
 from pyklip_diffrender.refinement.correlated_error import fitted_correlated_error
-from pyklip_diffrender.refinement.storage import linear_hdus, linear_of
+from pyklip_diffrender.refinement.fit_file import linear_hdus, linear_of
 
 SIZE, UNKNOWNS = 32, 12
 EMPTY = torch.zeros(0, dtype=torch.int64)

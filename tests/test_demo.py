@@ -64,7 +64,7 @@ def test_the_demo_finds_the_planet_that_klip_loses(tmp_path: Path) -> None:
     assert rows["refined"]["seconds"] == pytest.approx(result.fit.seconds)
 
     # With the wavefront marginalised the planet is whole, and where it is.
-    (found,) = result.detection.table
+    (found,) = result.detection.candidates
     assert found["snr"] > rows["refined"]["annulus SNR"]
     assert abs(found["contrast"] - 1e-6) < 3 * found["contrast_error"]
     assert found["separation"].to_value("arcsec") == pytest.approx(0.6, abs=0.02)

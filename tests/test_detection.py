@@ -160,7 +160,7 @@ def test_snr_scatters_by_one_where_there_is_nothing(
     assert abs(values.mean()) < 0.15
     # chi2 of a thousand pixels is known to 4.5 %.
     assert all(1.0 <= found.scatter < 1.06 for found in empty)
-    assert all(len(found.candidates) == 0 for found in empty)
+    assert all(len(found.sources) == 0 for found in empty)
 
 
 def test_the_freedom_of_the_wavefront_costs_something_everywhere(empty: list[Detection]) -> None:
@@ -210,9 +210,9 @@ def pulls(seed: int) -> tuple[float, float | None, float | None]:
     found = dr.detect(fit)
     row = found.measure([planet.offset])[0]
     contrast = float((row["contrast"] - planet.contrast) / row["contrast_error"])
-    if len(found.table) != 1:
+    if len(found.candidates) != 1:
         return contrast, None, None
-    there = found.table[0]
+    there = found.candidates[0]
     x, y = (
         float((there[axis].value - true) / there[f"{axis}_error"].value)
         for axis, true in zip("xy", planet.offset, strict=True)
@@ -292,7 +292,7 @@ def test_what_a_fit_took_for_a_companion_need_not_be_one(world: World) -> None:
     observation = world.observed(world.expected(), 4)
     fit = world.refined(observation, companions=(replace(WHERE, contrast=1e-6),))
     assert len(fit.companions) == 1
-    assert len(dr.detect(fit).table) == 0
+    assert len(dr.detect(fit).candidates) == 0
 
 
 def test_a_prior_that_is_held_too_narrow_is_noticed(world: World) -> None:
@@ -356,7 +356,7 @@ def test_a_planet_does_not_make_the_noise_larger(world: World) -> None:
     planet = FAINT
     quiet, fit = world.fitted(5), world.fitted(5, planet)
     noise, found = world.detected(5), world.detected(5, planet)
-    assert len(found.candidates) == 1
+    assert len(found.sources) == 1
     assert len(fit.companions) == 0
     # Its light would be structure that no mode explains.
     assert fit.reduced_chi2 > 1.06 * quiet.reduced_chi2
@@ -392,8 +392,8 @@ def test_a_model_that_is_wrong_inflates_the_errors(large: World) -> None:
 
 
 def test_a_planet_is_found_where_it_is(one: Detection) -> None:
-    assert len(one.candidates) == 1
-    row = one.table[0]
+    assert len(one.sources) == 1
+    row = one.candidates[0]
     for axis, true in zip("xy", WHERE.offset, strict=True):
         error = row[f"{axis}_error"].to_value("arcsec")
         assert 0 < error < 0.02
@@ -436,14 +436,14 @@ def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(large: W
     """As far as wavefronts that are as probable as the one that was found change its light."""
     found = large.detected(7, replace(WHERE, contrast=1e-3))
     (linear, templates), fit = found.groups[0], found.fits[0]
-    row = found.table[0]
+    row = found.candidates[0]
     own = row["contrast"] / row["snr"]
     stated = math.sqrt((row["contrast_error"] ** 2 - own**2).item()) / row["contrast"]
     assert fit.frames[0].coefficients is not None
     deviation = linear.covariance.diagonal().sqrt()
     factor = torch.linalg.cholesky(linear.covariance / deviation[:, None] / deviation)
     generator = torch.Generator().manual_seed(2)
-    offset, flux = found.candidates.offsets[0], linear.unknowns.index(Unknown("flux", 0))
+    offset, flux = found.sources.offsets[0], linear.unknowns.index(Unknown("flux", 0))
     image, grid = templates.image(0, offset), PupilGrid.full(large.model.npix)
     seen = image * linear.frames[0].weight ** 2
     changes = []
@@ -463,7 +463,7 @@ def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(large: W
 def test_a_wavefront_that_is_known_adds_nothing_to_a_bright_contrasts_error(world: World) -> None:
     known = replace(world, opd=world.later)
     found = dr.detect(known.fitted(14, replace(WHERE, contrast=1e-3), wavefront=False))
-    fit, row = found.fits[0], found.table[0]
+    fit, row = found.fits[0], found.candidates[0]
     relative = found.scatter * fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
     expected = row["contrast"] * math.hypot(relative, 1 / row["snr"])
     assert row["snr"] > 100
@@ -511,7 +511,7 @@ def test_a_search_ends_with_a_number_of_candidates_that_stand_for_something_exte
     monkeypatch.setattr("pyklip_diffrender.detection.search._MAX_CANDIDATES", 2)
     with caplog.at_level(logging.WARNING, "pyklip_diffrender"):
         found = dr.detect(fit, relinearise=5.0, scatter=1.0)
-    assert len(found.candidates) == 2
+    assert len(found.sources) == 2
     assert found.fits[0] is fit
     assert "2 candidates, the most that are looked for" in caplog.text
 
@@ -520,13 +520,13 @@ def test_a_search_ends_with_a_number_of_candidates_that_stand_for_something_exte
 def test_two_planets_closer_than_a_beam_are_fitted_together(large: World) -> None:
     pair = (Planet(1.5e-4, 0.80, 60.0), Planet(1e-4, 0.80, 51.0))
     found = dr.detect(large.fitted(12, *pair))
-    assert len(found.candidates) == 2
+    assert len(found.sources) == 2
     for planet in pair:
-        away = np.hypot(*(found.candidates.offsets.numpy() - planet.offset).T)
+        away = np.hypot(*(found.sources.offsets.numpy() - planet.offset).T)
         nearest = int(np.argmin(away))
         assert away[nearest] < 0.02
-        contrast = float(found.candidates.contrasts[nearest])
-        assert abs(contrast - planet.contrast) < 4 * float(found.candidates.errors[nearest, 0])
+        contrast = float(found.sources.contrasts[nearest])
+        assert abs(contrast - planet.contrast) < 4 * float(found.sources.errors[nearest, 0])
         assert contrast == pytest.approx(planet.contrast, rel=0.3)
 
 
@@ -538,7 +538,7 @@ def test_a_bright_planet_is_measured_right_after_the_star_is_refined_again(large
     found = dr.detect(fit)
     assert found.fits[0] is not fit
     assert len(found.fits[0].companions) == 1
-    assert float(found.table["contrast"][0]) == pytest.approx(1e-3, rel=0.02)
+    assert float(found.candidates["contrast"][0]) == pytest.approx(1e-3, rel=0.02)
     away = radius(found) > 0.25
     assert np.abs(found.residual_snr[away]).max() < 6
 
@@ -745,7 +745,7 @@ def oriented(found: Detection) -> Detection:
 
 def test_the_images_are_on_the_sky_where_the_table_says(one: Detection, tmp_path: Path) -> None:
     found = oriented(one)
-    planet = found.table[0]
+    planet = found.candidates[0]
     # The nearest pixel, and from there the rest of the way.
     nearest = (np.hypot(found.grid[..., 0] - planet["x"].value,
                         found.grid[..., 1] - planet["y"].value)).argmin()  # fmt: skip
@@ -793,7 +793,7 @@ def test_a_detection_survives_the_file(one: Detection, tmp_path: Path) -> None:
         np.testing.assert_array_equal(ours, theirs)
     assert [repr(again), str(again), again.scatter] == [repr(first), str(first), first.scatter]
     for ours, theirs in (
-        (again.table, first.table),
+        (again.candidates, first.candidates),
         (again.contrast_curve, first.contrast_curve),
     ):
         assert ours.meta == theirs.meta
@@ -818,7 +818,7 @@ def test_a_detection_from_a_file_measures_with_its_fit(
     world: World, one: Detection, tmp_path: Path
 ) -> None:
     folder = one.write(tmp_path)[0].parent
-    places = [[0.3, 0.6], *one.candidates.offsets.tolist()]
+    places = [[0.3, 0.6], *one.sources.offsets.tolist()]
     expected = one.measure(places)
     with pytest.raises(IncompatibleSetupError, match=r"no fit\.fits.*read\(path, fit=fit\)"):
         Detection.read(folder).measure(places)
@@ -879,7 +879,7 @@ def kept(image: Image, star: Image, light: Image, error: Image) -> float:
 def test_a_frame_keeps_the_light_of_candidates(world: World) -> None:
     light = world.expected(FAINT) - world.expected()
     found = world.detected(5, FAINT)
-    assert len(found.candidates) == 1
+    assert len(found.sources) == 1
     fit = found.fits[0]
     assert not len(fit.companions)
     # What is left of the star and its noise, were it known.
@@ -889,7 +889,7 @@ def test_a_frame_keeps_the_light_of_candidates(world: World) -> None:
     (image,) = found.subtracted
     assert kept(image, noise, light, error) == pytest.approx(1.0, abs=0.06)
     # A fit that has the planet from the start leaves the same.
-    (renewed,) = with_companions(found.fits, found.candidates)
+    (renewed,) = with_companions(found.fits, found.sources)
     away = radius(found) > 0.25
     difference = ((image - renewed.frames[0].residual[0]) / error)[away]
     closed = ((fit.frames[0].residual[0] - renewed.frames[0].residual[0]) / error)[away]
@@ -901,7 +901,7 @@ def test_a_bright_companions_frame_is_what_its_own_fit_leaves(world: World) -> N
     """The star is found in single precision once more; of 1e-3 that must not show."""
     found = world.detected(7, replace(WHERE, contrast=1e-3))
     (fit,) = found.fits
-    assert len(fit.companions) == len(found.candidates) == 1
+    assert len(fit.companions) == len(found.sources) == 1
     difference = (found.subtracted[0] - fit.frames[0].residual[0]) / fit.frames[
         0
     ].observation.error[0]
@@ -928,7 +928,7 @@ def test_a_companion_that_is_none_is_given_to_no_fit(large: World) -> None:
     fit = large.refined(large.observed(large.expected(planet), 80), companions=(planet, nothing))
     assert len(fit.companions) == 2
     found = dr.detect(fit)
-    assert len(found.candidates) == len(found.fits[0].companions) == 1
+    assert len(found.sources) == len(found.fits[0].companions) == 1
 
 
 @pytest.fixture(scope="module")
@@ -944,7 +944,7 @@ def test_a_reference_star_on_its_own_stays_as_it_was_fitted(
 ) -> None:
     target = large.fitted(7, replace(WHERE, contrast=2e-5), **options)
     found = dr.detect([target, reference])
-    assert len(found.fits[0].companions) == len(found.candidates) == 1
+    assert len(found.fits[0].companions) == len(found.sources) == 1
     assert found.fits[1] is reference
     # What the fit has found by itself needs no second one.
     assert [len(target.companions), found.fits[0] is target] == [int(not options), not options]
@@ -969,7 +969,7 @@ def test_every_frame_is_subtracted_as_it_was_taken(large: World) -> None:
     frames[1].valid[0, 3, 4] = False
     frames.append(replace(large.observed(4 * large.expected(), 72), reference=True))
     found = dr.detect(large.refined(frames))
-    assert len(found.candidates) == 1
+    assert len(found.sources) == 1
     assert len(found.subtracted) == 3
     for frame, planet, image in zip(frames, planets, found.subtracted, strict=False):
         light = large.expected(planet) - large.expected()

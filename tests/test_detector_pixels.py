@@ -16,7 +16,6 @@ from scipy.ndimage import fourier_shift, gaussian_filter
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import (
-    CorruptFileError,
     IncompatibleSetupError,
     NonFiniteError,
     ShapeError,
@@ -26,8 +25,6 @@ from pyklip_diffrender.pattern import (
     MeasuredPattern,
     combine_patterns,
     place_on_detector,
-    read_patterns,
-    write_patterns,
 )
 from pyklip_diffrender.scene.star_place import measured_offset
 
@@ -266,20 +263,6 @@ def test_patterns_are_combined_pixel_by_pixel_of_the_detector() -> None:
     with pytest.raises(IncompatibleSetupError, match="F356W"):
         combine_patterns([one, replace(other, filter="F356W")])
     assert known.provenance["frames"] == ["A.fits", "BB.fits"]
-
-
-def test_patterns_survive_the_file(tmp_path: Path) -> None:
-    pattern = measured("A")
-    variance = pattern.variance.copy()
-    variance[3, 4] = np.inf
-    path = write_patterns([replace(pattern, variance=variance)], tmp_path / "patterns.fits.gz")
-    (back,) = read_patterns(path)
-    np.testing.assert_allclose(back.value[5:], pattern.value[5:], rtol=1e-6)
-    np.testing.assert_allclose(back.variance, variance, rtol=1e-6)
-    assert (back.star, back.first_pixel, back.filter) == ("A", (600, 1630), "F444W")
-    assert (back.frame, back.date) == ("A.fits", "2022-10-03")
-    with pytest.raises(CorruptFileError):
-        read_patterns(tmp_path / "none.fits")
 
 
 @pytest.mark.parametrize("name", ["F444W", "F356W"])

@@ -87,7 +87,7 @@ def check(world: World, settings: GaussNewton, seed: int = 5) -> None:
     star = fit.frames[0].star - fit.frames[0].values["background"][0]
     assert world.error_of(star) < 0.15 * outdated
     assert world.unseen_rms(fit.wavefront) < 0.5 * world.unseen_rms(world.before)
-    (row,) = dr.detect(fit).table
+    (row,) = dr.detect(fit).candidates
     away = abs(float(row["contrast"]) - world.planet.contrast)
     assert away < 3 * row["contrast_error"]
     assert away < 0.1 * world.planet.contrast

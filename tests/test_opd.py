@@ -23,7 +23,7 @@ from pyklip_diffrender.instrument import jwst_pupil, nircam_coronagraph
 from pyklip_diffrender.io import sha256
 from pyklip_diffrender.optics import PupilGrid, resample
 from pyklip_diffrender.pyklip_backend import DiffrenderSettings
-from pyklip_diffrender.pyklip_backend.settings import starting_opd
+from pyklip_diffrender.pyklip_backend.backend_settings import starting_opd
 from pyklip_diffrender.wavefront import (
     SegmentMotions,
     as_opd_map,

@@ -66,7 +66,7 @@ def test_a_hot_pixel_is_no_planet() -> None:
     before = frame.data.copy(), frame.valid.copy()
     fit = fitted(frame)
     assert left_out(fit) == [PIXEL]
-    assert len(dr.detect(fit).table) == 0
+    assert len(dr.detect(fit).candidates) == 0
     assert fit.reduced_chi2 == pytest.approx(1.0, abs=0.15)
     np.testing.assert_array_equal(frame.data, before[0])
     np.testing.assert_array_equal(frame.valid, before[1])

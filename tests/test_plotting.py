@@ -246,7 +246,7 @@ def test_a_detection_shows_candidates_and_the_curve(found: Detection) -> None:
     left, right = found.plot()
     np.testing.assert_array_equal(shown(left), found.snr)
     np.testing.assert_allclose(place_of(left, 4, 7), found.grid[4, 7], atol=1e-12)
-    (row,) = found.table
+    (row,) = found.candidates
     circled = points(left, "companions")
     np.testing.assert_allclose(circled, [[row["x"].value, row["y"].value]])
     peak = np.unravel_index(np.nanargmax(found.snr), found.snr.shape)
@@ -267,7 +267,7 @@ def test_a_detection_shows_candidates_and_the_curve(found: Detection) -> None:
 
 
 def test_a_detection_without_candidates_has_no_circles(found: Detection) -> None:
-    left, right = replace(found, candidates=Candidates.at([], []), false_alarm=np.zeros(0)).plot()
+    left, right = replace(found, sources=Candidates.at([], []), false_alarm=np.zeros(0)).plot()
     assert left.get_title(loc="left") == "0 candidates above S/N 5"
     assert points(left, "companions").shape == (0, 2)
     assert "candidates" not in [text.get_text() for text in right.get_legend().get_texts()]

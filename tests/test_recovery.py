@@ -61,7 +61,7 @@ def searched(science: tuple[dr.Observation, ...] | None = None, **changes: Any) 
     values = {
         "fits": [SimpleNamespace(frames=[Frame(1.0), Frame(2.0)])],
         "grid": grid, "snr": snr, "north": NORTH, "contrast_curve": curve, "measure": measure,
-        "table": table(np.zeros((0, 2)), []),
+        "candidates": table(np.zeros((0, 2)), []),
     }  # fmt: skip
     return SimpleNamespace(**{**values, **changes})
 
@@ -133,7 +133,7 @@ def test_a_planet_is_its_candidate_or_what_is_measured_at_its_place(
         dr.Observation.from_arrays(k * data, np.ones_like(data), pixelscale=PIXEL) for k in (1, 2)
     )
     candidates = table(np.array([[1.0, 1.0], np.add(place, away)]), [1e-3, 7e-4])
-    measured = measured_planet(searched(frames, table=candidates), place)
+    measured = measured_planet(searched(frames, candidates=candidates), place)
     assert (measured.contrast, measured.detected) == (pytest.approx(expected[0]), expected[1])
     # Noise alone, without what the table's error has of the star's flux.
     assert measured.contrast_error == pytest.approx(measured.contrast / measured.snr)
@@ -148,7 +148,7 @@ def covered(keep: Callable[[Any, Any], Any]) -> Any:
 def test_planets_keep_away_from_candidates_and_from_pixels_without_a_value() -> None:
     first = _free_place(searched(), 0.6, 0.0)
     assert first == pytest.approx([0.0, 0.6])
-    candidate = searched(table=table(first[None], [1e-3]))
+    candidate = searched(candidates=table(first[None], [1e-3]))
     moved = _free_place(candidate, 0.6, 0.0)
     assert np.hypot(*moved) == pytest.approx(0.6)
     assert 0.3 < np.hypot(*(moved - first)) < 0.5

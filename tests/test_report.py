@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from html import escape
@@ -20,17 +21,19 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable
 from astropy.time import Time
+from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.geometry import full_circle, half_circle
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction import summarise, write_report
 from pyklip_diffrender.reduction.extended import looks_extended
 from pyklip_diffrender.reduction.overview import Klip, Overview
 from pyklip_diffrender.reduction.page import page
+from pyklip_diffrender.reduction.sky_images import SkyImages
 from pyklip_diffrender.reduction.words import (
     advice,
     plus_minus,
@@ -53,8 +56,10 @@ def reduction(planet: bool = True, target: str = "HD 1") -> dr.Reduction:
     scene = dr.Scene(dr.Star(exposure=20.0), (on_frame,) if planet else ())
     frame = replace(
         dr.simulate(model, scene, opd, seed=3),
-        header=fits.Header({"TARGPROP": target, "INSTRUME": "TEST"}),
-        position_angles=np.array([ROLL]),
+        header=fits.Header(
+            {"TARGPROP": target, "INSTRUME": "TEST", "CRVAL1": 100.0, "CRVAL2": 20.0}
+        ),
+        position_angles=np.array([ROLL - 360]),
         date=Time("2022-10-03T00:00:00"),
         filter="F444W",
         name="frame <1>.fits",
@@ -86,8 +91,77 @@ def test_products_of_another_reduction_are_removed_or_refused(folder: Path) -> N
     assert not (folder / "wide_field.fits").exists()
     assert not (folder / "systematics.fits").exists()
     assert (folder / "fit.fits").exists()
-    with pytest.raises(IncompatibleSetupError, match=r"fit\.fits.*overwrite=True"):
+    with pytest.raises(OSError, match=r"fit\.fits.*overwrite=True"):
         reduction().write(folder)
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (lambda result, path: result.fit.write(path, linear=False), "fit.fits"),
+        (lambda result, path: result.detection.write(path.parent), "contrast.ecsv"),
+        (lambda result, path: result.detection.write_astrometry(path), "positions.csv"),
+        (lambda result, path: result.write(path.parent), "summary.json"),
+    ],
+    ids=["fit", "detection", "astrometry", "reduction"],
+)
+def test_no_writer_replaces_a_file_without_being_asked(
+    tmp_path: Path, write: Callable[[dr.Reduction, Path], Any], name: str
+) -> None:
+    path = tmp_path / name
+    path.write_text("earlier", encoding="utf-8")
+    with pytest.raises(OSError, match=rf"{re.escape(name)} exists.*overwrite=True"):
+        write(reduction(), path)
+    assert [each.name for each in tmp_path.iterdir()] == [name]
+    assert path.read_text(encoding="utf-8") == "earlier"
+
+
+def test_a_detection_without_a_date_leaves_no_earlier_astrometry(tmp_path: Path) -> None:
+    detection = reduction().detection
+    assert tmp_path / "astrometry.csv" in detection.write(tmp_path)
+    undated = replace(detection, fits=detection.fits)
+    vars(undated)["sky"] = replace(detection.sky, mjd=None)
+    undated.write(tmp_path, overwrite=True)
+    assert not (tmp_path / "astrometry.csv").exists()
+
+
+def angles_in(content: Any) -> Iterator[float]:
+    """All position angles of a summary."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            if "angle" in key and "error" not in key and isinstance(value, float):
+                yield value
+            else:
+                yield from angles_in(value)
+    elif isinstance(content, list):
+        for value in content:
+            yield from angles_in(value)
+
+
+def test_position_angles_are_from_0_to_360_wherever_they_are_stated() -> None:
+    # The orientation of the frame is given as -330 degrees, and the planet is on the other side.
+    result = reduction()
+    (frame,) = result.sequence.science
+    assert frame.position_angle == ROLL
+    stated = list(angles_in(summarise(result)))
+    assert len(stated) >= 4
+    for angle in stated:
+        assert any(
+            angle == pytest.approx(one, abs=3)
+            for one in (ROLL, PLANET.position_angle, PLANET.position_angle - ROLL)
+        )
+    west = result.detection.measure([[0.4, 0.3]])[0]
+    assert west["position_angle"].value == pytest.approx(-np.rad2deg(np.arctan(4 / 3)) + ROLL + 360)
+    assert dr.Planet.from_offset(1e-5, 0.3, 0.3).position_angle == pytest.approx(315)
+    assert PLANET.rotated(-50).position_angle == pytest.approx(350)
+    assert full_circle(-1e-20) == 0
+    assert half_circle(10.0 - 350.0) == 20
+
+
+def test_the_earlier_name_of_the_candidates_is_deprecated() -> None:
+    detection = reduction().detection
+    with pytest.warns(DeprecationWarning, match=r"Detection\.candidates"):
+        assert detection.table is detection.candidates
 
 
 class Tags(HTMLParser):
@@ -111,7 +185,7 @@ class Tags(HTMLParser):
 
 
 def test_the_first_sentence_has_the_numbers_of_the_planet() -> None:
-    (row,) = reduction().detection.table
+    (row,) = reduction().detection.candidates
     said = summarise(reduction())["sentence"]
     numbers = re.fullmatch(
         r"One companion candidate at ([\d.]+) ± ([\d.]+) arcsec, position angle ([\d.]+) ± [\d.]+ "
@@ -190,10 +264,10 @@ def test_candidates_in_line_suggest_a_disk() -> None:
     three = Candidates.at(places, np.full(3, 1e-5))
     three = replace(three, covariance=1e-12 * torch.eye(9, dtype=torch.float64))
     crowded = replace(
-        whole, detection=replace(whole.detection, candidates=three, false_alarm=np.zeros(3))
+        whole, detection=replace(whole.detection, sources=three, false_alarm=np.zeros(3))
     )
     suggestion = "repeat the reduction with disk=True (--disk on the command line)"
-    assert len(crowded.detection.table) == 3
+    assert len(crowded.detection.candidates) == 3
     assert str(crowded).endswith(f"{suggestion}.")
     assert suggestion in crowded._repr_html_()
     assert suggestion in summarise(crowded)["status"]["advice"]
@@ -281,7 +355,7 @@ def test_probabilities_of_false_alarms() -> None:
 def test_the_summary_has_the_numbers_of_the_result(folder: Path) -> None:
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     result = reduction()
-    (row,), (entry,) = result.detection.table, summary["candidates"]
+    (row,), (entry,) = result.detection.candidates, summary["candidates"]
     assert entry["contrast"] == row["contrast"]
     assert entry["separation_arcsec"] == row["separation"].to_value(u.arcsec)
     assert entry["position_angle_deg"] == row["position_angle"].to_value(u.deg)
@@ -424,10 +498,12 @@ def test_images_have_north_up() -> None:
     klip = Klip.of(replace(whole, sequence=replace(whole.sequence, references=(alone,))))
     assert klip is not None
     assert klip.label == "KLIP RDI (1 reference frame, 1 mode)"
-    overview = Overview(whole, klip)
+    images = SkyImages(whole)
+    overview = Overview(images, klip)
     wrong = [replace(PLANET, position_angle=angle).offset for angle in (10.0, 70.0, -40.0, 220.0)]
-    for image, grid in ((overview.image, overview.grid), (klip.image, klip.grid),
-                        (overview._snr(), overview.grid)):  # fmt: skip
+    for image, grid in ((images.combined[0], images.grid), (images.posterior_mean, images.grid),
+                        (klip.image, klip.grid),
+                        (images.turned(whole.detection.snr), images.grid)):  # fmt: skip
         # Its position on the frame, turned twice, mirrored, and on the other side.
         light, *others = (
             np.nansum(image[np.hypot(*(grid - place).T).T < 0.1]) for place in
@@ -437,6 +513,32 @@ def test_images_have_north_up() -> None:
     # Four standard deviations.
     (circled,) = overview._places
     assert np.hypot(*(circled - PLANET.offset)) < 0.05
+
+
+def test_images_of_the_sky_are_written_with_coordinates(tmp_path: Path) -> None:
+    whole = reduction()
+    images = SkyImages(whole)
+    with fits.open(images.write(tmp_path / "images.fits")) as hdus:
+        names = [hdu.name for hdu in hdus[1:]]
+        assert names == [
+            "COMBINED", "COMBINED_ERROR", "POSTERIOR_MEAN", "CONTRAST", "CONTRAST_ERROR", "SNR",
+        ]  # fmt: skip
+        (row,) = whole.detection.candidates
+        image, wcs = np.nan_to_num(hdus["SNR"].data), WCS(hdus["POSTERIOR_MEAN"].header)
+        y, x = np.unravel_index(image.argmax(), image.shape)
+        star = wcs.pixel_to_world(images.grid.shape[1] // 2, images.grid.shape[0] // 2)
+        peak = wcs.pixel_to_world(int(x), int(y))
+        # To a pixel of 0.063 arcsec, at 0.6 arcsec.
+        assert star.separation(peak).arcsec == pytest.approx(row["separation"].value, abs=0.07)
+        angle = star.position_angle(peak).deg
+        assert angle == pytest.approx(row["position_angle"].value, abs=8.0)
+        np.testing.assert_array_equal(hdus["POSTERIOR_MEAN"].data, images.posterior_mean)
+        ratio = hdus["CONTRAST"].data[y, x] / hdus["CONTRAST_ERROR"].data[y, x]
+        # The ratio of interpolated values, and the interpolated ratio.
+        assert ratio == pytest.approx(hdus["SNR"].data[y, x], rel=0.05)
+        # The mean has the noise of the frames.
+        noise = np.nanmedian(hdus["COMBINED_ERROR"].data)
+        assert 0.5 < noise / np.nanmedian(whole.detection.observation.error) < 2
 
 
 @pytest.mark.usefixtures("_few_pictures")
@@ -536,7 +638,7 @@ def shown() -> dict[str, Any]:
     detection = replace(whole.detection, fits=(fit,))
     again = replace(whole, sequence=sequence, fit=fit, detection=detection, systematics=known)
     wide = dr.WideField(
-        detection, 5.0, flat, flat, flat, flat, detection.error_factor, detection.table,
+        detection, 5.0, flat, flat, flat, flat, detection.error_factor, detection.candidates,
         detection.contrast_curve,
     )  # fmt: skip
     disk = dr.Disk(fit, (), flat, flat, flat, np.ones((1, 2)), np.ones(1), 9.0)
@@ -566,7 +668,7 @@ def test_a_notebook_shows_a_small_escaped_summary(name: str) -> None:
 
 def test_a_notebook_shows_the_numbers_of_a_candidate() -> None:
     detection = reduction().detection
-    (row,) = detection.table
+    (row,) = detection.candidates
     said = Tags(detection._repr_html_()).words
     assert f"{row['contrast']:.3e}" in said
     assert f"{row['position_angle'].value:.2f}" in said
@@ -636,7 +738,7 @@ def test_the_page_fits_the_screen(folder: Path, tmp_path: Path, width: int, dark
 @pytest.mark.slow
 def test_the_search_of_whole_frames_has_a_section_of_its_own(tmp_path: Path) -> None:
     inner = reduction().detection
-    table = inner.table.copy()
+    table = inner.candidates.copy()
     table["fit_chi2"] = 1.3
     wide = dr.WideField(
         inner, 5.0, inner.contrast, inner.error, inner.snr, inner.grid, inner.error_factor, table,

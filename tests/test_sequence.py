@@ -267,7 +267,7 @@ def test_with_the_pattern_the_planet_of_another_star_is_unbiased() -> None:
     fit = refine(model(), target, opd(), settings=SETTINGS, systematics=learned)
     assert without.chi2_per_pixel > 5
     assert fit.chi2_per_pixel < 2
-    (row,) = detect(fit).table
+    (row,) = detect(fit).candidates
     away = (row["contrast"] - PLANET.contrast) / row["contrast_error"]
     assert abs(away) < 3
     assert row["separation"].to_value(u.arcsec) == pytest.approx(0.6, abs=0.01)
@@ -321,8 +321,8 @@ def test_a_detection_in_a_file_is_that_in_the_fit(tmp_path: Path) -> None:
     fit = rolled_fit()
     again, first = detect(Refinement.read(fit.write(tmp_path / "fit.fits"))), detect(fit)
     np.testing.assert_array_equal(again.snr, first.snr)
-    np.testing.assert_array_equal(again.table["contrast"], first.table["contrast"])
-    assert again.table["position_angle"][0].to_value(u.deg) == pytest.approx(40, abs=0.5)
+    np.testing.assert_array_equal(again.candidates["contrast"], first.candidates["contrast"])
+    assert again.candidates["position_angle"][0].to_value(u.deg) == pytest.approx(40, abs=0.5)
 
 
 @pytest.mark.parametrize("percent", [25, 50, 99])

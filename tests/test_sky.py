@@ -19,11 +19,11 @@ from astropy.wcs import WCS
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.detection import Candidates
+from pyklip_diffrender.detection.candidate_tables import candidate_table, measured_table
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.orbits import write_astrometry
 from pyklip_diffrender.detection.sky import Positions, Sky
-from pyklip_diffrender.detection.tables import candidate_table, measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import detector_place
 from pyklip_diffrender.refinement import FrameFit, jansky_per_unit, require_calibrated, to_jansky
@@ -376,7 +376,7 @@ def test_the_companion_of_hip_65426_is_on_its_side_of_the_star(shared_data: Path
     frames = shared_data / "hip65426_f444w_calints.fits.gz"
     opd = shared_data / "opd_2022-07-30.fits.gz"
     detection = dr.reduce(frames, opd, size=48).detection
-    row = detection.table[0]
+    row = detection.candidates[0]
     assert row["separation"].to_value("mas") == pytest.approx(820, abs=25)
     header = detection.observation.header
     star = SkyCoord(header["CRVAL1"], header["CRVAL2"], unit="deg")

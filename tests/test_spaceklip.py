@@ -20,16 +20,20 @@ from pyklip.parallelized import klip_dataset
 from benchmarks.calints_files import calints
 from pyklip_diffrender import spaceklip
 from pyklip_diffrender.detection import Candidates, Detection
+from pyklip_diffrender.detection.candidate_tables import candidate_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.sky import Sky
-from pyklip_diffrender.detection.tables import candidate_table
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
 from pyklip_diffrender.optics import OpticalSystem
-from pyklip_diffrender.pyklip_backend import backend, reduction
+from pyklip_diffrender.pyklip_backend import backend, klip_call
 from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.spaceklip import run
-from pyklip_diffrender.spaceklip.products import complete_header, write_contrast, write_database
+from pyklip_diffrender.spaceklip.database_files import (
+    complete_header,
+    write_contrast,
+    write_database,
+)
 from pyklip_diffrender.spaceklip.sources import source_table
 from pyklip_diffrender.wavefront import random_opd
 
@@ -119,7 +123,7 @@ def fake_detection(offset: tuple[float, float], north: float) -> Any:
     table = candidate_table(
         candidates, ErrorFactor.constant(2.0), np.zeros((2, 2)), Sky(north, star=(0.5, 0.01))
     )
-    return SimpleNamespace(table=table, contrast_curve=QTable(curve))
+    return SimpleNamespace(candidates=table, contrast_curve=QTable(curve))
 
 
 def test_candidates_become_rows_of_spaceklips_table(tmp_path: Path) -> None:
@@ -305,7 +309,7 @@ def test_a_concatenation_from_frames_to_sources(
     np.testing.assert_allclose(rolls.mean(axis=0)[seen], image[seen], rtol=1e-5, atol=1e-3)
     assert np.abs(rolls[0] - rolls[1])[seen].max() > 10
     assert (product.parent / f"{KEY}.dat").exists()
-    assert Detection.read(product.parent / f"ADI_NANNU1_NSUBS1_{KEY}").table["snr"][0] > 5
+    assert Detection.read(product.parent / f"ADI_NANNU1_NSUBS1_{KEY}").candidates["snr"][0] > 5
 
 
 @pytest.mark.slow
@@ -325,7 +329,7 @@ def test_a_catalogues_star_is_that_of_the_search(
         plan="off", fit=ALIGNED, star_flux={"F444W": "450 mJy"}, star_flux_error=0.3,
     )  # fmt: skip
     assert tied == [(pytest.approx(0.45), 0.3)]
-    table = detections[KEY].table
+    table = detections[KEY].candidates
     assert table["contrast_error"][0] / table["contrast"][0] == pytest.approx(0.3, rel=0.1)
 
 
@@ -380,7 +384,7 @@ def test_spaceklips_own_injections_need_one_fit(
         dataset = JWST.JWSTData(files, None, highpass=False)
         before = copy.deepcopy(dataset)
         klip_dataset(dataset, fileprefix="once", **options)
-    monkeypatch.setattr(reduction, "subtract_by_refinement", None)
+    monkeypatch.setattr(klip_call, "subtract_by_refinement", None)
     y, x = np.indices((25, 25)) - 12
     peak = 1e-3 * FLUX * float(model(OPD.data, star_offset=(0.8, 0.0)).max())
     with backend(injected_into=dataset, image="subtracted"):

@@ -34,7 +34,7 @@ def fit() -> Refinement:
 
 def test_contrasts_of_real_frames_have_the_error_of_the_stars_flux(fit: Refinement) -> None:
     detection = dr.detect(fit)
-    (planet,) = detection.table
+    (planet,) = detection.candidates
     assert star_flux_error(fit) == 0.1
     # The noise is 1/469 of the planet.
     assert planet["contrast_error"] / planet["contrast"] == pytest.approx(0.1, rel=0.01)
@@ -87,7 +87,7 @@ def test_contrasts_refer_to_the_catalogues_star(fit: Refinement, share: float) -
     assert star_flux_error(tied) == 0.05
     assert after.sky.star is not None
     assert after.sky.star[0] / before.sky.star[0] == pytest.approx(share, rel=3e-4)
-    (then,), (now,) = before.table, after.table
+    (then,), (now,) = before.candidates, after.candidates
     assert now["contrast"] / then["contrast"] == pytest.approx(1 / share, rel=6e-3)
     ratio = (now["flux_density"] / then["flux_density"]).value
     assert ratio == pytest.approx(1.0, abs=6e-3)
@@ -100,7 +100,7 @@ def test_a_prior_that_agrees_changes_nothing_but_the_error(fit: Refinement) -> N
     before = dr.detect(fit)
     assert before.sky.star is not None
     after = dr.detect(with_star_flux(fit, before.sky.star[0], 0.03))
-    (then,), (now,) = before.table, after.table
+    (then,), (now,) = before.candidates, after.candidates
     assert now["contrast"] == pytest.approx(then["contrast"], rel=2e-3)
     assert now["contrast"] == pytest.approx(TRUTH, rel=4 / now["snr"])
     assert now["contrast_error"] / now["contrast"] == pytest.approx(0.03, rel=0.02)

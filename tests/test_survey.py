@@ -794,7 +794,7 @@ def test_what_is_recovered_is_the_candidate_at_the_place() -> None:
 
     class Found:
         north = 20.0
-        table = QTable({"x": [0.5, x + 0.03] * u.arcsec, "y": [0.5, y] * u.arcsec,
+        candidates = QTable({"x": [0.5, x + 0.03] * u.arcsec, "y": [0.5, y] * u.arcsec,
                         **{key: [7.0, value] for key, value in measured.items()}})  # fmt: skip
 
         def measure(self, offsets: list[Any]) -> QTable:
@@ -805,10 +805,10 @@ def test_what_is_recovered_is_the_candidate_at_the_place() -> None:
         detection = Found()
 
     assert work._recovered(Whole(), planet) == {**measured, "detected": True}
-    Found.table = Found.table[:1]
+    Found.candidates = Found.candidates[:1]
     assert work._recovered(Whole(), planet)["snr"] == 4.5
     assert work._recovered(Whole(), planet)["detected"] is False
-    Found.table = Found.table[:0]
+    Found.candidates = Found.candidates[:0]
     assert work._recovered(Whole(), planet)["detected"] is False
 
 

@@ -58,7 +58,7 @@ def test_planets_are_found_where_full_fits_find_them() -> None:
                 detection.fits[0].model, observation, detection.fits[0].initial,
                 settings=dr.GaussNewton(cycles=6),
             )  # fmt: skip
-            found += len(dr.detect(fit).table)
+            found += len(dr.detect(fit).candidates)
         assert found / 4 == pytest.approx(fraction, abs=0.26)  # One planet of four.
         assert (found > 2) == expected
 

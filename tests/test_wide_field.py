@@ -75,9 +75,9 @@ def test_sources_that_a_joint_fit_leaves_faint_are_no_candidates() -> None:
 
 @pytest.mark.slow
 def test_planets_are_measured_wherever_they_are(wide: WideField) -> None:
-    assert len(wide.table) == len(PLANETS)
+    assert len(wide.candidates) == len(PLANETS)
     for planet in PLANETS:
-        row = wide.table[np.argmin(np.abs(wide.table["contrast"] - planet.contrast))]
+        row = wide.candidates[np.argmin(np.abs(wide.candidates["contrast"] - planet.contrast))]
         for name, true in (
             ("separation", planet.separation),
             ("position_angle", planet.position_angle),
@@ -99,10 +99,10 @@ def test_contrasts_outside_have_the_error_of_the_stars_flux_as_well(
     detection, frames = searched
     (fit,) = detection.fits
     uncertain = replace(fit, settings=replace(fit.settings, star_flux_error=0.1))
-    again = wide_field(replace(detection, fits=(uncertain,)), frames).table
+    again = wide_field(replace(detection, fits=(uncertain,)), frames).candidates
     outside = np.isfinite(again["fit_chi2"])
     assert outside.any()
-    added = again["contrast_error"] ** 2 - wide.table["contrast_error"] ** 2
+    added = again["contrast_error"] ** 2 - wide.candidates["contrast_error"] ** 2
     ratio = np.sqrt(np.abs(added[outside])) / again["contrast"][outside]
     np.testing.assert_allclose(ratio, 0.1, rtol=1e-3)
 
@@ -134,7 +134,7 @@ def test_a_wide_field_is_written_and_drawn(wide: WideField, tmp_path: Path) -> N
         np.testing.assert_array_equal(hdus["SNR"].data, wide.snr)
         np.testing.assert_array_equal(hdus["OFFSET_Y"].data, wide.grid[..., 1])
     table = QTable.read(written[1])
-    np.testing.assert_allclose(table["snr"], wide.table["snr"])
+    np.testing.assert_allclose(table["snr"], wide.candidates["snr"])
     map_axes, _ = wide.plot()
     assert map_axes.get_title(loc="left").startswith("3 candidates above")
     assert str(wide).count("arcsec") == 3

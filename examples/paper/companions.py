@@ -42,7 +42,7 @@ def one_system(setup: Setting, name: str, seed: int) -> Table:
     setup = setup.redrawn(seed)
     shot = frame(setup, HOURS, seed, planets)
     detection = dr.detect(dr.refine(setup.model, shot.observation, setup.measured))
-    table = detection.table
+    table = detection.candidates
     places = np.array([planet.offset for planet in planets])
     x, y = table["x"].value, table["y"].value
     distance = np.hypot(x - places[:, :1], y - places[:, 1:])

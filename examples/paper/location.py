@@ -42,7 +42,7 @@ def one_frame(setup: Setting, separation: float, steps: int, seed: int) -> Table
     subtracted = all_of(setup, shot, references(setup, HOURS, seed), steps)
     fit = subtracted["Gauss-Newton"].fit
     assert fit is not None
-    table = dr.detect(fit).table
+    table = dr.detect(fit).candidates
     row: dict[str, Any] = {
         "separation": separation,
         "angle": angle,

@@ -12,8 +12,9 @@ import click
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.cli import commands
 from pyklip_diffrender.cli.doctor import doctor
-from pyklip_diffrender.cli.options import common
-from pyklip_diffrender.cli.run import PROGRAM, Run
+from pyklip_diffrender.cli.learning import learn
+from pyklip_diffrender.cli.session import PROGRAM, Run
+from pyklip_diffrender.cli.shared_options import common
 from pyklip_diffrender.errors import DiffrenderError
 
 __all__ = ["application", "main"]
@@ -39,6 +40,7 @@ for _command in (
     commands.demo,
     commands.reduce_frames,
     commands.detect_in_file,
+    learn,
     commands.survey,
     commands.psf,
     doctor,

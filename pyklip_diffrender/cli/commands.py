@@ -7,16 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pyklip_diffrender.cli.options import (
+from pyklip_diffrender.cli.session import Run
+from pyklip_diffrender.cli.shared_options import (
     Command,
+    archive,
     common,
     file_type,
     option,
     outputs,
+    require_frames,
     search,
     wavefront,
 )
-from pyklip_diffrender.cli.run import Run
 from pyklip_diffrender.errors import IncompatibleSetupError
 
 if TYPE_CHECKING:
@@ -82,13 +84,13 @@ def demo(
         f"Refinement: {result.fit.status.message}.\n\n"
         "Point sources with the wavefront marginalised, which loses none of the planet:"
     )
-    for row in result.detection.table:
+    for row in result.detection.candidates:
         click.echo(
             f"  {row['separation'].to_value('arcsec'):.3f} arcsec at "
             f"{row['position_angle'].to_value('deg'):.1f} deg: contrast {row['contrast']:.2e} +- "
             f"{row['contrast_error']:.1e}, S/N {row['snr']:.1f}"
         )
-    if not len(result.detection.table):
+    if not len(result.detection.candidates):
         click.echo(f"  none above {result.detection.threshold:g} sigma")
     for path in (*written, figure):
         click.echo(f"wrote {path}")
@@ -108,20 +110,7 @@ Examples:
 @option("--target", metavar="STAR", section="Frames",
         help="Name of the target, in any spelling; the other stars are references.")  # fmt: skip
 @option("--filter", metavar="NAME", section="Frames", help="Which filter, if there are several.")
-@option(
-    "--program",
-    type=int,
-    metavar="NUMBER",
-    section="Frames",
-    help="Fetch the frames of this JWST programme from MAST, in place of FRAMES.",
-)
-@option(
-    "--cache",
-    type=file_type(),
-    metavar="FOLDER",
-    section="Frames",
-    help="Folder for fetched frames; default: in the user's cache.",
-)
+@archive
 @wavefront
 @search
 @outputs()
@@ -141,10 +130,7 @@ def reduce_frames(
     FRAMES are calints files, or one folder of them. With --program they come from MAST. Epochs more
     than 5 days apart are reduced one by one, into a folder for each, and compared on one page.
     """
-    if not frames and program is None:
-        raise click.UsageError("Missing argument 'FRAMES...', or the option --program.")
-    if frames and program is not None:
-        raise click.UsageError("Give either FRAMES or --program.")
+    require_frames(frames, program)
     if program is not None and options["dry_run"] and _is_to_fetch(program, target, filter, cache):
         return
 
@@ -159,7 +145,7 @@ def reduce_frames(
             )
         return Sequence.by_epoch(files, target=target, filter=filter)
 
-    from pyklip_diffrender.cli.reduction import run_reduction
+    from pyklip_diffrender.cli.reducing import run_reduction
 
     run_reduction(run, read, **options)
 
@@ -193,7 +179,7 @@ def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
             )
         return (Sequence.from_files([frames]),)
 
-    from pyklip_diffrender.cli.reduction import run_reduction
+    from pyklip_diffrender.cli.reducing import run_reduction
 
     run_reduction(run, read, **options)
 

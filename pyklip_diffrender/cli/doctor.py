@@ -8,7 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
-from importlib import import_module, resources
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
@@ -17,8 +17,8 @@ import click
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.cli.machine import free_memory
-from pyklip_diffrender.cli.options import Command, common
-from pyklip_diffrender.cli.run import Run
+from pyklip_diffrender.cli.session import Run
+from pyklip_diffrender.cli.shared_options import Command, common
 from pyklip_diffrender.errors import DiffrenderError
 
 __all__ = ["Check", "doctor"]
@@ -71,13 +71,11 @@ def check_libraries(names: Iterable[str] = _LIBRARIES) -> Iterator[Check]:
 def check_data(tables: Collection[str] = _TABLES) -> Iterator[Check]:
     """Read the files that come with the package."""
     from pyklip_diffrender.io.files import embedded_table
-    from pyklip_diffrender.pattern.library import read_patterns
+    from pyklip_diffrender.pattern.library import package_library
 
-    library = resources.files("pyklip_diffrender.pattern") / "data" / "patterns.fits.gz"
     try:
         rows = sum(len(embedded_table(name)) for name in tables)
-        with resources.as_file(library) as path:
-            patterns = len(read_patterns(path))
+        patterns = len(package_library().patterns)
     except (DiffrenderError, OSError, ValueError) as error:
         yield Check("FAIL", f"data files cannot be read ({error}). Install the package again")
     else:

@@ -6,7 +6,12 @@ import math
 
 from pyklip_diffrender.cli.machine import free_memory
 from pyklip_diffrender.detection.recovery import TOGETHER
-from pyklip_diffrender.pattern import known_systematics
+from pyklip_diffrender.pattern import (
+    PatternLibrary,
+    combine_libraries,
+    known_systematics,
+    package_library,
+)
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.scene.sequence import Sequence
 
@@ -49,12 +54,15 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
     area = (options.size / 80) ** 2
     fit = _FIT * area**_PIXELS
     steps = []
-    known = systematics == "auto" and known_systematics(sequence.science[0]) is not None
+    searched = systematics == "auto" or isinstance(systematics, PatternLibrary)
+    libraries = [systematics] if isinstance(systematics, PatternLibrary) else []
+    library = combine_libraries([*libraries, package_library()])
+    known = searched and known_systematics(sequence.science[0], library=library) is not None
     unplaced = sum(each.first_pixel is None for each in sequence.science)
     stars = {each.target for each in sequence.references}
     if known and unplaced:
         steps.append((f"place on the detector of {_frames(unplaced)}", _PLACE * fit * unplaced))
-    elif not known and systematics in ("auto", "references") and stars:
+    elif not known and (searched or systematics == "references") and stars:
         frames = len(sequence.references)
         steps.append((f"reference stars: {', '.join(sorted(stars))}", fit * frames**_FRAMES))
     joint = fit * count**_FRAMES * (1 + _TIED * (options.star_flux is not None))

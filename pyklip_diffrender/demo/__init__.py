@@ -7,6 +7,6 @@ from pyklip_diffrender.demo.comparison import (
     simulate_references,
     write_demo,
 )
-from pyklip_diffrender.demo.figure import draw_demo
+from pyklip_diffrender.demo.demo_figure import draw_demo
 
 __all__ = ["DITHERS", "DemoResult", "draw_demo", "run_demo", "simulate_references", "write_demo"]

@@ -202,7 +202,7 @@ def write_demo(result: DemoResult, folder: Path) -> list[Path]:
     hdus.append(fits.ImageHDU(result.detection.snr.astype(np.float32), name="SNR"))
     images = folder / "demo.fits"
     write_fits(hdus, images)
-    tables = {"demo.ecsv": result.table, "candidates.ecsv": result.detection.table}
+    tables = {"demo.ecsv": result.table, "candidates.ecsv": result.detection.candidates}
     for name, table in tables.items():
         with replacing(folder / name) as temporary:
             table.write(temporary, format="ascii.ecsv", overwrite=True)

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.combination import combine_frames
+from pyklip_diffrender.detection.detection_file import image_hdu
 from pyklip_diffrender.detection.disk import Disk, fit_disk
 from pyklip_diffrender.detection.figure import draw_curve, draw_search
 from pyklip_diffrender.detection.recovery import measured_planet, recover_planets, with_planets
-from pyklip_diffrender.detection.result import Detection
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure
+from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.true_positives import completeness, contrast_of_completeness
 from pyklip_diffrender.detection.wide_result import WideField
 from pyklip_diffrender.detection.wide_search import wide_field
@@ -32,6 +33,7 @@ __all__ = [
     "draw_curve",
     "draw_search",
     "fit_disk",
+    "image_hdu",
     "measure",
     "measured_planet",
     "recover_planets",

@@ -32,14 +32,14 @@ from scipy.optimize import minimize
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.combination import combine_frames
+from pyklip_diffrender.detection.detection_file import image_hdu
 from pyklip_diffrender.detection.field import Image, separation_of
 from pyklip_diffrender.detection.groups import groups_of, has_only_reference_stars
 from pyklip_diffrender.detection.relinearise import without_light
 from pyklip_diffrender.detection.sky import Sky
-from pyklip_diffrender.detection.storage import image_hdu
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.files import write_fits
+from pyklip_diffrender.io.files import require_new, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.io.units import to_arcsec
@@ -183,12 +183,19 @@ class Disk:
         x, y = self.offsets.T
         return QTable({"x": x * u.arcsec, "y": y * u.arcsec, "contrast": self.contrasts})
 
-    def write(self, folder: str | os.PathLike[str]) -> Path:
+    def write(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Write disk.fits; returns its path.
 
         Its extensions are IMAGE, IMAGE_ERROR, LIGHT (one for every frame), OFFSET_X, OFFSET_Y and
         the table SOURCES.
+
+        Raises
+        ------
+        ExistingFileError
+            If the file exists, and `overwrite` is False; it is also an `OSError`.
         """
+        path = Path(folder) / "disk.fits"
+        require_new([path], overwrite)
         first = self.fit.frames[0].observation
         unit, wcs = first.unit.to_string("fits"), world_coordinates(self.grid, first)
         shown = [each for each in self.fit.frames if not each.observation.reference]
@@ -208,7 +215,6 @@ class Disk:
                 sources,
             ]
         )
-        path = Path(folder) / "disk.fits"
         write_fits(hdus, path)
         return path
 

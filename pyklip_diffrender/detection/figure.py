@@ -24,7 +24,7 @@ class _Search(Protocol):
     @property
     def grid(self) -> Image: ...
     @property
-    def table(self) -> QTable: ...
+    def candidates(self) -> QTable: ...
     @property
     def contrast_curve(self) -> QTable: ...
     @property
@@ -45,7 +45,7 @@ def draw_search(axes: Sequence[Any], search: _Search) -> None:
     axes : two Axes
     search : Detection or WideField
     """
-    table = search.table
+    table = search.candidates
     drawing.snr_map(
         axes[0], search.snr, search.grid,
         np.stack([table["x"].value, table["y"].value], axis=1),
@@ -68,6 +68,6 @@ def draw_curve(ax: Any, search: _Search, klip: QTable | None = None) -> None:
         Contrast curve of KLIP on the same frames, see `klip_curve`.
     """
     drawing.contrast_curve(
-        ax, search.contrast_curve, search.table, small_sample=search.error_factor.is_measured,
+        ax, search.contrast_curve, search.candidates, small_sample=search.error_factor.is_measured,
         klip=klip,
     )  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.io.files import replacing, require_new
 
 __all__ = ["write_astrometry"]
 
@@ -88,7 +88,9 @@ _FORMATS: dict[str, tuple[Callable[[QTable], Table], str]] = {
 }
 
 
-def write_astrometry(table: QTable, path: str | os.PathLike[str], format: str) -> Path:
+def write_astrometry(
+    table: QTable, path: str | os.PathLike[str], format: str, *, overwrite: bool = False
+) -> Path:
     """Write the positions of candidates; see `Detection.write_astrometry`."""
     if format not in _FORMATS:
         raise IncompatibleSetupError(
@@ -104,6 +106,7 @@ def write_astrometry(table: QTable, path: str | os.PathLike[str], format: str) -
             f"the frames have no {' and no '.join(missing)}, which an orbit needs; their headers "
             "have them in ROLL_REF, and in EXPMID or DATE-BEG"
         )
+    require_new([path], overwrite)
     convert, form = _FORMATS[format]
     plain = convert(table)
     for name in plain.colnames:

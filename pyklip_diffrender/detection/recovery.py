@@ -11,7 +11,8 @@ from astropy import units as u
 from astropy.table import QTable
 from numpy.typing import NDArray
 
-from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.search_result import Detection
+from pyklip_diffrender.io.geometry import full_circle
 from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
@@ -126,7 +127,7 @@ def recover_planets(
         ]
         again = search(with_planets(frames, injected))
         for planet in injected:
-            angle = (planet.position_angle + detection.north) % 360
+            angle = full_circle(planet.position_angle + detection.north)
             measured = measured_planet(again, planet.offset)
             planets.add_row((planet.separation, angle, planet.contrast, *measured))
     for name, unit in _UNITS.items():
@@ -178,7 +179,7 @@ def measured_planet(detection: Detection, place: tuple[float, float]) -> Measure
     -------
     MeasuredPlanet
     """
-    table = detection.table
+    table = detection.candidates
     distances = np.hypot(table["x"].value - place[0], table["y"].value - place[1])
     detected = len(table) > 0 and bool(distances.min() < _SAME)
     row = table[int(distances.argmin())] if detected else detection.measure([place])[0]
@@ -192,7 +193,7 @@ def _free_place(detection: Detection, separation: float, angle: float) -> NDArra
 
     The first such place counter-clockwise from the angle; if there is none, that at the angle.
     """
-    table = detection.table
+    table = detection.candidates
     candidates = np.stack([table["x"].value, table["y"].value], axis=-1)
     turns = np.arange(0, 360, _STEP).tolist()
     circle: list[NDArray[np.float64]] = [

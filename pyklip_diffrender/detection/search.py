@@ -10,6 +10,7 @@ import torch
 from astropy.table import QTable
 from numpy.typing import ArrayLike
 
+from pyklip_diffrender.detection.candidate_tables import measured_table
 from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
@@ -30,14 +31,14 @@ from pyklip_diffrender.detection.field import (
 from pyklip_diffrender.detection.groups import groups_of, weigh
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.measurement import contrasts_at
+from pyklip_diffrender.detection.raised_peaks import with_raised_peaks
 from pyklip_diffrender.detection.relinearise import (
     lacks_candidates,
     with_companions,
 )
-from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.detection.sky import Sky
-from pyklip_diffrender.detection.tables import measured_table
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_arcsec
 from pyklip_diffrender.refinement import Refinement
@@ -115,7 +116,7 @@ def detect(
     >>> scene = dr.Scene(planets=(dr.Planet(1e-5, 0.6, 120.0),))
     >>> frames = dr.simulate(model, scene, opd, seed=3)
     >>> fit = dr.refine(model, frames, opd, settings=dr.GaussNewton(cycles=6))
-    >>> len(dr.detect(fit).table)
+    >>> len(dr.detect(fit).candidates)
     1
     """
     fits = _checked(fits)
@@ -124,6 +125,13 @@ def detect(
     maps = Maps(groups_of(fits), progress)
     known = Candidates.of_fit(fits[0])
     candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
+    if not len(candidates):
+        better = with_raised_peaks(fits, maps, inner, progress)
+        if better is not None:
+            fits = better
+            maps = Maps(groups_of(fits), progress)
+            known = Candidates.of_fit(fits[0])
+            candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
     if not all(fit.status.calibrated for fit in fits):
         relinearise = min(relinearise, threshold)
     bright = candidates.snr(factor) > relinearise
@@ -166,7 +174,7 @@ def detect(
         snr=maps.snr() / factors,
         residual_snr=maps.snr(maps.without(candidates)) / factors,
         error_factor=factor,
-        candidates=candidates,
+        sources=candidates,
         false_alarm=false_alarm,
         rings=chi2_by_ring(maps.groups, candidates.offsets, factor),
         threshold=threshold,

@@ -10,6 +10,7 @@ from astropy.time import Time
 from numpy.typing import NDArray
 
 from pyklip_diffrender.detection.field import Image
+from pyklip_diffrender.io.geometry import full_circle
 from pyklip_diffrender.refinement import Refinement, jansky_per_unit, star_flux_error
 
 __all__ = ["Positions", "Sky"]
@@ -104,12 +105,12 @@ class Positions:
     def frame_angle(self) -> Image:
         """Angle from +y of the first frame, counter-clockwise, degrees, (k,)."""
         x, y = self.offsets.T
-        return np.asarray(np.rad2deg(np.arctan2(-x, y)) % 360)
+        return full_circle(np.asarray(np.rad2deg(np.arctan2(-x, y))))
 
     @property
     def position_angle(self) -> Image:
         """Position angle, degrees east of north, (k,)."""
-        return (self.frame_angle + self.north) % 360
+        return full_circle(self.frame_angle + self.north)
 
     @property
     def on_sky(self) -> Image:

@@ -23,7 +23,7 @@ from pyklip_diffrender.detection.field import Image, curve_separations, far_from
 from pyklip_diffrender.detection.groups import groups_of
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.recovery import CLEAR
-from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.progress import ProgressBar
@@ -106,7 +106,7 @@ def completeness(
             "completeness: got a detection without its fits, expected one from detect or reduce"
         )
     maps = Maps(groups_of(detection.fits), progress)
-    known = detection.candidates
+    known = detection.sources
     significance = significance_of(detection.fits, maps, known.offsets, inner)
     residual = maps.without(known)
     curve = detection.contrast_curve
@@ -216,6 +216,6 @@ def _detects(
     """Whether a search of the map has a candidate within `reach` arcsec of the place."""
     everywhere = np.ones(snr.shape, dtype=bool)
     peaks = significance.significant_peaks(
-        snr, detection.candidates.offsets, detection.threshold, everywhere
+        snr, detection.sources.offsets, detection.threshold, everywhere
     )
     return any(np.hypot(*(significance.grid[peak] - place)) < reach for peak, _ in peaks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,13 +15,13 @@ from astropy.table import QTable
 from numpy.typing import NDArray
 
 from pyklip_diffrender import drawing
+from pyklip_diffrender.detection.candidate_tables import in_words
+from pyklip_diffrender.detection.detection_file import image_hdu
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.figure import draw_search
-from pyklip_diffrender.detection.result import Detection
-from pyklip_diffrender.detection.storage import image_hdu
-from pyklip_diffrender.detection.tables import in_words
-from pyklip_diffrender.io.files import replacing, write_fits
+from pyklip_diffrender.detection.search_result import RENAMED, Detection
+from pyklip_diffrender.io.files import replacing, require_new, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
@@ -48,9 +49,9 @@ class WideField:
         x, y of the pixels from the star, arcsec.
     error_factor : ErrorFactor
         Factor by which errors outside the fitted pixels were multiplied.
-    table : QTable
+    candidates : QTable
         Candidates, highest S/N first, those of the detection included; columns as in
-        `Detection.table`, and fit_chi2.
+        `Detection.candidates`, and fit_chi2.
     contrast_curve : QTable
         See `contrast.contrast_table`.
     light : tuple of ndarray, (ny, nx)
@@ -72,24 +73,30 @@ class WideField:
     snr: Image
     grid: Image
     error_factor: ErrorFactor
-    table: QTable
+    candidates: QTable
     contrast_curve: QTable
     light: tuple[Image, ...] = ()
 
     def __repr__(self) -> str:
         ny, nx = self.snr.shape
-        return f"<WideField: {nx} x {ny} pixels, {len(self.table)} candidates>"
+        return f"<WideField: {nx} x {ny} pixels, {len(self.candidates)} candidates>"
 
     def __str__(self) -> str:
         """The candidates in words, at most 80 columns wide."""
-        return in_words(self.table, self.threshold)
+        return in_words(self.candidates, self.threshold)
 
     def _repr_html_(self) -> str:
         ny, nx = self.snr.shape
         facts = {"Star": self.observation.target, "Pixels": f"{nx} x {ny}"}
-        title = f"WideField: {len(self.table)} candidates above {self.threshold:g} sigma"
+        title = f"WideField: {len(self.candidates)} candidates above {self.threshold:g} sigma"
         columns = ("separation", "position_angle", "contrast", "contrast_error", "snr", "fit_chi2")
-        return html_summary(title, facts, self.table, columns)
+        return html_summary(title, facts, self.candidates, columns)
+
+    @property
+    def table(self) -> QTable:
+        """Earlier name of `candidates`, deprecated."""
+        warnings.warn(RENAMED.format("WideField"), DeprecationWarning, stacklevel=2)
+        return self.candidates
 
     @property
     def observation(self) -> Observation:
@@ -133,14 +140,26 @@ class WideField:
         draw_search(axes, self)
         return np.array(axes)
 
-    def write(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables."""
+    def write(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> list[Path]:
+        """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables.
+
+        Raises
+        ------
+        ExistingFileError
+            If one of the files exists, and `overwrite` is False; it is also an `OSError`.
+        """
         folder = Path(folder)
+        tables = {
+            folder / "wide_field_candidates.ecsv": self.candidates,
+            folder / "wide_field_contrast.ecsv": self.contrast_curve,
+        }
+        written = [folder / "wide_field.fits", *tables]
+        require_new(written, overwrite)
         about = self.detection
         wcs = world_coordinates(self.grid, self.observation)
         hdus = fits.HDUList(
             [
-                primary_hdu(self.observation, about._provenance, about.sky.mjd),
+                primary_hdu(self.observation, about.provenance, about.sky.mjd),
                 image_hdu(self.snr, "SNR", "", wcs),
                 image_hdu(self.contrast, "CONTRAST", "", wcs),
                 image_hdu(self.error, "CONTRAST_ERROR", "", wcs),
@@ -148,10 +167,8 @@ class WideField:
                 image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
             ]
         )
-        written = [folder / "wide_field.fits"]
         write_fits(hdus, written[0])
-        for name, table in (("candidates", self.table), ("contrast", self.contrast_curve)):
-            written.append(folder / f"wide_field_{name}.ecsv")
-            with replacing(written[-1]) as temporary:
+        for path, table in tables.items():
+            with replacing(path) as temporary:
                 table.write(temporary, format="ascii.ecsv", overwrite=True)
         return written

@@ -11,13 +11,13 @@ import torch
 from astropy.table import QTable, vstack
 from numpy.typing import NDArray
 
+from pyklip_diffrender.detection.candidate_tables import candidate_table
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image, far_from, ring_pixels, separation_of
-from pyklip_diffrender.detection.result import Detection
+from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.significance import Significance
-from pyklip_diffrender.detection.tables import candidate_table
 from pyklip_diffrender.detection.whole_frames import WholeFrame
 from pyklip_diffrender.detection.wide_result import WideField
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -117,7 +117,7 @@ def wide_field(
     table = candidate_table(sources, factor, calibration, detection.sky)
     # As in the table, the highest S/N first.
     order = np.argsort(-sources.snr(factor))
-    inner = detection.table.copy()
+    inner = detection.candidates.copy()
     chi2 = np.array([each.chi2 for each in measured]) / factor.of(sources.offsets) ** 2
     inner["fit_chi2"], table["fit_chi2"] = np.nan, chi2[order]
     table["false_alarm_probability"] = np.nan
@@ -127,7 +127,7 @@ def wide_field(
         "reduced chi-squared of the source's image, over the squared error factor; much above 1 "
         "for extended and blended sources"
     )
-    joined.meta = dict(detection.table.meta)
+    joined.meta = dict(detection.candidates.meta)
     return WideField(
         detection,
         threshold,
@@ -154,7 +154,7 @@ def _frames(detection: Detection, observations: Sequence[Observation]) -> list[W
             f"observations: got {[each.name for each in observations]}, expected those of the fit, "
             f"{names}, before they were cut"
         )
-    known = detection.candidates
+    known = detection.sources
     inside = np.column_stack([known.contrasts.numpy(), known.offsets.numpy()])
     return [
         WholeFrame(fit, each, each.roll_from(observations[0]), inside)
@@ -187,7 +187,7 @@ def _search(
     The highest peak is fitted and subtracted, until none is left: sources have side lobes.
     """
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
-    known = detection.candidates.offsets.numpy()
+    known = detection.sources.offsets.numpy()
     significance = Significance(
         grid,
         np.mean([frame.on_first(grid, (frame.starlight,))[0] for frame in frames], axis=0),

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from pyklip_diffrender.imaging.sky import SkyModel
+from pyklip_diffrender.imaging.sky_model import SkyModel
 
 __all__ = ["SkyModel"]

@@ -10,7 +10,7 @@ import secrets
 import shutil
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
@@ -20,9 +20,14 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
 
-from pyklip_diffrender.errors import CorruptFileError, DiffrenderWarning, MissingFileError
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    DiffrenderWarning,
+    ExistingFileError,
+    MissingFileError,
+)
 
-__all__ = ["embedded_table", "open_fits", "replacing", "sha256", "write_fits"]
+__all__ = ["embedded_table", "open_fits", "replacing", "require_new", "sha256", "write_fits"]
 
 _GZIP = b"\x1f\x8b"
 
@@ -103,6 +108,22 @@ def _require_sound(hdu: Any, number: int, path: Path) -> None:
             stacklevel=5,
         )
     _ = hdu.data
+
+
+def require_new(paths: Iterable[str | os.PathLike[str]], overwrite: bool) -> None:
+    """Check, before anything is written, that no file is replaced unless that is wanted.
+
+    Raises
+    ------
+    ExistingFileError
+        If one of the files exists, and `overwrite` is False.
+    """
+    existing = [str(path) for path in paths if os.path.lexists(path)]
+    if existing and not overwrite:
+        verb = "exists" if len(existing) == 1 else "exist"
+        raise ExistingFileError(
+            f"{', '.join(existing)} {verb}; choose another place, or replace with overwrite=True"
+        )
 
 
 @contextmanager

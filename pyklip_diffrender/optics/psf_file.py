@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.files import write_fits
+from pyklip_diffrender.io.files import require_new, write_fits
 from pyklip_diffrender.optics.propagation import Propagation
 
 __all__ = ["instrument_psf", "poppy_psf", "save"]
@@ -198,13 +198,12 @@ def save(hdus: fits.HDUList, outfile: str | os.PathLike[str] | None, overwrite: 
 
     Raises
     ------
-    FileExistsError
+    ExistingFileError
         If the file exists and must not be overwritten.
     """
     if outfile is None:
         return
-    if os.path.exists(outfile) and not overwrite:
-        raise FileExistsError(f"{outfile} exists; pass overwrite=True, or another outfile")
+    require_new([outfile], overwrite)
     hdus[0].header["FILENAME"] = (os.path.basename(outfile), "Name of this file")
     with warnings.catch_warnings():
         # Some of stpsf's comments are longer than a card.

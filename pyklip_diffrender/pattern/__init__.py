@@ -9,11 +9,17 @@ from pyklip_diffrender.pattern.choice import (
     PatternChoice,
     PatternRequest,
     ReferenceFrames,
+    as_request,
     choose_systematics,
-    require_request,
 )
 from pyklip_diffrender.pattern.fit import fit_with_pattern
-from pyklip_diffrender.pattern.library import known_systematics, read_patterns, write_patterns
+from pyklip_diffrender.pattern.learn import learn_library
+from pyklip_diffrender.pattern.library import (
+    PatternLibrary,
+    combine_libraries,
+    known_systematics,
+    package_library,
+)
 from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
     combine_patterns,
@@ -27,19 +33,21 @@ from pyklip_diffrender.pattern.presence import lacks_pattern, pattern_size
 __all__ = [
     "MeasuredPattern",
     "PatternChoice",
+    "PatternLibrary",
     "PatternRequest",
     "ReferenceFrames",
+    "as_request",
     "choose_systematics",
+    "combine_libraries",
     "combine_patterns",
     "fit_with_pattern",
     "known_systematics",
     "lacks_pattern",
+    "learn_library",
     "learn_systematics",
     "measure_patterns",
+    "package_library",
     "pattern_pedestal",
     "pattern_size",
     "place_on_detector",
-    "read_patterns",
-    "require_request",
-    "write_patterns",
 ]

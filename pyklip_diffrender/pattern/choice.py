@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from astropy import units as u
 
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.pattern.library import known_systematics
+from pyklip_diffrender.pattern.library import (
+    PatternLibrary,
+    combine_libraries,
+    known_systematics,
+    package_library,
+)
 from pyklip_diffrender.pattern.placement import place_on_detector
 from pyklip_diffrender.pattern.presence import lacks_pattern
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
-from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
@@ -27,11 +35,11 @@ __all__ = [
     "PatternChoice",
     "PatternRequest",
     "ReferenceFrames",
+    "as_request",
     "choose_systematics",
-    "require_request",
 ]
 
-PatternRequest: TypeAlias = Systematics | Literal["auto", "references", "off"]
+PatternRequest: TypeAlias = Systematics | PatternLibrary | Literal["auto", "references", "off"]
 
 ReferenceFrames: TypeAlias = Sequence[Observation] | Callable[[], Sequence[Observation]]
 """Frames of reference stars, or a function that reads them where they are needed."""
@@ -80,7 +88,7 @@ class PatternChoice:
     failed : tuple of (str, str)
         Reference stars that could not be fitted, and why.
     origin : {"none", "given", "library", "references", "rolls"}
-        Where the pattern comes from: nowhere, from the caller, from the package's library alone,
+        Where the pattern comes from: nowhere, from the caller, from libraries alone,
         from reference stars (and the library), or from the rolls, which share a pattern of which
         only the size is known.
     """
@@ -121,15 +129,31 @@ class PatternChoice:
         return lacks_pattern(fit) and self.origin == "library"
 
 
-def require_request(systematics: object) -> None:
-    """Raise `IncompatibleSetupError` for what is no request for a pattern."""
-    if systematics not in ("auto", "references", "off") and not isinstance(
-        systematics, Systematics
-    ):
-        raise IncompatibleSetupError(
-            f"systematics: got {systematics!r}, expected 'auto', 'references', 'off' or a "
-            "Systematics"
-        )
+def as_request(systematics: object) -> PatternRequest:
+    """Make a request for a pattern; paths are those of files, or of a folder of libraries.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For anything else, and for a path that does not exist.
+    CorruptFileError
+        For a file or a folder without a pattern.
+    """
+    match systematics:
+        case "auto" | "references" | "off" | Systematics() | PatternLibrary():
+            return systematics
+        case str() | os.PathLike():
+            path = Path(systematics)
+            if path.is_dir():
+                return PatternLibrary.read(path)
+            if path.is_file():
+                with open_fits(path) as hdus:
+                    is_library = "PATVERS" in hdus[0].header
+                return PatternLibrary.read(path) if is_library else Systematics.read(path)
+    raise IncompatibleSetupError(
+        f"systematics: got {systematics!r}, expected 'auto', 'references', 'off', a Systematics, a "
+        "PatternLibrary, or an existing file or folder with patterns, such as a systematics.fits"
+    )
 
 
 def choose_systematics(
@@ -155,12 +179,14 @@ def choose_systematics(
     model : OpticalSystem
     opd : OPDMap
         The wavefront to start from.
-    systematics : Systematics, "auto", "references" or "off"
+    systematics : Systematics, PatternLibrary, "auto", "references" or "off"
         "auto" takes the pattern of the library, and fits the references only where it has none;
         "references" fits them in any case and uses both. Where neither knows anything, rolls that
-        show the same pixels of the detector share a pattern of which only the size is known.
+        show the same pixels of the detector share a pattern of which only the size is known. With
+        a `PatternLibrary`, the choice is as for "auto", with its patterns and those of the
+        package.
     library : bool
-        False leaves the library out, for frames that do not show its pattern, see
+        False leaves libraries out, for frames that do not show their pattern, see
         `PatternChoice.is_refuted_by`.
     settings : GaussNewton, optional
         Of the fits; default those of `refine`.
@@ -176,7 +202,7 @@ def choose_systematics(
     DiffrenderError
         If frames that must be moved cannot be fitted. A reference star that cannot be is left out.
     """
-    require_request(systematics)
+    systematics = as_request(systematics)
     common: dict[str, Any] = {
         "settings": _limited(settings, science[0], memory),
         "progress": progress,
@@ -185,17 +211,18 @@ def choose_systematics(
     failed: list[tuple[str, str]] = []
     pattern = systematics if isinstance(systematics, Systematics) else None
     origin: Origin = "none" if pattern is None else "given"
-    if systematics in ("auto", "references"):
+    if systematics != "off" and not isinstance(systematics, Systematics):
         first = science[0]
-        if systematics == "auto" and library:
-            pattern = known_systematics(first)
+        known = _library(systematics) if library else PatternLibrary()
+        if systematics != "references" and library:
+            pattern = known_systematics(first, library=known)
             if pattern is not None:
                 science, pattern = _registered(science, pattern, model, opd, common)
                 origin = "library"
         if pattern is None and references:
             frames = references() if callable(references) else references
             fits, failed = _fit_references(frames, model, opd, common)
-            pattern = known_systematics(first, fits, library=library)
+            pattern = known_systematics(first, fits, library=known)
             origin = "references"
         if pattern is None:
             pattern = _unknown_pattern(science)
@@ -207,6 +234,13 @@ def choose_systematics(
         settings = replace(settings_for(science[0]), min_model_error=_KNOWN_MODEL_ERROR)
     settings = _limited(settings, science[0], memory)
     return PatternChoice(tuple(science), pattern, settings, tuple(fits), tuple(failed), origin)
+
+
+def _library(systematics: PatternLibrary | str) -> PatternLibrary:
+    """The package's library, after that of the request if it has one."""
+    if isinstance(systematics, PatternLibrary):
+        return combine_libraries([systematics, package_library()])
+    return package_library()
 
 
 def _limited(

@@ -1,45 +1,185 @@
-"""Flat-field patterns that were measured on other stars and come with the package.
+"""Libraries of flat-field patterns that were measured on stars: files, search and combination.
 
-The table was made by ``examples/make_pattern_library.py`` from frames of JWST programme 1184.
+The package's own library was measured on frames of JWST programme 1184.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from astropy.io import fits
+from astropy.table import QTable, vstack
 
+from pyklip_diffrender.errors import CorruptFileError
 from pyklip_diffrender.io.files import open_fits, write_fits
 from pyklip_diffrender.io.headers import fits_text
+from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.names import same_name
+from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pattern.measure import (
     MeasuredPattern,
     combine_patterns,
+    common_pedestal,
+    flat_of,
     measure_patterns,
 )
-from pyklip_diffrender.refinement.result import Refinement
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.scene.catalogue_star import star_of
+from pyklip_diffrender.scene.exposure import detector_of, image_mask
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics, pattern_fields, pattern_hdus
 
-__all__ = ["known_systematics", "read_patterns", "write_patterns"]
+__all__ = ["PatternLibrary", "combine_libraries", "known_systematics", "package_library"]
 
 _COVERED = 0.5
 """Smallest part of a frame's pixels that the patterns must cover to be of use."""
+
+_VERSION = 2
+"""Of the layout of the files, in the card PATVERS."""
+
+_SUFFIXES = (".fits", ".fits.gz")
+
+
+@dataclass(frozen=True, eq=False)
+class PatternLibrary:
+    """Flat-field patterns of many stars, set-ups and dates.
+
+    Attributes
+    ----------
+    patterns : tuple of MeasuredPattern
+        One for each frame.
+    validation : QTable
+        One row for each star and epoch, see `learn_library`; empty for patterns that were not
+        tested on each other.
+
+    Examples
+    --------
+    From files of the command ``learn``, which the package does not contain:
+
+    >>> import pyklip_diffrender as dr
+    >>> library = dr.PatternLibrary.read("patterns")  # doctest: +SKIP
+    >>> result = dr.reduce("calints", "maps", systematics=library)  # doctest: +SKIP
+    """
+
+    patterns: tuple[MeasuredPattern, ...] = ()
+    validation: QTable = field(default_factory=QTable)
+
+    def __repr__(self) -> str:
+        return f"<PatternLibrary: {len(self.patterns)} frames of {', '.join(self.stars) or 'none'}>"
+
+    def _repr_html_(self) -> str:
+        facts = {"Frames": len(self.patterns), "Stars": ", ".join(self.stars) or None}
+        return html_summary("Library of flat-field patterns", facts)
+
+    @property
+    def stars(self) -> list[str]:
+        """Names of the stars."""
+        return list(dict.fromkeys(pattern.star for pattern in self.patterns))
+
+    def matching(self, observation: Observation) -> list[MeasuredPattern]:
+        """Return the patterns that an observation may show.
+
+        They are of the detector, mask and filter of the observation, cover at least half of its
+        pixels, and are of other stars, so that nothing of the target's planets is among them. They
+        share one flat field: that of the observation if there are such, else the one of most
+        patterns.
+        """
+        header, name = observation.header, observation.name
+        star, detector = star_of(header, name), detector_of(header, name)
+        mask = image_mask(header, name)
+        chosen = [
+            pattern
+            for pattern in self.patterns
+            if (pattern.filter, pattern.image_mask) == (observation.filter, mask)
+            and pattern.detector is not None
+            and pattern.detector == detector
+            and not (pattern.catalogue.is_same(star) or same_name(pattern.star, observation.target))
+            and not any(same_name(pattern.star, each) for each in star.names)
+            and _covered(pattern, observation) >= _COVERED
+        ]
+        flats = Counter(pattern.flat for pattern in chosen)
+        own = flat_of(observation)
+        flat = own if own in flats else max(flats, key=lambda each: flats[each], default=None)
+        return [pattern for pattern in chosen if pattern.flat == flat]
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file that `write` wrote, or all of a folder.
+
+        Raises
+        ------
+        MissingFileError
+            If there is no such file.
+        CorruptFileError
+            If a file is truncated or holds something else, or a folder has no library.
+        """
+        path = Path(path)
+        if not path.is_dir():
+            patterns, validation = _read(path)
+            return cls(patterns, validation)
+        files = sorted(each for each in path.iterdir() if each.name.endswith(_SUFFIXES))
+        if not files:
+            raise CorruptFileError(
+                f"{path}: the folder has no FITS files, expected some that the command learn wrote"
+            )
+        several = combine_libraries([cls(*_read(each)) for each in files])
+        return cls(several.patterns, several.validation)
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write to a FITS file, atomically; an existing one is replaced.
+
+        Each pattern has the extensions PATTERN and PATTERN_ERROR, as a `Systematics`, and STAR, if
+        the star was kept, with the number of the pattern as EXTVER; VALIDATION is a table.
+        """
+        primary = fits.PrimaryHDU()
+        primary.header["PATVERS"] = (_VERSION, "version of the layout")
+        hdus = [primary]
+        for k, pattern in enumerate(self.patterns, 1):
+            hdus += _hdus(pattern, k)
+        if len(self.validation):
+            hdus.append(fits.table_to_hdu(self.validation))
+            hdus[-1].name = "VALIDATION"
+        write_fits(fits.HDUList(hdus), path)
+        return Path(path)
+
+
+def combine_libraries(libraries: Iterable[PatternLibrary]) -> PatternLibrary:
+    """Put the patterns of several libraries into one.
+
+    Of a frame that is in several of them, the pattern of the first one is kept.
+
+    Examples
+    --------
+    >>> import pyklip_diffrender as dr
+    >>> from pyklip_diffrender.pattern import package_library
+    >>> print(dr.combine_libraries([dr.PatternLibrary(), package_library()]))
+    <PatternLibrary: 8 frames of HIP17695, G-7-34>
+    """
+    several = list(libraries)
+    patterns: dict[tuple[object, ...], MeasuredPattern] = {}
+    for library in several:
+        for pattern in library.patterns:
+            patterns.setdefault(_identity(pattern), pattern)
+    tables = [library.validation for library in several if len(library.validation)]
+    validation = vstack(tables, metadata_conflicts="silent") if tables else QTable()
+    return PatternLibrary(tuple(patterns.values()), validation)
 
 
 def known_systematics(
     observation: Observation,
     references: Refinement | Sequence[Refinement] = (),
     *,
-    library: bool = True,
+    library: bool | PatternLibrary = True,
 ) -> Systematics | None:
-    """Combine the flat-field pattern of reference stars and that of the package's own library.
+    """Combine the flat-field pattern of reference stars and that of a library.
 
     Parameters
     ----------
@@ -48,8 +188,8 @@ def known_systematics(
         planets is in the pattern.
     references : Refinement or sequence of Refinement
         Fits of reference stars, if there are any.
-    library : bool
-        False leaves the library out.
+    library : bool or PatternLibrary
+        True stands for the package's own library, False for none.
 
     Returns
     -------
@@ -68,37 +208,21 @@ def known_systematics(
     >>> print(dr.known_systematics(frame))
     <Systematics 'HIP17695, G-7-34': F444W, 80 x 80 pixels>
     """
-    known = _library_for(observation) if library else []
-    pedestal = known[0].pedestal if known else None
-    patterns = measure_patterns(references, pedestal)
-    target = star_of(observation.header, observation.name).names or (observation.target,)
-    stars = [pattern.star for pattern in patterns] + list(target)
+    if isinstance(library, bool):
+        library = package_library() if library else PatternLibrary()
+    known = library.matching(observation)
+    patterns = measure_patterns(references, common_pedestal(known) if known else None)
+    fitted = {pattern.star for pattern in patterns}
     if all(pattern.first_pixel is not None for pattern in patterns):
-        patterns += [
-            each for each in known if not any(same_name(each.star, star) for star in stars)
-        ]
+        patterns += [p for p in known if not any(same_name(p.star, star) for star in fitted)]
     return combine_patterns(patterns) if len(patterns) > 1 else None
 
 
-def _library_for(observation: Observation) -> list[MeasuredPattern]:
-    """The library's patterns of the observation's filter and mask, if they cover its pixels.
+def _covered(pattern: MeasuredPattern, observation: Observation) -> float:
+    """The part of the observation's pixels that a pattern covers.
 
     Frames that do not say where their pixels are on the detector may be anywhere.
     """
-    if observation.header.get("DETECTOR") != "NRCALONG":
-        return []
-    mask = str(observation.header.get("CORONMSK", "")).strip().upper()
-    return [
-        pattern
-        for pattern in _library()
-        if pattern.filter == observation.filter
-        and pattern.image_mask == mask
-        and _covered(pattern, observation) >= _COVERED
-    ]
-
-
-def _covered(pattern: MeasuredPattern, observation: Observation) -> float:
-    """The part of the observation's pixels that a pattern covers."""
     if pattern.first_pixel is None or observation.first_pixel is None:
         return 1.0
     starts = np.array([pattern.first_pixel, observation.first_pixel])
@@ -107,49 +231,75 @@ def _covered(pattern: MeasuredPattern, observation: Observation) -> float:
     return float(np.clip(overlap, 0, None).prod() / shapes[1].prod())
 
 
+def _identity(pattern: MeasuredPattern) -> tuple[object, ...]:
+    """The frame that a pattern was measured in, and the flat field it was calibrated with."""
+    name = pattern.frame.removesuffix(".gz")
+    return (name or id(pattern), pattern.date, pattern.filter, pattern.detector, pattern.flat)
+
+
 @lru_cache(maxsize=1)
-def _library() -> tuple[MeasuredPattern, ...]:
+def package_library() -> PatternLibrary:
+    """The library that comes with the package."""
     name = resources.files("pyklip_diffrender.pattern") / "data" / "patterns.fits.gz"
     with resources.as_file(name) as path:
-        return tuple(read_patterns(path))
+        return PatternLibrary.read(path)
 
 
-def write_patterns(patterns: Sequence[MeasuredPattern], path: str | os.PathLike[str]) -> Path:
-    """Write patterns to a FITS file, two extensions as of a `Systematics` for each, atomically."""
-    hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [fits.PrimaryHDU()]
-    for k, pattern in enumerate(patterns, 1):
-        error = np.sqrt(np.where(np.isfinite(pattern.variance), pattern.variance, np.nan))
-        value = pattern.value.astype(np.float32)
-        hdus += pattern_hdus(value, error.astype(np.float32), pattern, k)
-        header = hdus[-2].header
-        header["STAR"] = (fits_text(pattern.star), "star that it was measured on")
-        header["FRAME"], header["DATE-BEG"] = fits_text(pattern.frame), pattern.date
-    write_fits(fits.HDUList(hdus), path)
-    return Path(path)
+def _hdus(pattern: MeasuredPattern, number: int) -> list[fits.ImageHDU]:
+    """Extensions of a pattern; unknown pixels have the error NaN."""
+    error = np.sqrt(np.where(np.isfinite(pattern.variance), pattern.variance, np.nan))
+    value = pattern.value.astype(np.float32)
+    hdus = pattern_hdus(value, error.astype(np.float32), pattern, number)
+    header = hdus[0].header
+    header["STAR"] = (fits_text(pattern.star), "star that it was measured on")
+    star = pattern.catalogue
+    for card, name in zip(("TARGPROP", "TARGNAME"), star.names, strict=False):
+        header[card] = fits_text(name)
+    if star.coordinates is not None:
+        cards = ("RA_REF", "DEC_REF") if star.pointing else ("TARG_RA", "TARG_DEC")
+        header[cards[0]], header[cards[1]] = star.coordinates
+    header["FRAME"], header["DATE-BEG"] = fits_text(pattern.frame), pattern.date
+    header["DETECTOR"] = pattern.detector or ""
+    header["R_FLAT"] = (pattern.flat or "", "flat field of the frame's calibration")
+    if pattern.light is not None:
+        hdus.append(fits.ImageHDU(pattern.light.astype(np.float32), name="STAR", ver=number))
+    return hdus
 
 
-def read_patterns(path: str | os.PathLike[str]) -> list[MeasuredPattern]:
-    """Read what `write_patterns` wrote.
-
-    Raises
-    ------
-    CorruptFileError
-        If the file is missing or truncated.
-    """
-    patterns = []
+def _read(path: Path) -> tuple[tuple[MeasuredPattern, ...], QTable]:
+    """Patterns and table of a file."""
     with open_fits(path) as hdus:
-        for k in range(1, 1 + sum(hdu.name == "PATTERN" for hdu in hdus)):
-            header, fields = hdus["PATTERN", k].header, pattern_fields(hdus, k)
-            value, error = fields.pop("pattern"), fields.pop("error")
-            known = np.isfinite(error)
-            patterns.append(
-                MeasuredPattern(
-                    star=header["STAR"],
-                    value=np.where(known, value, 0.0),
-                    variance=np.where(known, error, np.inf) ** 2,
-                    frame=header["FRAME"],
-                    date=header["DATE-BEG"],
-                    **fields,
-                )
+        version = hdus[0].header.get("PATVERS")
+        if version != _VERSION:
+            raise CorruptFileError(
+                f"{path}: got {'no' if version is None else version} version of a library of "
+                f"patterns (PATVERS), expected {_VERSION}. The command learn writes such files"
             )
-    return patterns
+        try:
+            count = sum(hdu.name == "PATTERN" for hdu in hdus)
+            patterns = tuple(_pattern(hdus, k) for k in range(1, 1 + count))
+            table = QTable.read(hdus["VALIDATION"]) if "VALIDATION" in hdus else QTable()
+        except (KeyError, ValueError) as error:
+            raise CorruptFileError(
+                f"{path}: not a complete library of patterns ({error}). Learn it again"
+            ) from error
+    return patterns, table
+
+
+def _pattern(hdus: fits.HDUList, number: int) -> MeasuredPattern:
+    header, fields = hdus["PATTERN", number].header, pattern_fields(hdus, number)
+    value, error = fields.pop("pattern"), fields.pop("error")
+    known = np.isfinite(error)
+    has_star = ("STAR", number) in hdus
+    return MeasuredPattern(
+        star=header["STAR"],
+        value=np.where(known, value, 0.0),
+        variance=np.where(known, error, np.inf) ** 2,
+        frame=header["FRAME"],
+        date=header["DATE-BEG"],
+        detector=header["DETECTOR"] or None,
+        flat=header["R_FLAT"] or None,
+        light=native_float64(hdus["STAR", number].data) if has_star else None,
+        catalogue=star_of(header, header["FRAME"]),
+        **fields,
+    )

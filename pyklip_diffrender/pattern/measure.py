@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.pattern.pedestal import (
     FEW_PIXELS,
     OUTLIER,
@@ -18,13 +19,18 @@ from pyklip_diffrender.pattern.pedestal import (
     pattern_pedestal,
     rings_about,
 )
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.result import Refinement
+from pyklip_diffrender.scene.catalogue_star import CatalogueStar, star_of
+from pyklip_diffrender.scene.exposure import detector_of, image_mask
+from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = [
     "MeasuredPattern",
     "combine_patterns",
+    "common_pedestal",
+    "flat_of",
     "learn_systematics",
     "measure_patterns",
 ]
@@ -52,6 +58,14 @@ class MeasuredPattern:
         Where and when it was measured.
     pedestal : float
         As of `Systematics`.
+    detector : str or None
+        NRCALONG, NRCA2 or NRCA4.
+    flat : str or None
+        Name of the flat field with which the frame was calibrated (R_FLAT).
+    light : ndarray, (ny, nx), or None
+        The star without the pattern, in the unit of the frame; None where it was not kept.
+    catalogue : CatalogueStar
+        Names and place of the star.
     """
 
     star: str
@@ -64,6 +78,37 @@ class MeasuredPattern:
     frame: str = ""
     date: str = ""
     pedestal: float = 0.0
+    detector: str | None = None
+    flat: str | None = None
+    light: Image | None = None
+    catalogue: CatalogueStar = field(default_factory=CatalogueStar)
+
+    def with_pedestal(self, pedestal: float) -> MeasuredPattern:
+        """The same residual over the sum of the star and another pedestal.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If the pattern has another pedestal, and its star was not kept.
+        """
+        if pedestal == self.pedestal:
+            return self
+        if self.light is None:
+            raise IncompatibleSetupError(
+                f"{self.frame}: got a pattern with the pedestal {self.pedestal:.4g}, expected "
+                f"{pedestal:.4g}; it was stored without its star, by which the pedestal could be "
+                "changed. Learn it again"
+            )
+        multiplied = self.light + pedestal
+        usable = np.isfinite(self.variance) & (multiplied > 0)
+        ratio = (self.light + self.pedestal) / np.where(usable, multiplied, 1.0)
+        variance = np.where(usable, self.variance, 0.0) * ratio**2
+        return replace(
+            self,
+            value=np.where(usable, self.value * ratio, 0.0),
+            variance=np.where(usable, variance, np.inf),
+            pedestal=pedestal,
+        )
 
 
 def learn_systematics(
@@ -136,22 +181,22 @@ def measure_patterns(
 def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = None) -> Systematics:
     """Average measured patterns, see `learn_systematics`.
 
+    Patterns with different pedestals are brought to that of the patterns whose star was not kept,
+    or else to the median.
+
     Raises
     ------
     IncompatibleSetupError
-        For none, or patterns of different filters.
+        For none, for patterns of different filters, and for patterns with different pedestals whose
+        stars were not kept.
     """
     filters = {pattern.filter for pattern in patterns}
-    pedestals = {pattern.pedestal for pattern in patterns}
-    if len(pedestals) != 1:
-        raise IncompatibleSetupError(
-            f"systematics: got patterns with pedestals of {sorted(pedestals)}, expected one. "
-            "Measure them with the same value of pedestal"
-        )
     if len(filters) != 1:
         raise IncompatibleSetupError(
             f"systematics: got patterns of {sorted(map(str, filters))}, expected one filter"
         )
+    pedestal = common_pedestal(patterns)
+    patterns = [pattern.with_pedestal(pedestal) for pattern in patterns]
     values, variances, center, first_pixel = _on_common_pixels(patterns)
     ring = rings_about(values[0].shape, center)
     stars = [pattern.star for pattern in patterns]
@@ -170,7 +215,7 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
         center=center,
         first_pixel=first_pixel,
         unknown=float(np.median(width)),
-        pedestal=pedestals.pop(),
+        pedestal=pedestal,
         filter=patterns[0].filter,
         image_mask=patterns[0].image_mask,
         name=name or ", ".join(names),
@@ -182,8 +227,16 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
     )
 
 
-def _text(value: object) -> str | None:
-    return value if isinstance(value, str) else None
+def common_pedestal(patterns: Sequence[MeasuredPattern]) -> float:
+    """The pedestal to which `combine_patterns` brings patterns."""
+    fixed = [pattern.pedestal for pattern in patterns if pattern.light is None]
+    return float(np.median(fixed or [pattern.pedestal for pattern in patterns]))
+
+
+def flat_of(observation: Observation) -> str | None:
+    """Name of the flat field with which frames were calibrated (R_FLAT), without its address."""
+    name = header_text(observation.header, "R_FLAT", observation.name)
+    return None if name is None else name.rpartition("/")[2]
 
 
 def _measured(frame: FrameFit, pedestal: float) -> MeasuredPattern:
@@ -200,10 +253,14 @@ def _measured(frame: FrameFit, pedestal: float) -> MeasuredPattern:
         center=(float(x), float(y)),
         first_pixel=observation.first_pixel,
         filter=observation.filter,
-        image_mask=_text(observation.header.get("CORONMSK")),
+        image_mask=image_mask(observation.header, observation.name),
         frame=observation.name,
         date="" if observation.date is None else observation.date.isot,
         pedestal=pedestal,
+        detector=detector_of(observation.header, observation.name),
+        flat=flat_of(observation),
+        light=light,
+        catalogue=star_of(observation.header, observation.name),
     )
 
 

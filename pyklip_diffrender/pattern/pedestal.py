@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.result import Refinement
 
 __all__ = [
     "FEW_PIXELS",

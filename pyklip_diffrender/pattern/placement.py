@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import fourier_shift
 
 from pyklip_diffrender.pattern.measure import measure_patterns
-from pyklip_diffrender.refinement.result import Refinement
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.scene.detector_pixels import shift_frames, shift_variances
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics

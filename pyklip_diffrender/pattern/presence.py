@@ -11,7 +11,7 @@ import logging
 import torch
 
 from pyklip_diffrender.pattern.pedestal import light_and_residual
-from pyklip_diffrender.refinement.result import Refinement
+from pyklip_diffrender.refinement.fit_result import Refinement
 
 __all__ = ["lacks_pattern", "pattern_size"]
 

@@ -5,7 +5,8 @@ Importing this package does not import pyKLIP; `register` and `backend` do.
 
 from __future__ import annotations
 
-from pyklip_diffrender.pyklip_backend.frames import observation_from_dataset
+from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.dataset_frames import observation_from_dataset
 from pyklip_diffrender.pyklip_backend.registration import (
     ALGORITHM,
     backend,
@@ -13,7 +14,6 @@ from pyklip_diffrender.pyklip_backend.registration import (
     register,
     unregister,
 )
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.subtract import (
     Fit,
     Subtraction,

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError, ShapeError
-from pyklip_diffrender.pyklip_backend.frames import require_frames
-from pyklip_diffrender.pyklip_backend.images import IMAGES
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
+from pyklip_diffrender.pyklip_backend.dataset_frames import require_frames
+from pyklip_diffrender.pyklip_backend.product_images import IMAGES
 
 __all__ = ["check_arguments", "check_dataset", "check_settings"]
 
@@ -69,7 +69,7 @@ def check_settings(settings: DiffrenderSettings) -> None:
     if settings.subtractor is not None:
         return
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-    from pyklip_diffrender.pattern.choice import require_request
+    from pyklip_diffrender.pattern.choice import as_request
 
     known = set(inspect.signature(nircam_coronagraph).parameters) - {"filter"}
     wrong = sorted(set(settings.model_options) - known)
@@ -79,7 +79,7 @@ def check_settings(settings: DiffrenderSettings) -> None:
             f"{', '.join(sorted(known))}"
         )
     if settings.systematics is not None:
-        require_request(settings.systematics)
+        as_request(settings.systematics)
     if settings.max_chi2 is not None and not settings.max_chi2 > 0:
         raise IncompatibleSetupError(
             f"max_chi2: got {settings.max_chi2}, expected a positive number; inf for no limit"

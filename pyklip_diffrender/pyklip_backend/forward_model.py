@@ -18,8 +18,8 @@ import torch
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 
 if TYPE_CHECKING:
     from pyklip_diffrender.refinement import Refinement

@@ -15,15 +15,15 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.forward_model import (
     check_forward_model,
     is_planet,
     planet_in_frames,
 )
-from pyklip_diffrender.pyklip_backend.placement import fill
+from pyklip_diffrender.pyklip_backend.klip_call import DatasetReduction
+from pyklip_diffrender.pyklip_backend.klip_frames import fill
 from pyklip_diffrender.pyklip_backend.planet_fit import planet_cards
-from pyklip_diffrender.pyklip_backend.reduction import DatasetReduction
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.wavefront.opd import OPDMap
 

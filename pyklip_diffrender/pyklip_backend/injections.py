@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.pyklip_backend.frames import Frames
-from pyklip_diffrender.pyklip_backend.products import ReductionRecord
+from pyklip_diffrender.pyklip_backend.dataset_frames import Frames
+from pyklip_diffrender.pyklip_backend.output_files import ReductionRecord
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 
 __all__ = ["subtract_from_copy"]

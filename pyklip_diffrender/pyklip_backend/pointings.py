@@ -11,6 +11,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from pyklip_diffrender.io.geometry import half_circle
 from pyklip_diffrender.scene.exposure import beginning
 from pyklip_diffrender.scene.observation import Observation
 
@@ -87,7 +88,7 @@ def pointings_of(
             other = group[0]
             if (
                 np.hypot(*(center - observation.center[other])) <= _SAME_PLACE
-                and abs(angle - angles[other]) <= _SAME_ANGLE
+                and abs(half_circle(angle - angles[other])) <= _SAME_ANGLE
                 and (details is None or details[k].first_pixel == details[other].first_pixel)
             ):
                 group.append(k)

@@ -18,16 +18,16 @@ from contextvars import ContextVar
 from typing import Any
 
 from pyklip_diffrender.errors import DiffrenderWarning, IncompatibleSetupError
-from pyklip_diffrender.pyklip_backend.child import announce, spawned_beside_klip
-from pyklip_diffrender.pyklip_backend.forward_reduction import ForwardReduction
-from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
-from pyklip_diffrender.pyklip_backend.products import ReductionRecord
-from pyklip_diffrender.pyklip_backend.reduction import RESULTS, DatasetReduction, mark_filtered
-from pyklip_diffrender.pyklip_backend.settings import (
+from pyklip_diffrender.pyklip_backend.backend_settings import (
     DiffrenderSettings,
     OPDLike,
     settings_of,
 )
+from pyklip_diffrender.pyklip_backend.child import announce, spawned_beside_klip
+from pyklip_diffrender.pyklip_backend.forward_reduction import ForwardReduction
+from pyklip_diffrender.pyklip_backend.klip_call import RESULTS, DatasetReduction, mark_filtered
+from pyklip_diffrender.pyklip_backend.output_files import ReductionRecord
+from pyklip_diffrender.pyklip_backend.patch import PatchedFunction, PatchedMethod
 from pyklip_diffrender.pyklip_backend.source import keeping_references, keeping_source
 
 __all__ = [

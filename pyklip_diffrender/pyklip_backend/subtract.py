@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 from pyklip_diffrender.pyklip_backend.pointings import Pointing, pointings_of
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.verdict import (
     require_plausible,
     warn_of_status,
@@ -231,6 +231,8 @@ def _requested_pattern(
     IncompatibleSetupError
         If "references" is asked for without any.
     """
+    from pyklip_diffrender.pattern import as_request
+
     requested = settings.systematics
     if requested is None:
         return "auto" if observation.is_nircam else "off"
@@ -240,7 +242,7 @@ def _requested_pattern(
             "psflib_filepaths after register(), and RDI in the mode and psf_library= to "
             "klip_dataset"
         )
-    return requested
+    return as_request(requested)
 
 
 def _refined(
@@ -301,13 +303,13 @@ def _with_companions(
     # No relinearisation: the star is refined again below.
     tell("searching for companions")
     detection = detect(result, relinearise=math.inf)
-    logger.info("companions kept out of the star: %s", detection.table)
-    number = _counted(len(detection.candidates), "companion")
-    if not lacks_candidates([result], detection.candidates):
+    logger.info("companions kept out of the star: %s", detection.candidates)
+    number = _counted(len(detection.sources), "companion")
+    if not lacks_candidates([result], detection.sources):
         tell(f"{number} detected, as many as the fit has")
         return result, detection.error_factor
     tell(f"{number} detected, {len(result.companions)} in the fit: the star is fitted again")
-    (result,) = with_companions([result], detection.candidates)
+    (result,) = with_companions([result], detection.sources)
     tell(_described(result))
     return result, detection.error_factor
 

@@ -9,7 +9,7 @@ from pyklip_diffrender.reduction.products import (
     write_products,
     write_report,
 )
-from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.summary import summarise
 
 __all__ = [

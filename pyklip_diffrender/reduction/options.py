@@ -6,16 +6,14 @@ import difflib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any, Self
 
 from astropy import units as u
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import require_bound, to_bytes
-from pyklip_diffrender.pattern import PatternRequest, require_request
+from pyklip_diffrender.pattern import PatternRequest, as_request
 from pyklip_diffrender.refinement import GaussNewton, to_jansky
-from pyklip_diffrender.scene.systematics import Systematics
 
 __all__ = ["ReduceOptions"]
 
@@ -31,13 +29,14 @@ class ReduceOptions:
     ----------
     size : int
         Side in pixels of the square about the star that is fitted.
-    systematics : Systematics, path, "auto", "references" or "off"
-        Flat-field pattern, or a file with one (``systematics.fits``). "auto" takes that of the
-        library (see `known_systematics`), and fits the reference stars only where there is none
-        for these pixels; "references" fits them in any case and uses both. A fit that shows less
-        than half of the library's pattern is repeated without the library. Where nothing is known,
-        rolls of the same pixels share a pattern of which only the size is known. With "off" there
-        is no pattern.
+    systematics : Systematics, PatternLibrary, path, "auto", "references" or "off"
+        Flat-field pattern, or a file with one (``systematics.fits``); or a library of patterns to
+        search besides the package's, its file, or a folder of such files. "auto" takes the pattern
+        of the package's library (see `known_systematics`), and fits the reference stars only where
+        there is none for these pixels; "references" fits them in any case and uses both. A fit that
+        shows less than half of a library's pattern is repeated without libraries. Where nothing is
+        known, rolls of the same pixels share a pattern of which only the size is known. With "off"
+        there is no pattern.
     settings : GaussNewton, optional
         Settings of the fits; default those of `refine`.
     threshold : float
@@ -84,7 +83,7 @@ class ReduceOptions:
     UnitError, ShapeError, NonFiniteError
         For a flux density, an error or a memory that is none.
     CorruptFileError
-        For a file of `systematics` that is missing or damaged.
+        For a file or folder of `systematics` that is damaged or has no pattern.
 
     Examples
     --------
@@ -125,7 +124,7 @@ class ReduceOptions:
             object.__setattr__(self, "star_flux", to_jansky(self.star_flux))
         if self.memory is not None:
             object.__setattr__(self, "memory", to_bytes(self.memory, "memory"))
-        object.__setattr__(self, "systematics", _pattern(self.systematics))
+        object.__setattr__(self, "systematics", as_request(self.systematics))
 
     @classmethod
     def from_keywords(cls, keywords: Mapping[str, Any]) -> Self:
@@ -153,18 +152,3 @@ def _require_whole(value: Any, name: str, least: int) -> None:
         raise IncompatibleSetupError(
             f"{name}: got {value!r}, expected a whole number of at least {least}"
         )
-
-
-def _pattern(systematics: Any) -> PatternRequest:
-    """Read the pattern of a file; everything else is a request already."""
-    is_path = isinstance(systematics, str | os.PathLike)
-    if is_path and systematics not in ("auto", "references", "off"):
-        if not Path(systematics).is_file():
-            raise IncompatibleSetupError(
-                f"systematics: got {os.fspath(systematics)!r}, expected 'auto', 'references', "
-                "'off' or a systematics.fits that exists"
-            )
-        return Systematics.read(systematics)
-    require_request(systematics)
-    request: PatternRequest = systematics
-    return request

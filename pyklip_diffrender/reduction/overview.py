@@ -8,16 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-from astropy.convolution import Gaussian2DKernel, interpolate_replace_nans
 from astropy.table import QTable
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.detection import combine_frames, draw_curve
-from pyklip_diffrender.io.geometry import rotation_matrix
-from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.detection import draw_curve
+from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.sky_images import SkyImages
 
 __all__ = ["Klip", "Overview"]
 
@@ -78,48 +75,18 @@ class Overview:
 
     Parameters
     ----------
-    reduction : Reduction
+    images : SkyImages
     klip : Klip, optional
     """
 
-    def __init__(self, reduction: Reduction, klip: Klip | None) -> None:
-        detection = reduction.detection
-        self._detection, self.klip = detection, klip
-        self._templates = detection.groups[0][1]
-        observation = detection.observation
-        self._oriented = observation.position_angles is not None
-        self._unit = drawing.unit_label(observation.unit)
-        to_sky = rotation_matrix(detection.north)
-        half = max(observation.shape) // 2
-        y, x = np.mgrid[-half : half + 1, -half : half + 1]
-        scale = np.sqrt(np.prod(observation.pixelscale))
-        self.grid = scale * np.stack([x, y], axis=-1)
-        self._on_frame = self.grid @ to_sky
-        table = detection.table
-        self._places = np.stack([table["x"].value, table["y"].value], axis=1) @ to_sky.T
+    def __init__(self, images: SkyImages, klip: Klip | None) -> None:
+        self.images, self.klip = images, klip
+        detection = images.detection
+        self._detection = detection
+        self._unit = drawing.unit_label(detection.observation.unit)
+        table = detection.candidates
+        self._places = np.stack([table["x"].value, table["y"].value], axis=1) @ images.to_sky.T
         self._labels = [f"S/N {each:.1f}" for each in table["snr"]]
-        self.image, self._error = self._combined(reduction)
-
-    def _combined(self, reduction: Reduction) -> tuple[Image, Image]:
-        """Frames minus the star, and the error of their mean."""
-        images, errors = {}, {}
-        lights: Sequence[Any] = [0.0] * len(self._templates.frames)
-        if reduction.disk is not None:
-            lights = reduction.disk.light
-        left = zip(self._templates.frames.items(), self._detection.subtracted, lights, strict=True)
-        for (k, frame), subtracted, light in left:
-            filled = interpolate_replace_nans(subtracted, Gaussian2DKernel(1.0))
-            images[k] = np.nan_to_num(filled) + light
-            error = frame.observation.combined().error[0]
-            errors[k] = np.where(np.isfinite(subtracted), error, np.inf)
-        return combine_frames(self._templates, images, errors, self._on_frame)
-
-    def _snr(self) -> Image:
-        """The S/N map, interpolated."""
-        first = min(self._templates.frames)
-        places = self._templates.pixels_of(first, torch.from_numpy(self._on_frame.reshape(-1, 2)))
-        turned = map_coordinates(self._detection.snr, places, order=1, cval=np.nan)
-        return np.asarray(turned.reshape(self.grid.shape[:2]))
 
     @property
     def panels(self) -> int:
@@ -133,21 +100,21 @@ class Overview:
         ----------
         axes : sequence of `panels` Axes
         """
-        linear = _LINEAR * float(np.nanmedian(self._error))
+        mean, error = self.images.combined
+        image, grid = self.images.image, self.images.grid
+        north = 0.0 if self.images.oriented else None
         style: dict[str, Any] = {
-            "bar": self._unit, "linear": linear, "north": 0.0 if self._oriented else None,
-            "limit": float(np.nanmax(np.abs(self.image))), "places": self._places,
+            "bar": self._unit, "linear": _LINEAR * float(np.nanmedian(error)), "north": north,
+            "limit": float(np.nanmax(np.abs(mean))), "places": self._places,
         }  # fmt: skip
-        drawing.signed_image(axes[0], self.image, self.grid, title="Without the star", **style)
+        drawing.signed_image(axes[0], image, grid, title="Without the star", **style)
         if self.klip is not None:
-            image, grid, title = self.klip.image, self.klip.grid, self.klip.label
-            drawing.signed_image(axes[1], image, grid, title=title, **style)
+            title = self.klip.label
+            drawing.signed_image(axes[1], self.klip.image, self.klip.grid, title=title, **style)
             axes[1].set_xlim(axes[0].get_xlim())
             axes[1].set_ylim(axes[0].get_ylim())
-        drawing.snr_map(
-            axes[-1], self._snr(), self.grid, self._places, style["north"], title="S/N",
-            labels=self._labels,
-        )  # fmt: skip
+        snr = self.images.turned(self._detection.snr)
+        drawing.snr_map(axes[-1], snr, grid, self._places, north, title="S/N", labels=self._labels)
 
     def figure(self) -> Any:
         """One figure of all panels and the contrast curve."""

@@ -12,7 +12,7 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Detection, Disk, WideField, draw_curve, draw_search
 from pyklip_diffrender.reduction.html import Picture
 from pyklip_diffrender.reduction.overview import Overview
-from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.summary import wavefronts
 from pyklip_diffrender.reduction.words import number
 
@@ -43,7 +43,7 @@ def overview_pictures(overview: Overview, summary: Mapping[str, Any]) -> list[Pi
     words = [
         (
             f"Image of {summary['target']} without the star, all frames combined, {up}.",
-            f"All frames without the star, turned {up} and averaged. "
+            f"{overview.images.words}, {up}. "
             + ("Circles mark the candidates. " if count else "")
             + "The scale is linear near 0 and logarithmic beyond.",
         ),
@@ -124,7 +124,7 @@ def wide_pictures(wide: WideField) -> list[Picture]:
     """The S/N map of the whole frames, and the contrast curve to their edge."""
     figures, axes = _panels(2)
     draw_search(axes, wide)
-    count = len(wide.table)
+    count = len(wide.candidates)
     some = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {wide.threshold:g}"
     return _pictures(
         figures,
@@ -168,7 +168,7 @@ def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
     unit, count = drawing.unit_label(observation.unit), len(observation)
     subtracted = (
         " The star was estimated together with the candidates (circles), whose light is kept."
-        if len(detection.table)
+        if len(detection.candidates)
         else ""
     )
     mean = f", the mean of {count} integrations" if count > 1 else ""
@@ -234,7 +234,7 @@ def _star(detection: Detection, frame: int) -> list[Any]:
     for ax, image, title in ((axes[0], data, "Data"), (axes[1], part.star, "Model of the star")):
         drawing.star_image(ax, image, part.grid, norm, bar=unit, title=title, north=north)
     residual = detection.subtracted[frame] / noise
-    places = np.stack([detection.table["x"].value, detection.table["y"].value], axis=1)
+    places = np.stack([detection.candidates["x"].value, detection.candidates["y"].value], axis=1)
     drawing.signed_image(
         axes[2],
         residual,

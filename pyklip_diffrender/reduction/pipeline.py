@@ -23,7 +23,7 @@ from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern import PatternChoice, fit_with_pattern
 from pyklip_diffrender.reduction.options import ReduceOptions
-from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.refinement import (
     Refinement,
     refine,

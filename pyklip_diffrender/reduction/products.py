@@ -8,7 +8,6 @@ from pathlib import Path
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.io.files import replacing
-from pyklip_diffrender.reduction.injections import completeness_section, injections_section
 from pyklip_diffrender.reduction.overview import Klip, Overview
 from pyklip_diffrender.reduction.page import page
 from pyklip_diffrender.reduction.pictures import (
@@ -20,7 +19,9 @@ from pyklip_diffrender.reduction.pictures import (
     wavefront_pictures,
     wide_pictures,
 )
-from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.recovery_sections import completeness_section, injections_section
+from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.sky_images import SkyImages
 from pyklip_diffrender.reduction.summary import summarise
 
 __all__ = ["PRODUCTS", "existing_products", "write_products", "write_report"]
@@ -28,8 +29,9 @@ __all__ = ["PRODUCTS", "existing_products", "write_products", "write_report"]
 PRODUCTS = {
     "report.html": "this page",
     "summary.json": "the content of this page, for programs",
-    "detection.png": "the frames without the star, the S/N map and the contrast curve",
+    "detection.png": "the sky without the star, the S/N map and the contrast curve",
     "detection.fits": "maps, star-subtracted frames and candidates, for Detection.read",
+    "images.fits": "the sky without the star, its contrast and S/N, with north up",
     "candidates.ecsv": "the candidates with all columns",
     "contrast.ecsv": "the contrast curve",
     "astrometry.csv": "epoch and positions of the candidates, for orbitize!",
@@ -69,24 +71,25 @@ def write_products(
     -------
     list of Path
     """
-    written = reduction.detection.write(folder)
+    written = reduction.detection.write(folder, overwrite=True)
     if fit:
         # The fit that was searched: with the candidates in the model, if the star was fitted again.
         searched = reduction.detection.fits[0]
-        written.append(searched.write(folder / "fit.fits", linear=derivatives))
+        written.append(searched.write(folder / "fit.fits", linear=derivatives, overwrite=True))
     if reduction.wide is not None:
-        written += reduction.wide.write(folder)
+        written += reduction.wide.write(folder, overwrite=True)
     if reduction.disk is not None:
-        written.append(reduction.disk.write(folder))
+        written.append(reduction.disk.write(folder, overwrite=True))
     if reduction.systematics is not None:
-        written.append(reduction.systematics.write(folder / "systematics.fits"))
+        written.append(reduction.systematics.write(folder / "systematics.fits", overwrite=True))
     tables = {"injections": reduction.injections, "completeness": reduction.completeness}
     for name, table in tables.items():
         if table is not None:
             written.append(folder / f"{name}.ecsv")
             with replacing(written[-1]) as temporary:
                 table.write(temporary, format="ascii.ecsv", overwrite=True)
-    overview = Overview(reduction, Klip.of(reduction))
+    overview = Overview(SkyImages(reduction), Klip.of(reduction))
+    written.append(overview.images.write(folder / "images.fits"))
     written.append(folder / "detection.png")
     drawing.save(overview.figure(), written[-1])
     written += _write_report(reduction, overview, folder, written)
@@ -110,7 +113,8 @@ def write_report(reduction: Reduction, folder: Path, files: Iterable[Path] = ())
     -------
     list of Path
     """
-    return _write_report(reduction, Overview(reduction, Klip.of(reduction)), folder, files)
+    overview = Overview(SkyImages(reduction), Klip.of(reduction))
+    return _write_report(reduction, overview, folder, files)
 
 
 def _write_report(

@@ -18,7 +18,7 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
-from pyklip_diffrender.reduction.result import Reduction
+from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.words import advice, sentence
 from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement
 from pyklip_diffrender.scene.observation import Observation
@@ -185,7 +185,7 @@ def _rows(table: QTable) -> list[dict[str, Any]]:
 
 def _candidates(reduction: Reduction) -> list[dict[str, Any]]:
     """Candidates; those that look like extended light have no false-alarm probability."""
-    rows = _rows(reduction.detection.table)
+    rows = _rows(reduction.detection.candidates)
     if reduction.extended:
         rows = [each | {"false_alarm_probability": None} for each in rows]
     return rows
@@ -193,7 +193,7 @@ def _candidates(reduction: Reduction) -> list[dict[str, Any]]:
 
 def _wide_field(wide: WideField) -> dict[str, Any]:
     """Candidates and limits in the whole frames."""
-    return {"candidates": _rows(wide.table), "contrast_curve": _curve(wide.contrast_curve)}
+    return {"candidates": _rows(wide.candidates), "contrast_curve": _curve(wide.contrast_curve)}
 
 
 def _disk(disk: Disk) -> dict[str, Any]:

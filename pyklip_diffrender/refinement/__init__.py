@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from pyklip_diffrender.refinement.continuation import refine_again
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
-from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.result import Refinement
-from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
-from pyklip_diffrender.refinement.star_flux import (
+from pyklip_diffrender.refinement.flux_scale import (
     jansky_per_unit,
     require_calibrated,
     star_flux_error,
     to_jansky,
     with_star_flux,
 )
+from pyklip_diffrender.refinement.frame_fit import FrameFit
+from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.refinement.status import Status
 
 __all__ = [

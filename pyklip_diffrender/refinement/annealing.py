@@ -28,11 +28,11 @@ from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.companions import bright_companions
 from pyklip_diffrender.refinement.conclusion import conclude
 from pyklip_diffrender.refinement.correlated_error import fitted_correlated_error
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.mode_priors import ModePriors, count_modes_below
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.outliers import isolated_outliers
 from pyklip_diffrender.refinement.problem import Problem
-from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.solver import Solver
 from pyklip_diffrender.refinement.status import Status
@@ -382,6 +382,8 @@ class Annealing:
     def _significant(self, course: _Course) -> list[Planet]:
         """Companions in the residual of the alignment."""
         most, threshold = self._room(course), self.settings.companion_threshold
+        if most < 1 and self.settings.companions_if_stalled:
+            most, threshold = min(1, most + _MOST_BRIGHT), _BRIGHT
         return bright_companions(
             self.objective, course.state, course.kappa, most=most, threshold=threshold
         )

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.objective import State
-from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.solver import Solver
 from pyklip_diffrender.refinement.status import Status

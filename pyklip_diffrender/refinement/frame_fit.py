@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement.storage import image, observation_hdus, observation_of
+from pyklip_diffrender.refinement.fit_file import image, observation_hdus, observation_of
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import world_coordinates
 

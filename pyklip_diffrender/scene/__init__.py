@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
-from pyklip_diffrender.scene.noise import calibrated_errors
+from pyklip_diffrender.scene.measured_noise import calibrated_errors
 from pyklip_diffrender.scene.objects import (
     ALPHA_PICTORIS_W2,
     PAPER_SEGMENT_GAP,

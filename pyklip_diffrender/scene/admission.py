@@ -16,13 +16,14 @@ from pyklip_diffrender.io.names import same_name, unknown_name
 from pyklip_diffrender.scene.catalogue_star import CatalogueStar
 from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.frame_files import FrameFile, admissible, require_some
-from pyklip_diffrender.scene.noise import why_odd_noise
+from pyklip_diffrender.scene.measured_noise import why_odd_noise
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.pixel_checks import (
     copies,
     why_no_star,
     why_odd_unit,
     why_other_brightness,
+    why_turned,
 )
 
 __all__ = [
@@ -30,10 +31,12 @@ __all__ = [
     "choose_filter",
     "choose_target",
     "compare_brightness",
+    "compare_orientation",
     "epochs_of",
     "exclude_copies",
     "exclude_other_setups",
     "exclude_unoriented",
+    "frames_by_star",
     "judge_frames",
 ]
 
@@ -73,7 +76,7 @@ def choose_target(
         If the target cannot be decided, with the choices.
     """
     usable = admissible(files)
-    stars = _by_star(usable)
+    stars = frames_by_star(usable)
     for star, frames in stars.items():
         for each in frames:
             each.star = star
@@ -150,7 +153,7 @@ def _require_no_lost_target(
         )
 
 
-def _by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
+def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
     """Group frames by star, by the proposer's name that most of them have."""
     groups: list[list[FrameFile]] = []
     for each in files:
@@ -266,7 +269,25 @@ def compare_brightness(
         If half of the frames or more are, and nothing says which are right.
     """
     usable = admissible(files)
-    odd = why_other_brightness([_known(frames[id(each)]) for each in usable])
+    _exclude(usable, why_other_brightness([_known(frames[id(each)]) for each in usable]))
+
+
+def compare_orientation(
+    files: Iterable[FrameFile], frames: Mapping[int, Observation | None]
+) -> None:
+    """Exclude frames whose pixels are mirrored or turned, unlike those of most others.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If half of the frames or more are, and nothing says which are right.
+    """
+    usable = admissible(files)
+    _exclude(usable, why_turned([_known(frames[id(each)]) for each in usable]))
+
+
+def _exclude(usable: Sequence[FrameFile], odd: Mapping[int, str]) -> None:
+    """Exclude frames with a reason, by index, if those without one can be right."""
     if 2 * len(odd) >= len(usable) and odd and not usable[0].exposure.reference:
         names = ", ".join(each.name for each in usable)
         raise IncompatibleSetupError(

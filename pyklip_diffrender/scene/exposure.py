@@ -14,6 +14,7 @@ from astropy.io import fits
 from astropy.time import Time
 
 from pyklip_diffrender.errors import CorruptFileError
+from pyklip_diffrender.io.geometry import full_circle, half_circle
 from pyklip_diffrender.io.headers import (
     card_error,
     day_and_time,
@@ -255,7 +256,7 @@ def is_reference(header: fits.Header) -> bool | None:
 
 
 def position_angle(header: fits.Header, name: str) -> float | None:
-    """Position angle of the +y axis of a JWST image, degrees east of north.
+    """Position angle of the +y axis of a JWST image, degrees east of north, from 0 to 360.
 
     It is ROLL_REF with V3I_YANG, the angle from V3 to +y. Where the latter is missing, PA_APER
     states the sum.
@@ -276,12 +277,12 @@ def position_angle(header: fits.Header, name: str) -> float | None:
     if roll is None:
         return None
     if angle is None:
-        return total
+        return None if total is None else full_circle(total)
     # -1 for every detector of JWST, in which x goes opposite to V2.
     turned = roll - angle * (-1.0 if parity is None else parity)
-    if total is not None and abs((turned - total + 180) % 360 - 180) > _SAME_ANGLE:
+    if total is not None and abs(half_circle(turned - total)) > _SAME_ANGLE:
         raise card_error(name, "PA_APER", total, f"{turned:.3f}, by ROLL_REF and V3I_YANG")
-    return turned
+    return full_circle(turned)
 
 
 def beginning(header: fits.Header, name: str) -> Time | None:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, uniform_filter
 from scipy.stats import median_abs_deviation
 
+from pyklip_diffrender.io.geometry import half_circle
+
 __all__ = ["Judgement", "empty_integrations", "judge_integrations", "judge_pointings", "pointings"]
 
 Stack = NDArray[np.float64]
@@ -239,7 +241,7 @@ def pointings(center: Stack, angles: NDArray[np.float64] | None) -> Iterator[NDA
     while left.any():
         first = int(np.argmax(left))
         apart = np.hypot(*(center - center[first]).T)
-        turned = np.abs((turns - turns[first] + 180) % 360 - 180)
+        turned = np.abs(half_circle(turns - turns[first]))
         group = left & (apart <= _SAME_PLACE) & (turned <= _SAME_ANGLE)
         left &= ~group
         yield np.flatnonzero(group)

@@ -12,6 +12,7 @@ from typing import Any
 
 from astropy import units as u
 
+from pyklip_diffrender.io.geometry import full_circle
 from pyklip_diffrender.io.units import ARCSEC, set_numbers, to_arcsec, to_number, to_pair
 
 __all__ = [
@@ -123,7 +124,8 @@ class Planet:
     separation : float
         arcsec.
     position_angle : float
-        Degrees, counter-clockwise from +y of the image.
+        Degrees, counter-clockwise from +y of the image: east of north where north is up. Kept from
+        0 to 360.
 
     Raises
     ------
@@ -149,6 +151,7 @@ class Planet:
             separation=(u.arcsec, "not negative"),
             position_angle=(u.deg, "any"),
         )
+        object.__setattr__(self, "position_angle", full_circle(self.position_angle))
 
     @classmethod
     def from_offset(cls, contrast: float, x: Any, y: Any) -> Planet:

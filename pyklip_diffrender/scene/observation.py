@@ -18,14 +18,14 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
     ShapeError,
 )
-from pyklip_diffrender.io.geometry import rotation_matrix
+from pyklip_diffrender.io.geometry import full_circle, half_circle, rotation_matrix
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.catalogue_star import star_of
 from pyklip_diffrender.scene.checked_frames import checked_frames
 from pyklip_diffrender.scene.exposure import instrument_of
 from pyklip_diffrender.scene.integrations import judge_pointings, pointings
 from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints, without_empty
-from pyklip_diffrender.scene.noise import calibrated_errors, weighted_mean
+from pyklip_diffrender.scene.measured_noise import calibrated_errors, weighted_mean
 from pyklip_diffrender.scene.window import Window
 
 __all__ = ["Observation"]
@@ -56,7 +56,8 @@ class Observation:
     mid_date : Time or None
         Middle of the exposure, UTC.
     position_angles : ndarray, (frames,), or None
-        Position angles of the +y axis, degrees east of north; None where they are not known.
+        Position angles of the +y axis, degrees east of north, from 0 to 360; None where they are
+        not known.
     star_offset : tuple of float or None
         x, y of the star relative to the occulter from the file, arcsec; the start of a fit.
     reference : bool
@@ -103,6 +104,10 @@ class Observation:
     header: fits.Header = field(default_factory=fits.Header)
     remarks: tuple[str, ...] = ()
     noise_ratios: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.position_angles is not None:
+            object.__setattr__(self, "position_angles", full_circle(self.position_angles))
 
     @classmethod
     def from_arrays(
@@ -170,8 +175,8 @@ class Observation:
         of aligned frames (IMSHIFTS, or CENTER_SHIFT and ALIGN_SHIFT): they are undone, so that the
         pixels are those of the detector, whose flat-field errors then stay in their pixels.
         Errors of NIRCam frames are corrected for the noise that is measured far from the star, see
-        `pyklip_diffrender.scene.noise.calibrated_errors`. Integrations that are empty are left out,
-        and three or more are compared with each other, see
+        `pyklip_diffrender.scene.measured_noise.calibrated_errors`. Integrations that are empty are
+        left out, and three or more are compared with each other, see
         ``scene.integrations.judge_integrations``; `remarks` says what was left out.
 
         Parameters
@@ -313,7 +318,7 @@ class Observation:
 
     @property
     def position_angle(self) -> float:
-        """Position angle of the first frame, degrees; 0 where it is not known."""
+        """Position angle of the first frame's +y axis, degrees east of north; 0 if not known."""
         return 0.0 if self.position_angles is None else float(self.position_angles[0])
 
     def roll_from(self, other: Observation) -> float:
@@ -322,11 +327,12 @@ class Observation:
         Returns
         -------
         float
-            Degrees, counter-clockwise on the detector; 0 if either has no position angle.
+            Degrees, counter-clockwise on the detector, from -180 to 180; 0 if either has no
+            position angle.
         """
         if self.position_angles is None or other.position_angles is None:
             return 0.0
-        return other.position_angle - self.position_angle
+        return half_circle(other.position_angle - self.position_angle)
 
     def turned(self, places: ArrayLike, other: Observation) -> NDArray[np.float64]:
         """Rotate positions beside the star in another observation to where they are in this one.

@@ -7,18 +7,25 @@ pointing of the telescope.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from astropy import units as u
 from numpy.typing import NDArray
-from scipy.ndimage import convolve
+from scipy.ndimage import convolve, shift
 from scipy.stats import median_abs_deviation
 
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.star_place import center_of_symmetry, stamp_about
 
-__all__ = ["brightness", "copies", "why_no_star", "why_odd_unit", "why_other_brightness"]
+__all__ = [
+    "brightness",
+    "copies",
+    "why_no_star",
+    "why_odd_unit",
+    "why_other_brightness",
+    "why_turned",
+]
 
 Image = NDArray[np.float64]
 
@@ -49,6 +56,23 @@ _FAR = 3.0
 
 _SCATTER = (1e-3, 20.0)
 """Plausible scatter far from the star, MJy/sr, for exposures of a second to a day."""
+
+_SPECKLES = 1.5
+"""Radius, arcsec, in which the diffraction patterns of frames are compared."""
+
+_TURNED = 0.1
+"""Gain in correlation above which frames are not of one orientation. Real frames of one filter
+correlate by 0.99, mirrored or turned ones by 0.2 to 0.7."""
+
+_SYMMETRIES: dict[str, Callable[[Image], Image]] = {
+    "mirrored left to right": lambda image: image[:, ::-1],
+    "mirrored upside down": lambda image: image[::-1],
+    "turned by 180 degrees": lambda image: image[::-1, ::-1],
+    "turned by 90 degrees": np.rot90,
+    "turned by 270 degrees": lambda image: np.rot90(image, 3),
+    "transposed": np.transpose,
+    "transposed and turned by 180 degrees": lambda image: image[::-1, ::-1].T,
+}
 
 _NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
 
@@ -128,6 +152,63 @@ def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
                 "unit (BUNIT) or a factor is probably wrong, or the star is not behind the mask"
             )
     return reasons
+
+
+def why_turned(observations: Sequence[Observation]) -> dict[int, str]:
+    """Find frames whose pixels are mirrored or turned, unlike those of most others.
+
+    The telescope, and with it the star's diffraction pattern, has one orientation on the detector.
+
+    Parameters
+    ----------
+    observations : sequence of Observation
+        Of one set-up. Frames that are too small are not compared.
+
+    Returns
+    -------
+    dict of int to str
+        Reason by index. Where half of the frames or more have one, nothing says which are right.
+    """
+    patterns = {k: each for k, each in enumerate(map(_pattern, observations)) if each is not None}
+    different: dict[int, list[str]] = {k: [] for k in patterns}
+    for k, pattern in patterns.items():
+        for j in patterns:
+            operation = _turn(pattern, patterns[j])
+            if j != k and operation:
+                different[k].append(operation)
+    return {
+        k: f"its pixels are {operations[0]}: the diffraction pattern of the star is that of the "
+        "other frames when this is undone. Use the file as MAST delivers it"
+        for k, operations in different.items()
+        if 2 * len(operations) > len(patterns) - 1
+    }
+
+
+def _pattern(observation: Observation) -> Image | None:
+    """Square root of the image with the star in the middle."""
+    stamp = _stamp(observation)
+    if stamp is None:
+        return None
+    image, _, noise = stamp
+    x, y = center_of_symmetry(np.where(np.abs(image) > 3 * noise, image, 0.0))
+    image = shift(image, (-y, -x), order=1)
+    reach, middle = int(_SPECKLES / np.mean(observation.pixelscale)), len(image) // 2
+    window = slice(max(middle - reach, 0), middle + reach + 1)
+    image = image[window, window]
+    return np.sign(image) * np.sqrt(np.abs(image))
+
+
+def _turn(pattern: Image, other: Image) -> str:
+    """What was done to a pattern that another one did not undergo; empty if nothing was."""
+    if pattern.shape != other.shape:
+        return ""
+
+    def likeness(image: Image) -> float:
+        return float(np.corrcoef(image.ravel(), other.ravel())[0, 1])
+
+    likenesses = {name: likeness(undo(pattern)) for name, undo in _SYMMETRIES.items()}
+    best = max(likenesses, key=lambda name: likenesses[name])
+    return best if likenesses[best] > likeness(pattern) + _TURNED else ""
 
 
 def why_odd_unit(observation: Observation) -> str:

@@ -18,6 +18,7 @@ from pyklip_diffrender.scene.admission import (
     choose_filter,
     choose_target,
     compare_brightness,
+    compare_orientation,
     epochs_of,
     exclude_copies,
     exclude_other_setups,
@@ -193,6 +194,7 @@ class Sequence:
         frames = {id(each): each.read() for each in together if not each.reason}
         judge_frames([each for each in together if not each.reason], frames)
         exclude_copies(together, frames)
+        compare_orientation(together, frames)
         for group in (science, *_by_star(others)):
             compare_brightness(group, frames)
         exclude_unoriented(science)

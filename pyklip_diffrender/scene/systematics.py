@@ -13,7 +13,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError, ShapeError
-from pyklip_diffrender.io.files import open_fits, write_fits
+from pyklip_diffrender.io.files import open_fits, require_new, write_fits
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
@@ -169,8 +169,21 @@ class Systematics:
             },
         )
 
-    def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write to a FITS file, atomically; an existing one is replaced."""
+    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+        """Write to a FITS file, atomically.
+
+        Parameters
+        ----------
+        path : path
+        overwrite : bool
+            Replace an existing file.
+
+        Raises
+        ------
+        ExistingFileError
+            If the file exists, and `overwrite` is False; it is also an `OSError`.
+        """
+        require_new([path], overwrite)
         write_fits(fits.HDUList([fits.PrimaryHDU(), *self.to_hdus()]), path)
         return Path(path)
 

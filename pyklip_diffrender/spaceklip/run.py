@@ -21,10 +21,10 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.units import require_bound
-from pyklip_diffrender.pyklip_backend.jwst_files import reduce_jwst_files
+from pyklip_diffrender.pyklip_backend.reduce_files import reduce_jwst_files
 from pyklip_diffrender.refinement import to_jansky, with_star_flux
 from pyklip_diffrender.scene.sequence import Sequence
-from pyklip_diffrender.spaceklip.products import (
+from pyklip_diffrender.spaceklip.database_files import (
     complete_header,
     write_contrast,
     write_database,
@@ -270,8 +270,8 @@ def _reduced(
         write_rolls(product, dataset, files[kinds == "SCI"])
     write_snr(folder / f"{prefix}-snr.fits", detection, product)
     write_contrast(product, detection)
-    detection.write(folder / prefix)
-    detection.fits[0].write(folder / prefix / "fit.fits")
+    detection.write(folder / prefix, overwrite=True)
+    detection.fits[0].write(folder / prefix / "fit.fits", overwrite=True)
     source_table(detection, product).write(
         folder / f"{prefix}-results.ecsv", format="ascii.ecsv", overwrite=True
     )

@@ -33,7 +33,7 @@ def source_table(detection: Detection, product: Path) -> Table:
         contrasts to the star. What depends on the star's magnitude is NaN, and so are the
         throughputs, which the contrasts include.
     """
-    table = detection.table
+    table = detection.candidates
     count = len(table)
     unknown = np.full(count, np.nan)
 

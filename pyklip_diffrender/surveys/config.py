@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.geometry import full_circle
 from pyklip_diffrender.io.opd_map import FLAT
 
 __all__ = ["Config", "Injections", "Options", "SequenceConfig", "read_config"]
@@ -39,7 +40,8 @@ class Options:
     size : int
     threshold : float
     systematics : str
-        "auto", "references", "off", or the path of a file of `Systematics.write`.
+        "auto", "references", "off", or the path of a file of `Systematics.write`, of a library of
+        patterns, or of a folder with such libraries.
     wide, disk, completeness : bool
         Search the whole frames as well, fit extended light together with the star, and compute the
         fraction of planets that the search finds.
@@ -294,7 +296,7 @@ def _options(table: _Table, default: Options) -> Options:
 
     pattern = table.take(
         "systematics", default.systematics,
-        "'auto', 'references', 'off' or a systematics.fits that exists", systematics,
+        "'auto', 'references', 'off', or an existing file or folder with patterns", systematics,
     )  # fmt: skip
     wide, disk, completeness = (
         table.take(key, getattr(default, key), "true or false", _flag)
@@ -348,7 +350,7 @@ def _injections(table: _Table, default: Injections) -> Injections:
     if own and bool(contrasts) != bool(separations):
         table.complain("", "one of contrasts and separations", "both, or neither")
     table.finish()
-    return Injections(contrasts, separations, angles)
+    return Injections(contrasts, separations, tuple(map(full_circle, angles)))
 
 
 # -- values ----------------------------------------------------------------------------------------

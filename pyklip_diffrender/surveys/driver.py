@@ -191,7 +191,7 @@ class _Board:
         IncompatibleSetupError
             If the output cannot be written to.
         """
-        from pyklip_diffrender.surveys.page import page
+        from pyklip_diffrender.surveys.survey_page import page
 
         text = page([(job, self.records.get(job.key)) for job in self.todo], self.output.name)
         folder = None

@@ -162,7 +162,7 @@ def _job(
     digest: Callable[[Path], str],
 ) -> Job:
     pattern, star = sequence.options.systematics, sequence.options.star_flux
-    known = [] if pattern in ("auto", "references", "off") else [Path(pattern)]
+    known = [] if pattern in ("auto", "references", "off") else _files((Path(pattern),))
     maps = [] if str(opd) == FLAT else [opd]
     inputs = {str(path): digest(path) for path in (*files, *maps, *known)}
     facts = {
@@ -173,7 +173,9 @@ def _job(
         "filter": sequence.filter,
         "size": sequence.options.size,
         "threshold": sequence.options.threshold,
-        "systematics": inputs.get(pattern, pattern),
+        "systematics": (
+            inputs.get(pattern) or sorted(inputs[str(path)] for path in known) or pattern
+        ),
         "settings": dict(sequence.options.settings),
         # Only where they are used, so that jobs of configurations without them keep their names.
         **{name: True for name in ("wide", "disk") if getattr(sequence.options, name)},

@@ -10,8 +10,8 @@ from astropy import units as u
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement.continuation import refine_again
+from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.result import Refinement
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [

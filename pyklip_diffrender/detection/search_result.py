@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import textwrap
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +21,16 @@ from numpy.typing import ArrayLike, NDArray
 from pyklip_diffrender import drawing
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection.calibration import calibration_errors
+from pyklip_diffrender.detection.candidate_tables import candidate_table, in_words, measured_table
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.detection_file import (
+    computed_of,
+    digest,
+    fit_beside,
+    groups_of_searched,
+    hdus_of,
+    searched_of,
+)
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.figure import draw_search
@@ -34,23 +43,16 @@ from pyklip_diffrender.detection.measurement import (
 from pyklip_diffrender.detection.orbits import write_astrometry
 from pyklip_diffrender.detection.relinearise import unconfirmed_companions
 from pyklip_diffrender.detection.sky import Sky
-from pyklip_diffrender.detection.storage import (
-    computed_of,
-    digest,
-    fit_beside,
-    groups_of_searched,
-    hdus_of,
-    searched_of,
-)
-from pyklip_diffrender.detection.tables import candidate_table, in_words, measured_table
 from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.io.files import replacing, write_fits
+from pyklip_diffrender.io.files import replacing, require_new, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.storage import reading
+from pyklip_diffrender.refinement.fit_file import reading
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["Detection"]
+__all__ = ["RENAMED", "Detection"]
+
+RENAMED = "{0}.table is deprecated and will be removed in version 1.0; use {0}.candidates"
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,9 @@ class Detection:
     error_factor : ErrorFactor
         Factor by which errors were multiplied, at every pixel; ``error_factor.at(0.5)`` is its
         median at 0.5 arcsec.
-    candidates : Candidates
+    sources : Candidates
+        The candidates with the covariance of all their values, as tensors; in the order in which
+        they were found.
     false_alarm : ndarray, (candidates,)
         Probability that noise alone makes a peak as significant as the candidate anywhere in the
         field; NaN where a fit does not explain its data.
@@ -105,8 +109,10 @@ class Detection:
     >>> frame = dr.simulate(model, scene, opd, seed=1)
     >>> fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=4))
     >>> detection = dr.detect(fit)
-    >>> print(f"{detection.table['separation'][0]:.2f}, S/N above 5: {len(detection.table)}")
-    0.50 arcsec, S/N above 5: 1
+    >>> len(detection.candidates)
+    1
+    >>> print(f"{detection.candidates['separation'][0]:.2f}")
+    0.50 arcsec
     """
 
     fits: tuple[Refinement, ...]
@@ -117,7 +123,7 @@ class Detection:
     snr: Image
     residual_snr: Image
     error_factor: ErrorFactor
-    candidates: Candidates
+    sources: Candidates
     false_alarm: Image
     rings: QTable
     threshold: float
@@ -133,7 +139,14 @@ class Detection:
 
     def __str__(self) -> str:
         """The candidates in words, at most 80 columns wide."""
-        return f"{in_words(self.table, self.threshold)}\n{textwrap.fill(self.remark, 80)}".rstrip()
+        words = in_words(self.candidates, self.threshold)
+        return f"{words}\n{textwrap.fill(self.remark, 80)}".rstrip()
+
+    @property
+    def table(self) -> QTable:
+        """Earlier name of `candidates`, deprecated."""
+        warnings.warn(RENAMED.format("Detection"), DeprecationWarning, stacklevel=2)
+        return self.candidates
 
     @property
     def remark(self) -> str:
@@ -144,7 +157,7 @@ class Detection:
     def _unconfirmed(self) -> str:
         if not self.fits:
             return ""
-        sources = unconfirmed_companions(self.fits, self.candidates)
+        sources = unconfirmed_companions(self.fits, self.sources)
         return " ".join(
             f"A possible source of contrast {contrast:.1e} at {math.hypot(x, y):.2f} arcsec was "
             "fitted with the star; the search does not confirm it."
@@ -171,11 +184,12 @@ class Detection:
             for each in fit.frames
             if not each.observation.reference
         )
-        return 1 + sum(high - low > 1 for low, high in itertools.pairwise(angles))
+        steps = np.diff(angles, append=angles[0] + 360)
+        return max(1, int((steps > 1).sum()))
 
     @property
     def _count(self) -> str:
-        count = len(self.candidates)
+        count = len(self.sources)
         return f"{count} candidate{'' if count == 1 else 's'}"
 
     def _repr_html_(self) -> str:
@@ -188,7 +202,7 @@ class Detection:
                 "Flux density of the star": None if star is None else f"{star:.3g} Jy",
                 "Errors multiplied by": f"{self.scatter:.3g}",
             },
-            self.table,
+            self.candidates,
             ("separation", "separation_error", "position_angle", "position_angle_error",
              "contrast", "contrast_error", "delta_mag", "snr"),
         )  # fmt: skip
@@ -214,8 +228,8 @@ class Detection:
         return Sky.of(self.fits, self.scatter)
 
     @cached_property
-    def table(self) -> QTable:
-        """The candidates, highest S/N first; every column has a description.
+    def candidates(self) -> QTable:
+        """Table of the candidates, highest S/N first; every column has a description.
 
         Columns are separation; position angle east of north (counter-clockwise from +y of the
         first frame if its orientation is not known); contrast; magnitude difference; S/N; the
@@ -230,20 +244,18 @@ class Detection:
         does not depend on the star's flux. The S/N includes neither, because they do not change the
         significance of a source.
         """
-        table = candidate_table(
-            self.candidates, self.error_factor, self._calibration_errors, self.sky
-        )
-        order = np.argsort(-self.candidates.snr(self.error_factor))
+        table = candidate_table(self.sources, self.error_factor, self._calibration_errors, self.sky)
+        order = np.argsort(-self.sources.snr(self.error_factor))
         table["false_alarm_probability"] = self.false_alarm[order]
         table["false_alarm_probability"].info.format = ".1e"
         table["false_alarm_probability"].info.description = "of a peak anywhere; NaN if not known"
-        table.meta = dict(self._provenance)
+        table.meta = dict(self.provenance)
         return table
 
     @cached_property
     def _calibration_errors(self) -> Image:
         """Relative calibration errors of the candidates' contrasts and fluxes, (2, k)."""
-        candidates = self.candidates
+        candidates = self.sources
         factors = torch.from_numpy(self.error_factor.of(candidates.offsets))
         snr = candidates.contrasts / (factors * candidates.errors[:, 0])
         return calibration_errors(self.groups, candidates.offsets, snr, factors).numpy()
@@ -261,10 +273,10 @@ class Detection:
         Returns
         -------
         QTable
-            x, y, contrast, its error and S/N as in `table`; upper_limit, the contrast (at least 0)
-            plus `sigmas` errors, NaN where the S/N is `sigmas` or more; separation and position
-            angle, and what else is known of `table`. Positions are as given, without errors, and
-            the candidates are not removed from the data.
+            x, y, contrast, its error and S/N as in `candidates`; upper_limit, the contrast (at
+            least 0) plus `sigmas` errors, NaN where the S/N is `sigmas` or more; separation and
+            position angle, and the other columns of `candidates` that apply. Positions are as
+            given, without errors, and the candidates are not removed from the data.
 
         Raises
         ------
@@ -307,7 +319,7 @@ class Detection:
         `fits`, in the data's unit, and NaN where the data are masked; frames of one observation are
         averaged.
         """
-        return subtracted_frames(self.fits, self.groups, self.candidates)
+        return subtracted_frames(self.fits, self.groups, self.sources)
 
     @cached_property
     def _wcs(self) -> tuple[Header, ...]:
@@ -337,7 +349,8 @@ class Detection:
         return tuple(digest(fit) for fit in self.fits)
 
     @cached_property
-    def _provenance(self) -> dict[str, object]:
+    def provenance(self) -> dict[str, object]:
+        """Facts about the fits and the search, by name."""
         return {
             "software": f"pyklip_diffrender {__version__}",
             "observations": [f.observation.name for fit in self.fits for f in fit.frames],
@@ -371,30 +384,51 @@ class Detection:
         draw_search(axes, self)
         return np.array(axes)
 
-    def write(self, folder: str | os.PathLike[str]) -> list[Path]:
+    def write(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> list[Path]:
         """Write maps (FITS), candidates and contrast curve (ECSV); returns the paths.
 
         `read` needs only the first file, detection.fits. For frames with a date and a position
         angle there is also astrometry.csv, see `write_astrometry`.
+
+        Parameters
+        ----------
+        folder : path
+            Made if it does not exist.
+        overwrite : bool
+            Replace the files of an earlier detection.
+
+        Raises
+        ------
+        ExistingFileError
+            If one of the files exists, and `overwrite` is False; it is also an `OSError`.
         """
         folder = Path(folder)
-        maps = folder / "detection.fits"
+        maps, positions = folder / "detection.fits", folder / "astrometry.csv"
+        tables = {
+            folder / "candidates.ecsv": self.candidates,
+            folder / "contrast.ecsv": self.contrast_curve,
+        }
+        require_new([maps, *tables, positions], overwrite)
         write_fits(hdus_of(self), maps)
-        written = [maps]
-        for name, table in (("candidates", self.table), ("contrast", self.contrast_curve)):
-            path = folder / f"{name}.ecsv"
+        for path, table in tables.items():
             with replacing(path) as temporary:
                 table.write(temporary, format="ascii.ecsv", overwrite=True)
-            written.append(path)
-        if self.sky.north is not None and self.sky.mjd is not None:
-            written.append(self.write_astrometry(folder / "astrometry.csv"))
-        return written
+        if self.sky.north is None or self.sky.mjd is None:
+            positions.unlink(missing_ok=True)
+            return [maps, *tables]
+        return [maps, *tables, self.write_astrometry(positions, overwrite=overwrite)]
 
-    def write_astrometry(self, path: str | os.PathLike[str], *, format: str = "orbitize") -> Path:
+    def write_astrometry(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        format: str = "orbitize",
+        overwrite: bool = False,
+    ) -> Path:
         """Write epoch and positions of the candidates for a program that fits orbits.
 
-        Candidates are numbered in the order of `table`, which may differ between epochs. Errors
-        have no share of the pixel scale and of the roll angle; add those that you assume.
+        Candidates are numbered as in `candidates`, where their order may differ between epochs.
+        Errors have no share of the pixel scale and of the roll angle; add those that you assume.
 
         Parameters
         ----------
@@ -402,13 +436,17 @@ class Detection:
         format : "orbitize", "backtracks", "octofitter" or "orvara"
             The CSV file of orbitize! (MJD, mas, degrees), backtracks or Octofitter (MJD, mas), or
             the text file with relative astrometry of orvara (JD, arcsec, degrees).
+        overwrite : bool
+            Replace an existing file.
 
         Raises
         ------
+        ExistingFileError
+            If the file exists, and `overwrite` is False; it is also an `OSError`.
         IncompatibleSetupError
             If the frames have no date or no position angle.
         """
-        return write_astrometry(self.table, path, format)
+        return write_astrometry(self.candidates, path, format, overwrite=overwrite)
 
     @classmethod
     def read(

@@ -21,7 +21,7 @@ from pyklip_diffrender.detection.groups import Group, groups_of
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.storage import (
+from pyklip_diffrender.refinement.fit_file import (
     image,
     observation_hdus,
     observation_of,
@@ -80,17 +80,17 @@ def hdus_of(detection: Any) -> fits.HDUList:
         "false_alarm": detection.false_alarm,
         "rings": _table_facts(detection.rings),
         "rolls": detection.rolls,
-        "candidates": vars(detection.candidates),
+        "candidates": vars(detection.sources),
         "calibration_errors": detection._calibration_errors,
         "sky": vars(detection.sky),
         "contrast_curve": _table_facts(detection.contrast_curve),
         "observation": about,
-        "provenance": detection._provenance,
+        "provenance": detection.provenance,
         "fits": detection._digests,
     }
     return fits.HDUList(
         [
-            primary_hdu(detection.observation, detection._provenance, detection.sky.mjd),
+            primary_hdu(detection.observation, detection.provenance, detection.sky.mjd),
             *(
                 image_hdu(getattr(detection, attribute), name, "", wcs)
                 for name, attribute in _MAPS.items()
@@ -148,7 +148,7 @@ def searched_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
     """
     return {
         "threshold": facts["threshold"],
-        "candidates": _candidates_of(facts["candidates"]),
+        "sources": _candidates_of(facts["candidates"]),
         "false_alarm": np.array(facts["false_alarm"], dtype=float),
         "rings": _table_of(facts["rings"]),
         "contrast_curve": described(_table_of(facts["contrast_curve"])),

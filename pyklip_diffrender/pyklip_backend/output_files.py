@@ -18,8 +18,8 @@ from astropy.time import Time
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.io.headers import fits_text
-from pyklip_diffrender.pyklip_backend.frames import Frames
-from pyklip_diffrender.pyklip_backend.images import ProductImages
+from pyklip_diffrender.pyklip_backend.dataset_frames import Frames
+from pyklip_diffrender.pyklip_backend.product_images import ProductImages
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
 from pyklip_diffrender.wavefront.opd import OPDMap
 

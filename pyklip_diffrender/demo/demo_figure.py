@@ -78,7 +78,7 @@ def _draw_changes(axes: Any, result: DemoResult) -> None:
 
 def _strongest(result: DemoResult) -> str:
     """Describe the strongest candidate."""
-    table, truth = result.detection.table, result.scene.planets[0].contrast
+    table, truth = result.detection.candidates, result.scene.planets[0].contrast
     if not len(table):
         return f"nothing above {result.detection.threshold:g} sigma"
     return (

@@ -28,7 +28,7 @@ _AB_ZERO = float(u.AB.to(u.Jy))
 def candidate_table(
     candidates: Candidates, factor: ErrorFactor, calibration: Image, sky: Sky
 ) -> QTable:
-    """Make the table of candidates, highest S/N first; see `Detection.table`.
+    """Make the table of candidates, highest S/N first; see `Detection.candidates`.
 
     Parameters
     ----------

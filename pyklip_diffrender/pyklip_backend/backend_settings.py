@@ -30,6 +30,7 @@ from pyklip_diffrender.wavefront.map_choice import RULES, Rule, choose_map, wave
 from pyklip_diffrender.wavefront.opd import OPDMap, as_opd_map
 
 if TYPE_CHECKING:
+    from pyklip_diffrender.pattern import PatternLibrary
     from pyklip_diffrender.refinement import GaussNewton
     from pyklip_diffrender.scene.systematics import Systematics
 
@@ -89,10 +90,11 @@ class DiffrenderSettings:
         Settings of the fit; see `refine`.
     start : dict, optional
         Starting values by parameter name; see `refine`.
-    systematics : Systematics, "auto", "references" or "off", optional
+    systematics : Systematics, PatternLibrary, path, "auto", "references" or "off", optional
         Flat-field pattern. "auto", the default for real NIRCam frames, takes that of the
-        library, and fits the reference frames only where it has none; "references" fits them in
-        any case and uses both; see `reduce`. Reference frames are those of a psf_library that
+        package's library, and fits the reference frames only where it has none; "references" fits
+        them in any case and uses both; a library, its file, or a folder of such files is searched
+        besides the package's; see `reduce`. Reference frames are those of a psf_library that
         `JWSTData` has read, if the mode contains RDI, and any in the dataset.
     plan : "auto" or "off", optional
         Has no effect; see `refine`.
@@ -148,7 +150,7 @@ class DiffrenderSettings:
     seed: int | None = None
     fit: GaussNewton | None = None
     start: Mapping[str, Any] | None = None
-    systematics: Systematics | Literal["auto", "references", "off"] | None = None
+    systematics: Systematics | PatternLibrary | str | os.PathLike[str] | None = None
     plan: str | None = None
     keep_detected: bool | None = None
     image: Literal["cleaned", "flux", "subtracted"] | None = None

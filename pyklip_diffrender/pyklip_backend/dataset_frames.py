@@ -27,6 +27,7 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.instrument.masks import FILTERS, detector_place
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.pyklip_backend.admitted import admit
+from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings, settings_of
 from pyklip_diffrender.pyklip_backend.pointings import (
     FrameDetails,
     Pointing,
@@ -34,7 +35,6 @@ from pyklip_diffrender.pyklip_backend.pointings import (
     pointings_of,
 )
 from pyklip_diffrender.pyklip_backend.recorded import NotRecordedError, recorded_frames
-from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings, settings_of
 from pyklip_diffrender.pyklip_backend.source import (
     ATTRIBUTE,
     SourceFrames,

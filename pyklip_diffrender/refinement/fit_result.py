@@ -19,17 +19,14 @@ from torch import Tensor
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.files import write_fits
+from pyklip_diffrender.io.files import require_new, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.linear.noise import UNCORRELATED, CorrelatedError
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.parameters import parameter
-from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.settings import GaussNewton
-from pyklip_diffrender.refinement.status import Status
-from pyklip_diffrender.refinement.storage import (
+from pyklip_diffrender.parameters import LEVELS, parameter
+from pyklip_diffrender.refinement.fit_file import (
     linear_hdus,
     linear_of,
     model_facts,
@@ -37,6 +34,9 @@ from pyklip_diffrender.refinement.storage import (
     reading,
     text_hdu,
 )
+from pyklip_diffrender.refinement.frame_fit import FrameFit
+from pyklip_diffrender.refinement.settings import GaussNewton
+from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.product_headers import primary_hdu
 from pyklip_diffrender.scene.systematics import Systematics
@@ -259,15 +259,18 @@ class Refinement:
     def parameters(self) -> QTable:
         """All parameters but the wavefront: frame, name, value, error, unit and description.
 
-        Only the beginning of a description is printed; the column has all of it.
+        The unit of flux, background and pedestal is that of the frame.
         """
         rows = []
         for k, frame in enumerate(self.frames):
             for name, value in frame.values.items():
                 entry = parameter(name)
-                for j, (number, error) in enumerate(zip(value, frame.errors[name], strict=True)):
-                    label = name if len(value) == 1 else f"{name}[{j}]"
-                    rows.append((k, label, number, error, entry.unit, entry.description))
+                unit = frame.observation.unit.to_string() if entry in LEVELS else entry.unit
+                labels = entry.labels()[: len(value)]
+                parts = zip(value, frame.errors[name], labels, strict=True)
+                for j, (number, error, label) in enumerate(parts):
+                    component = name if len(value) == 1 else f"{name}[{j}]"
+                    rows.append((k, component, number, error, unit, label))
         table = QTable(
             rows=rows,
             names=("frame", "name", "value", "error", "unit", "description"),
@@ -275,22 +278,24 @@ class Refinement:
         )
         for name in ("value", "error"):
             table[name].info.format = ".5g"
-        # Whole ones leave no room for the values in a terminal of 80 columns.
-        table["description"].info.format = "26.26s"
         return table
 
-    def write(self, path: str | os.PathLike[str], *, linear: bool = True) -> Path:
+    def write(
+        self, path: str | os.PathLike[str], *, linear: bool = True, overwrite: bool = False
+    ) -> Path:
         """Write the refinement to a FITS file that `read` reads.
 
         Extensions are PARAMETERS (a table), and for each frame DATA, ERROR, VALID, STAR,
         COMPANIONS, GAIN, OPD and COEFFICIENTS, numbered by EXTVER. Images of the sky have world
-        coordinates. The file is written atomically; an existing one is replaced.
+        coordinates. The file is written atomically.
 
         Parameters
         ----------
         path : path
         linear : bool
             Include the linear model, which `detect` needs and which takes most of the space.
+        overwrite : bool
+            Replace an existing file.
 
         Returns
         -------
@@ -298,15 +303,16 @@ class Refinement:
 
         Raises
         ------
+        ExistingFileError
+            If the file exists, and `overwrite` is False; it is also an `OSError`.
         IncompatibleSetupError
             For settings with a user-defined basis.
         """
+        require_new([path], overwrite)
         names = [frame.observation.name for frame in self.frames]
         about = {**self.summary(), "observations": names}
         primary = primary_hdu(self.frames[0].observation, about)
-        parameters = self.parameters
-        parameters["description"].info.format = None  # FITS has no such format.
-        hdus = fits.HDUList([primary, fits.BinTableHDU(parameters, name="PARAMETERS")])
+        hdus = fits.HDUList([primary, fits.BinTableHDU(self.parameters, name="PARAMETERS")])
         parts = [frame.to_hdus(k) for k, frame in enumerate(self.frames)]
         for _, extensions in parts:
             hdus.extend(extensions)

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from pyklip_diffrender.cli.estimate import describe_plan, size_of_products
-from pyklip_diffrender.cli.run import Run, with_options
+from pyklip_diffrender.cli.session import Run, with_options
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument.star_flux import star_flux_density
 from pyklip_diffrender.io.opd_map import OPDMap
@@ -26,7 +26,7 @@ from pyklip_diffrender.wavefront.map_choice import Rule, choose_map
 from pyklip_diffrender.wavefront.opd import as_opd_map
 from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
 
-__all__ = ["run_reduction"]
+__all__ = ["map_for", "run_reduction"]
 
 _MAST = "mast"
 """Value of --opd for maps that come from MAST."""
@@ -75,7 +75,7 @@ def run_reduction(
                 run.claim_folder(folder, tuple(PRODUCTS), overwrite)
                 click.echo(f"\nepoch {folder.name}, {len(sequences)} in all:")
             _show(sequence)
-            map_ = _map(sequence, opd, opd_date)
+            map_ = map_for(sequence, opd, opd_date)
             click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
             prepared.append(prepare(sequence, map_, checked))
             if dry_run:
@@ -122,7 +122,7 @@ def _show(sequence: Sequence) -> None:
         click.echo(f"left out: {name}: {reason}")
 
 
-def _map(sequence: Sequence, opd: str, rule: Rule | None) -> OPDMap:
+def map_for(sequence: Sequence, opd: str, rule: Rule | None) -> OPDMap:
     """The wavefront map that --opd and --opd-date ask for."""
     is_folder = Path(opd).is_dir() and opd != "flat"
     if opd != _MAST and not is_folder:

@@ -28,15 +28,19 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.pyklip_backend.admitted import library_files
+from pyklip_diffrender.pyklip_backend.backend_settings import (
+    DiffrenderSettings,
+    starting_opd,
+    thread_limit,
+)
 from pyklip_diffrender.pyklip_backend.checks import (
     check_arguments,
     check_dataset,
     check_settings,
 )
-from pyklip_diffrender.pyklip_backend.frames import Frames, date_of_frames, frames_of
-from pyklip_diffrender.pyklip_backend.images import image_of
+from pyklip_diffrender.pyklip_backend.dataset_frames import Frames, date_of_frames, frames_of
 from pyklip_diffrender.pyklip_backend.injections import subtract_from_copy
-from pyklip_diffrender.pyklip_backend.placement import (
+from pyklip_diffrender.pyklip_backend.klip_frames import (
     aligned_before,
     annuli_of,
     fill,
@@ -44,18 +48,14 @@ from pyklip_diffrender.pyklip_backend.placement import (
     place,
     slices,
 )
-from pyklip_diffrender.pyklip_backend.products import (
+from pyklip_diffrender.pyklip_backend.output_files import (
     ReductionRecord,
     folder_and_prefix,
     provenance,
     staging,
     stamp,
 )
-from pyklip_diffrender.pyklip_backend.settings import (
-    DiffrenderSettings,
-    starting_opd,
-    thread_limit,
-)
+from pyklip_diffrender.pyklip_backend.product_images import image_of
 from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE, attach_source
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction, subtract_by_refinement
 from pyklip_diffrender.pyklip_backend.throughput import (

@@ -10,7 +10,7 @@ from pathlib import Path
 from astropy.table import QTable
 
 from pyklip_diffrender.detection import Detection, Disk, WideField
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.files import require_new
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.reduction.extended import looks_extended
 from pyklip_diffrender.refinement import Refinement
@@ -59,7 +59,7 @@ class Reduction:
 
     >>> import pyklip_diffrender as dr
     >>> result = dr.reduce("calints", "maps", target="HIP 65426")  # doctest: +SKIP
-    >>> print(result.detection.table["separation", "contrast", "snr"])  # doctest: +SKIP
+    >>> print(result.detection.candidates["separation", "contrast", "snr"])  # doctest: +SKIP
     >>> result.write("products")  # doctest: +SKIP
     """
 
@@ -100,7 +100,7 @@ class Reduction:
             return ""
         resolution = curve.meta["resolution_arcsec"]
         edge = float(curve["separation"][-1].to_value("arcsec"))
-        return looks_extended(self.detection.table, resolution, edge)
+        return looks_extended(self.detection.candidates, resolution, edge)
 
     def __repr__(self) -> str:
         return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"
@@ -150,18 +150,12 @@ class Reduction:
 
         Raises
         ------
-        IncompatibleSetupError
-            If there are products in the folder, and `overwrite` is False.
+        ExistingFileError
+            If there are products in the folder, and `overwrite` is False; it is also an `OSError`.
         """
         # The one import against the order of the modules: the products know this class.
         from pyklip_diffrender.reduction.products import existing_products, write_products
 
         folder = Path(folder)
-        existing = existing_products(folder)
-        if existing and not overwrite:
-            raise IncompatibleSetupError(
-                f"{folder}: got a folder with {', '.join(each.name for each in existing)}, "
-                "expected one without products. Choose another, or replace them with "
-                "overwrite=True"
-            )
+        require_new(existing_products(folder), overwrite)
         return write_products(self, folder, derivatives=derivatives)

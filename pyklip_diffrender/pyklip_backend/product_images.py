@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from pyklip_diffrender.detection.maps import Maps
     from pyklip_diffrender.imaging import SkyModel
-    from pyklip_diffrender.pyklip_backend.settings import DiffrenderSettings
+    from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
     from pyklip_diffrender.pyklip_backend.subtract import Subtraction
     from pyklip_diffrender.refinement import FrameFit
 

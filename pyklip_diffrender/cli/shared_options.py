@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 from click.core import ParameterSource
 
-from pyklip_diffrender.cli.run import Run
+from pyklip_diffrender.cli.session import Run
 
 __all__ = [
     "COMMON",
     "Command",
+    "archive",
     "common",
     "file_type",
     "option",
     "outputs",
     "read_config",
+    "require_frames",
     "search",
     "wavefront",
 ]
@@ -206,6 +208,22 @@ def outputs(default: str | None = None, *, folder: bool = True) -> Decorator:
     return _all(*([output] if folder else []), _OVERWRITE, common, _WRITE_CONFIG)
 
 
+archive = _all(
+    option("--program", type=int, metavar="NUMBER", section="Frames",
+           help="Fetch the frames of this JWST programme from MAST, in place of FRAMES."),
+    option("--cache", type=file_type(), metavar="FOLDER", section="Frames",
+           help="Folder for fetched frames; default: in the user's cache."),
+)  # fmt: skip
+
+
+def require_frames(frames: Sequence[Path], program: int | None) -> None:
+    """Raise `click.UsageError` unless there are either files or a programme."""
+    if not frames and program is None:
+        raise click.UsageError("Missing argument 'FRAMES...', or the option --program.")
+    if frames and program is not None:
+        raise click.UsageError("Give either FRAMES or --program.")
+
+
 wavefront = _all(
     option("--opd", required=True, metavar="FILE|FOLDER|flat|mast", section="Wavefront map",
            help="Wavefront map to start from: a FITS file; a folder of maps, of which one is "
@@ -243,7 +261,8 @@ search = _all(
     option("--systematics", default="auto", show_default=True, metavar="CHOICE",
            section="Fit and search",
            help="Flat-field pattern: auto (the package's library, else the reference "
-           "stars), references (both), off, or a systematics.fits of an earlier reduction."),
+           "stars), references (both), off, a folder or file of patterns to search besides the "
+           "package's (command learn), or a systematics.fits of an earlier reduction."),
     option("--memory", metavar="SIZE", section="Fit and search",
            help='Memory that the process may take, such as "2 GB"; default: as much as it needs.'),
     option("--dry-run", is_flag=True, section="Output",

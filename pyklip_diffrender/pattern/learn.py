@@ -1,0 +1,374 @@
+"""Learn a library of flat-field patterns from the frames of many stars, and test it on each."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from astropy.table import QTable
+from numpy.typing import NDArray
+
+from pyklip_diffrender._version import __version__
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    DiffrenderError,
+    NoValidPixelsError,
+    RefinementError,
+)
+from pyklip_diffrender.io.names import same_name, unknown_name
+from pyklip_diffrender.io.opd_map import OPDMap
+from pyklip_diffrender.io.progress import numbered_stages, stage
+from pyklip_diffrender.pattern.library import PatternLibrary, known_systematics
+from pyklip_diffrender.pattern.measure import flat_of, measure_patterns
+from pyklip_diffrender.pattern.pedestal import pattern_pedestal
+from pyklip_diffrender.pattern.presence import pattern_size
+from pyklip_diffrender.refinement.fit_result import Refinement
+from pyklip_diffrender.refinement.fitting import refine
+from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
+from pyklip_diffrender.scene.admission import frames_by_star
+from pyklip_diffrender.scene.exposure import detector_of, image_mask
+from pyklip_diffrender.scene.frame_files import (
+    FrameFile,
+    admissible,
+    exclude_unusable,
+    exposures_in,
+    require_some,
+)
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
+from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.wavefront.map_choice import wavefront_for
+
+__all__ = ["learn_library"]
+
+_log = logging.getLogger(__name__)
+
+Files = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+
+_Fit = tuple[Refinement, tuple[float, float]]
+"""A fit, and how much of its pattern the frames show with the error of that."""
+
+_ALONE = 0.01
+"""Smallest model error, as a fraction of the star, in the fit of a star without a pattern."""
+
+_KNOWN = 0.002
+"""The same with the pattern of the other stars, whose own error is counted apart."""
+
+
+def learn_library(
+    files: Files,
+    opd: Any,
+    *,
+    stars: Sequence[str] = (),
+    filters: Sequence[str] = (),
+    size: int = 80,
+    settings: GaussNewton | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    device: str = "cpu",
+    progress: bool = False,
+) -> PatternLibrary:
+    """Learn the flat-field pattern from the frames of many stars.
+
+    Frames are sorted by star, epoch and set-up (detector, mask, filter, flat field). Every star is
+    fitted twice: alone, and then with the pattern that the first fits of the other stars show, so
+    that less of the wavefront's error is taken for the pattern. The library has the patterns of the
+    second fits. How much better they describe a star than fits without a pattern tells how much a
+    pattern is worth for a star that it was not learned from.
+
+    Companions are no part of the fits. With three frames or more, a companion of one star is
+    rejected as an outlier where the patterns are combined; leave out stars with disks, and stars
+    with bright companions if there are few others.
+
+    Parameters
+    ----------
+    files : path or sequence of path
+        As for `Sequence.from_files`, of any number of stars, epochs, filters and masks. Frames are
+        calibrated (MJy/sr), and say which pixels of the detector they have.
+    opd : path, OPDMap, Quantity, array, "flat" or callable
+        The wavefront to start from, as for `reduce`; a function gets the `Sequence` of a star and
+        returns its `OPDMap`.
+    stars, filters : sequence of str
+        Names of those to use; default all.
+    size : int
+        Side in pixels of the square about the star that is fitted, and for which the library has
+        the pattern.
+    settings : GaussNewton, optional
+        Of the fits; default those of `refine`. The model error is replaced.
+    folder : path, optional
+        Where finished fits are kept. A run with the same frames, map and settings takes them from
+        there, and one with further stars fits those.
+    device : str
+        PyTorch device of the optical model.
+    progress : bool
+        Show progress bars.
+
+    Returns
+    -------
+    PatternLibrary
+        Its `validation` has for each star and epoch the set-up, the date, the number of `frames`,
+        chi-squared per pixel without a pattern (`chi2_alone`) and with that of the other stars
+        (`chi2_with_others`), both with the noise of the data alone, and how much of that pattern
+        the frames show with its error (`shown`, `shown_error`, see `pattern_size`). The latter
+        three are NaN for a star without others.
+
+    Raises
+    ------
+    NoValidPixelsError
+        If no star is left.
+    IncompatibleSetupError
+        For stars or filters that are not there.
+    RefinementError
+        If no star can be fitted.
+
+    Examples
+    --------
+    With frames and wavefront maps in folders, which the package does not contain:
+
+    >>> import pyklip_diffrender as dr
+    >>> library = dr.learn_library("calints", "maps", folder="fits")  # doctest: +SKIP
+    >>> library.write("patterns.fits")  # doctest: +SKIP
+    """
+    epochs = list(_epochs(files, opd, stars, filters, size))
+    if not epochs:
+        raise NoValidPixelsError(
+            "no star is left to learn the flat-field pattern from; the log says why"
+        )
+    fitter = _Fitter(settings, None if folder is None else Path(folder), device, progress)
+    parts = []
+    with numbered_stages():
+        for setup in dict.fromkeys(each.setup for each in epochs):
+            parts.append(_learn([each for each in epochs if each.setup == setup], fitter))
+    patterns = [pattern for part, _ in parts for pattern in part]
+    if not patterns:
+        raise RefinementError(
+            f"none of {len(epochs)} fits is good enough to learn the flat-field pattern from; the "
+            "log says why"
+        )
+    rows = [row for _, part in parts for row in part]
+    return PatternLibrary(tuple(patterns), QTable(rows=rows))
+
+
+@dataclass(frozen=True, eq=False)
+class _Epoch:
+    """Frames of a star that share a wavefront, cut to the fitted pixels."""
+
+    star: str
+    science: tuple[Observation, ...]
+    opd: OPDMap
+
+    @property
+    def setup(self) -> tuple[str | None, ...]:
+        """Detector, mask, filter and flat field, whose frames share a pattern."""
+        first = self.science[0]
+        mask = image_mask(first.header, first.name)
+        return (detector_of(first.header, first.name), mask, first.filter, flat_of(first))
+
+    @property
+    def date(self) -> str:
+        return min((each.date.isot for each in self.science if each.date is not None), default="")
+
+    def __str__(self) -> str:
+        _, mask, filter_, _ = self.setup
+        return " ".join(filter(None, (self.star, filter_, mask, self.date[:10])))
+
+
+@dataclass(frozen=True)
+class _Fitter:
+    """Fits that are kept in a folder."""
+
+    settings: GaussNewton | None
+    folder: Path | None
+    device: str
+    progress: bool
+
+    def fit(
+        self, epoch: _Epoch, known: Systematics | None
+    ) -> tuple[Refinement, tuple[float, float]]:
+        """Fit an epoch, or read the fit; also how much of the pattern it shows."""
+        first = epoch.science[0]
+        settings = replace(
+            self.settings or replace(settings_for(first), max_companions=0),
+            min_model_error=_ALONE if known is None else _KNOWN,
+        )
+        path = None
+        if self.folder is not None:
+            digest = _digest(epoch, settings, known)[:16]
+            path = self.folder / f"{re.sub(r'[^A-Za-z0-9.+-]+', '_', str(epoch))}_{digest}.fits"
+            if path.is_file():
+                try:
+                    fit = Refinement.read(path)
+                except CorruptFileError as error:
+                    _log.warning("%s; it is fitted again", error)
+                else:
+                    _log.info("%s: the fit is taken from %s", epoch, path)
+                    return fit, _shown(fit)
+        model = model_for(first, max(first.shape), device=self.device)
+        others = "" if known is None else ", with the pattern of the others"
+        with stage(f"{epoch}{others}"):
+            fit = refine(
+                model,
+                epoch.science,
+                epoch.opd,
+                systematics=known,
+                settings=settings,
+                progress=self.progress,
+            )
+        if path is not None:
+            # With the linear model only where something is measured with it.
+            fit.write(path, linear=known is not None)
+        return fit, _shown(fit)
+
+
+def _learn(epochs: Sequence[_Epoch], fitter: _Fitter) -> tuple[list[Any], list[dict[str, Any]]]:
+    """Patterns of one set-up, and the rows of its validation."""
+    alone: dict[_Epoch, Refinement] = {}
+    for epoch in epochs:
+        fit = _attempt(epoch, None, fitter)
+        if fit is not None:
+            alone[epoch] = fit[0]
+    pedestal = pattern_pedestal(list(alone.values()))
+    last, rows = [], []
+    for epoch, first in alone.items():
+        others = [fit for other, fit in alone.items() if not same_name(other.star, epoch.star)]
+        library = PatternLibrary(tuple(measure_patterns(others, pedestal)))
+        known = known_systematics(epoch.science[0], library=library)
+        again = None if known is None else _attempt(epoch, known, fitter)
+        chi2, shown = np.nan, (np.nan, np.nan)
+        if again is not None:
+            chi2, shown = _chi2(again[0]), again[1]
+        last.append(first if again is None else again[0])
+        detector, mask, filter_, flat = epoch.setup
+        row = {
+            "star": epoch.star,
+            "detector": detector or "",
+            "mask": mask or "",
+            "filter": filter_ or "",
+            "flat": flat or "",
+            "date": epoch.date,
+            "frames": len(epoch.science),
+            "chi2_alone": _chi2(first),
+            "chi2_with_others": chi2,
+            "shown": shown[0],
+            "shown_error": shown[1],
+        }
+        _log.info("%s: chi-squared per pixel %.2f alone, %.2f with the pattern of the others",
+                  epoch, row["chi2_alone"], chi2)  # fmt: skip
+        rows.append(row)
+    return measure_patterns(last, pattern_pedestal(last)), rows
+
+
+def _attempt(epoch: _Epoch, known: Systematics | None, fitter: _Fitter) -> _Fit | None:
+    """Fit an epoch; None, with a warning, if it fails."""
+    try:
+        fit = fitter.fit(epoch, known)
+    except DiffrenderError as error:
+        _log.warning("%s is left out: %s", epoch, error)
+        return None
+    if not fit[0].status.usable:
+        _log.warning("%s is left out: %s", epoch, fit[0].status.message)
+        return None
+    return fit
+
+
+def _epochs(
+    files: Files, opd: Any, stars: Sequence[str], filters: Sequence[str], size: int
+) -> Iterable[_Epoch]:
+    """Sort files, and read the frames of every star, epoch and set-up."""
+    listed = exposures_in(files)
+    exclude_unusable(listed)
+    require_some(listed)
+    for each in listed:
+        if each.reason:
+            _log.warning("%s is left out: %s", each.name, each.reason)
+    by_star = frames_by_star(admissible(listed))
+    known = {each.exposure.filter for each in admissible(listed)}
+    for choice in filters:
+        if not any(same_name(choice, each) for each in known):
+            raise unknown_name("filter", choice, known)
+    for choice in stars:
+        if not any(_is_called(choice, star, frames) for star, frames in by_star.items()):
+            raise unknown_name("star", choice, by_star)
+    for star, frames in by_star.items():
+        if stars and not any(_is_called(choice, star, frames) for choice in stars):
+            continue
+        for setup in dict.fromkeys(each.exposure.setup for each in frames):
+            chosen = [each for each in frames if each.exposure.setup == setup]
+            name = chosen[0].exposure.filter
+            if filters and not any(same_name(name, each) for each in filters):
+                continue
+            yield from _of_setup(star, chosen, opd, size)
+
+
+def _is_called(name: str, star: str, frames: Iterable[FrameFile]) -> bool:
+    return same_name(name, star) or any(each.exposure.star.is_called(name) for each in frames)
+
+
+def _of_setup(star: str, files: Sequence[FrameFile], opd: Any, size: int) -> Iterable[_Epoch]:
+    """Epochs of a star with one set-up; those that cannot be used are named in the log."""
+    try:
+        sequences = FrameSequence.by_epoch([each.path for each in files], target=star)
+    except DiffrenderError as error:
+        _log.warning("%s is left out: %s", star, error)
+        return
+    find: Callable[[FrameSequence], OPDMap] = (
+        opd if callable(opd) else lambda sequence: wavefront_for(opd, sequence.date)
+    )
+    used = {row.path for each in sequences for row in each.rows if row.use == "target"}
+    for name, reason in sequences[0].excluded:
+        if name not in {path.name for path in used if path is not None}:
+            _log.warning("%s is left out: %s", name, reason)
+    for sequence in sequences:
+        usable = []
+        for each in sequence.science:
+            if each.first_pixel is None:
+                reason = "the file does not say which pixels of the detector its frames show"
+            elif each.unit != u.MJy / u.sr:
+                reason = f"its unit is {each.unit}, expected calibrated frames in MJy/sr"
+            else:
+                usable.append(each)
+                continue
+            _log.warning("%s is left out: %s", each.name, reason)
+        if usable:
+            cut = replace(sequence, science=tuple(usable), references=()).cutout(size)
+            yield _Epoch(star, cut.science, find(sequence))
+
+
+def _chi2(fit: Refinement) -> float:
+    """Chi-squared per pixel with the noise of the data alone."""
+    total, count = 0.0, 0
+    for frame in fit.frames:
+        combined = frame.observation.combined()
+        left = combined.data[0] - frame.star - frame.companion_image
+        valid = combined.valid[0]
+        total += float(((left / combined.error[0])[valid] ** 2).sum())
+        count += int(valid.sum())
+    return total / count
+
+
+def _shown(fit: Refinement) -> tuple[float, float]:
+    size = None if fit.systematics is None else pattern_size(fit)
+    return (np.nan, np.nan) if size is None else size
+
+
+def _digest(epoch: _Epoch, settings: GaussNewton, known: Systematics | None) -> str:
+    """Hash of everything that decides the result of a fit."""
+    digest = hashlib.sha256(f"{__version__} {settings!r}".encode())
+    arrays: list[NDArray[Any]] = [epoch.opd.data]
+    for each in epoch.science:
+        digest.update(f"{each.name} {each.center.tolist()} {each.first_pixel}".encode())
+        arrays += [each.data, each.error, each.valid]
+    if known is not None:
+        digest.update(f"{known.pedestal} {known.unknown} {known.first_pixel}".encode())
+        arrays += [known.pattern, known.error]
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

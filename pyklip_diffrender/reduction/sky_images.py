@@ -1,0 +1,115 @@
+"""Images of the sky about the star with north up, of all frames together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from astropy.convolution import Gaussian2DKernel, interpolate_replace_nans
+from astropy.io import fits
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from pyklip_diffrender.detection import Detection, combine_frames, image_hdu
+from pyklip_diffrender.imaging import SkyModel
+from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.io.geometry import rotation_matrix
+from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
+
+__all__ = ["SkyImages"]
+
+Image = NDArray[np.float64]
+
+
+class SkyImages:
+    """Images with north up, or with the orientation of the first frame where north is not known.
+
+    Parameters
+    ----------
+    reduction : Reduction
+
+    Attributes
+    ----------
+    grid : ndarray, (n, n, 2)
+        x, y of the pixels from the star, arcsec; y is north and x is west.
+    """
+
+    def __init__(self, reduction: Reduction) -> None:
+        self.detection: Detection = reduction.detection
+        self._disk = reduction.disk
+        self._templates = self.detection.groups[0][1]
+        observation = self.detection.observation
+        self.oriented = observation.position_angles is not None
+        self._half = max(observation.shape) // 2
+        y, x = np.mgrid[-self._half : self._half + 1, -self._half : self._half + 1]
+        self.grid = np.sqrt(np.prod(observation.pixelscale)) * np.stack([x, y], axis=-1)
+        self.to_sky = rotation_matrix(self.detection.north)
+
+    @cached_property
+    def combined(self) -> tuple[Image, Image]:
+        """Mean of the frames minus the star, and its standard deviation, in the frames' unit."""
+        images, errors = {}, {}
+        lights: Sequence[Any] = [0.0] * len(self._templates.frames)
+        if self._disk is not None:
+            lights = self._disk.light
+        left = zip(self._templates.frames.items(), self.detection.subtracted, lights, strict=True)
+        for (k, frame), subtracted, light in left:
+            filled = interpolate_replace_nans(subtracted, Gaussian2DKernel(1.0))
+            images[k] = np.nan_to_num(filled) + light
+            error = frame.observation.combined().error[0]
+            errors[k] = np.where(np.isfinite(subtracted), error, np.inf)
+        return combine_frames(self._templates, images, errors, self.grid @ self.to_sky)
+
+    @cached_property
+    def posterior_mean(self) -> Image:
+        """What is neither star nor detector, in the frames' unit, see `imaging.sky_model`.
+
+        Of faint sources it has 0.4 to 0.8 of the peak.
+        """
+        model = SkyModel(self.detection.fits)
+        middle = slice(model.center - self._half, model.center + self._half + 1)
+        return model.estimate()[0][middle, middle]
+
+    @property
+    def image(self) -> Image:
+        """The image to show: the posterior mean, or with a disk in the model the mean of frames."""
+        return self.posterior_mean if self._disk is None else self.combined[0]
+
+    @property
+    def words(self) -> str:
+        """What `image` is."""
+        if self._disk is None:
+            return "Most probable image of what is neither star nor detector, from all frames"
+        return "Mean of all frames without the star"
+
+    def turned(self, on_frame: Image) -> Image:
+        """Interpolate an image on the pixels of the first frame."""
+        offsets = torch.from_numpy((self.grid @ self.to_sky).reshape(-1, 2))
+        places = self._templates.pixels_of(min(self._templates.frames), offsets)
+        values = map_coordinates(on_frame, places, order=1, cval=np.nan)
+        return np.asarray(values.reshape(self.grid.shape[:2]))
+
+    def write(self, path: Path) -> Path:
+        """Write all images to a FITS file with a world coordinate system."""
+        detection = self.detection
+        unit = detection.observation.unit.to_string("fits")
+        mean, error = self.combined
+        images = {
+            "COMBINED": (mean, unit),
+            "COMBINED_ERROR": (error, unit),
+            "POSTERIOR_MEAN": (self.posterior_mean, unit),
+            "CONTRAST": (self.turned(detection.contrast), ""),
+            "CONTRAST_ERROR": (self.turned(detection.error), ""),
+            "SNR": (self.turned(detection.snr), ""),
+        }
+        wcs = world_coordinates(self.grid @ self.to_sky, detection.observation)
+        first = primary_hdu(detection.observation, detection.provenance, detection.sky.mjd)
+        hdus = [image_hdu(image, name, unit, wcs) for name, (image, unit) in images.items()]
+        with replacing(path) as temporary:
+            fits.HDUList([first, *hdus]).writeto(temporary, overwrite=True, checksum=True)
+        return path

@@ -1,0 +1,287 @@
+"""Learning the flat-field pattern from many stars: the library, its test on each, its files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import pyklip_diffrender as dr
+from benchmarks.calints_files import SIDE, calints
+from pyklip_diffrender.cli import main
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    IncompatibleSetupError,
+    NoValidPixelsError,
+)
+from pyklip_diffrender.pattern import MeasuredPattern, choose_systematics, package_library
+from pyklip_diffrender.pyklip_backend.checks import check_settings
+from pyklip_diffrender.reduction import ReduceOptions
+from pyklip_diffrender.refinement import GaussNewton
+
+SIZE = 32
+FLAT = "crds://jwst_nircam_flat_9999.fits"
+OPD = dr.random_opd(1, npix=256)
+# The frames differ from the model by flux and pattern only.
+ALIGNED = GaussNewton(free=("flux", "background"), wavefront=False, companions_if_stalled=False)
+RMS = 0.05
+PATTERN = RMS * np.random.default_rng(5).normal(size=(SIDE, SIDE))
+PEDESTAL = 1.0
+
+
+@pytest.fixture(scope="module")
+def starlight(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
+    """The image of a star of unit flux in frames like those of `calints`."""
+    (frame,) = dr.Sequence.from_files([written(tmp_path_factory.mktemp("one"), "HD 1")]).science
+    cut = frame.cutout(SIZE)
+    model = dr.model_for(frame, SIZE)
+    assert cut.first_pixel is not None
+    middle = (SIZE - 1) / 2
+    shift = tuple((cut.center[0] - middle) * model.detector.pixelscale)
+    image = np.zeros((SIDE, SIDE))
+    x, y = np.array(cut.first_pixel) - frame.first_pixel
+    with torch.no_grad():
+        image[y : y + SIZE, x : x + SIZE] = model(OPD.data, detector_shift=shift).numpy()
+    return image
+
+
+def written(folder: Path, star: str, k: int = 1, light: np.ndarray | None = None) -> Path:
+    cards = {"SUBSTRT1": 601, "SUBSTRT2": 1601, "R_FLAT": FLAT}
+    name = f"jw01184{k:03d}001_03106_00001_nrcalong_calints.fits"
+    return calints(
+        folder / name, star, observation=k, roll=70.0 + 5 * k, cards=cards, light=light,
+        date=f"2022-10-03T{k:02d}:00:00",
+    )  # fmt: skip
+
+
+@pytest.fixture
+def frames(tmp_path: Path, starlight: np.ndarray) -> Path:
+    """A roll of one star and two of another, with one pattern in the pixels of the detector."""
+    folder = tmp_path / "frames"
+    for k, (star, flux) in enumerate((("HD 1", 1e8), ("HD 2", 3e8), ("HD 2", 3e8)), 1):
+        light = flux * starlight
+        written(folder, star, k, light + PATTERN * (light + PEDESTAL))
+    return folder
+
+
+def learned(frames: Path, **options: object) -> dr.PatternLibrary:
+    return dr.learn_library(frames, OPD, size=SIZE, settings=ALIGNED, **options)  # type: ignore[arg-type]
+
+
+def test_the_pattern_of_one_star_holds_for_the_other(frames: Path, tmp_path: Path) -> None:
+    library = learned(frames, folder=tmp_path / "fits")
+    rows = library.validation
+    assert list(rows["star"]) == ["HD 1", "HD 2"]
+    assert list(rows["flat"]) == ["jwst_nircam_flat_9999.fits"] * 2
+    assert list(rows["frames"]) == [1, 2]
+    # The pattern is several times the noise near the star.
+    assert (rows["chi2_alone"] > 3).all()
+    assert rows["chi2_with_others"][0] < 0.5 * rows["chi2_alone"][0]
+    assert rows["shown"][0] == pytest.approx(1.0, abs=0.1)
+    # One frame of another star is too little.
+    assert np.isnan(rows["chi2_with_others"][1])
+    assert np.isnan(rows["shown"][1])
+    # Frames of a third star would be fitted with the pattern that is there.
+    frame = dr.Observation.from_fits(written(tmp_path, "HD 3", 9)).cutout(SIZE)
+    known = dr.known_systematics(frame, library=library)
+    assert known is not None
+    assert known.provenance["stars"] == ["HD 1", "HD 2"]
+    assert frame.first_pixel is not None
+    x, y = np.array(frame.first_pixel) - (600, 1600)
+    truth = PATTERN[y : y + SIZE, x : x + SIZE]
+    got, error = known.at(frame)
+    sure = error < 0.3 * RMS
+    assert sure.mean() > 0.2
+    assert np.corrcoef(got[sure], truth[sure])[0, 1] > 0.95
+    # Errors are those for another frame, whose scatter from frame to frame adds to them.
+    assert 0.3 < ((got - truth) / error)[sure].std() < 1.3
+    # The same run takes its fits from the folder; one that is damaged is made again.
+    fits = sorted((tmp_path / "fits").iterdir())
+    assert len(fits) == 3
+    times = [each.stat().st_mtime_ns for each in fits]
+    fits[0].write_bytes(fits[0].read_bytes()[:5000])
+    again = learned(frames, folder=tmp_path / "fits")
+    assert sorted((tmp_path / "fits").iterdir()) == fits
+    assert [each.stat().st_mtime_ns for each in fits][1:] == times[1:]
+    for one, other in zip(library.patterns, again.patterns, strict=True):
+        np.testing.assert_allclose(one.value, other.value, atol=1e-9)
+
+
+def test_stars_and_filters_that_are_not_there_are_refused(frames: Path) -> None:
+    with pytest.raises(IncompatibleSetupError, match=r"star: got 'HD 7', expected one of 'HD 1'"):
+        learned(frames, stars=["HD 7"])
+    with pytest.raises(IncompatibleSetupError, match=r"filter: got 'F356W'"):
+        learned(frames, filters=["F356W"])
+
+
+def test_frames_without_a_place_or_a_unit_are_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    calints(tmp_path / "a_calints.fits", "HD 1")
+    cards = {"BUNIT": "DN/s", "SUBSTRT1": 601, "SUBSTRT2": 1601}
+    calints(tmp_path / "b_rateints.fits", "HD 2", observation=2, cards=cards)
+    with pytest.raises(NoValidPixelsError, match="no star is left"):
+        learned(tmp_path)
+    assert "does not say which pixels of the detector" in caplog.text
+    assert "its unit is" in caplog.text
+
+
+# -- libraries ------------------------------------------------------------------------------------
+
+
+def measured(star: str, k: int = 1, **changes: object) -> MeasuredPattern:
+    """The pattern of a frame whose residual does not depend on the pedestal."""
+    light = 10.0 + np.indices((SIZE, SIZE))[0]
+    left = 0.3 * np.random.default_rng([k, ord(star[0])]).normal(size=light.shape)
+    pattern = MeasuredPattern(
+        star=star, value=left / (light + 1), variance=(0.1 / (light + 1)) ** 2, center=(15.5, 15.5),
+        first_pixel=(600, 1600), filter="F444W", image_mask="MASK335R", frame=f"{star} {k}.fits",
+        date="2022-10-03", pedestal=1.0, detector="NRCALONG", flat="new.fits", light=light,
+    )  # fmt: skip
+    return replace(pattern, **changes)  # type: ignore[arg-type]
+
+
+def observation(**cards: str) -> dr.Observation:
+    header = {"INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "CORONMSK": "MASKA335R", **cards}
+    ones = np.ones((SIZE, SIZE))
+    return dr.Observation.from_arrays(
+        ones, ones, pixelscale=0.063, filter="F444W", header=header, first_pixel=(600, 1600)
+    )
+
+
+def test_a_library_is_searched_by_setup_place_star_and_flat() -> None:
+    usual = [measured("A"), measured("B"), measured("B", 2, flat="old.fits")]
+    others = [
+        measured("C", image_mask="MASK430R"), measured("C", filter="F356W"),
+        measured("C", detector="NRCA2"), measured("C", first_pixel=(100, 1600)),
+    ]  # fmt: skip
+    library = dr.PatternLibrary((*usual, *others))
+
+    def stars(**cards: str) -> list[str]:
+        return [f"{each.star} {each.flat}" for each in library.matching(observation(**cards))]
+
+    assert stars(R_FLAT="crds://new.fits") == ["A new.fits", "B new.fits"]
+    assert stars(R_FLAT="crds://old.fits") == ["B old.fits"]
+    # A flat field that none has: the one of most patterns, which the fit may refute.
+    assert stars(R_FLAT="crds://newest.fits") == stars() == ["A new.fits", "B new.fits"]
+    assert stars(R_FLAT="new.fits", TARGNAME="a") == ["B new.fits"]
+
+
+def test_a_star_is_known_by_its_coordinates_too() -> None:
+    """Another programme may call it by another name."""
+    header = {"TARGPROP": "Target 7", "TARG_RA": 53.1, "TARG_DEC": -9.4}
+    frame = observation(**header)  # type: ignore[arg-type]
+    catalogue = replace(measured("A").catalogue, names=("G 80-21",), coordinates=(53.1001, -9.4))
+    library = dr.PatternLibrary((measured("G 80-21", catalogue=catalogue), measured("B")))
+    assert [each.star for each in library.matching(frame)] == ["B"]
+
+
+def test_pedestals_are_brought_together() -> None:
+    one = measured("A")
+    other = one.with_pedestal(3.0)
+    np.testing.assert_allclose(other.value * (one.light + 3.0), one.value * (one.light + 1.0))
+    assert one.light is not None
+    frame = observation()
+    library = dr.PatternLibrary((other, measured("B"), measured("C")))
+    known = dr.known_systematics(frame, library=library)
+    assert known is not None
+    assert known.pedestal == 1.0
+    # Without their stars the patterns of a file keep the pedestal that they have.
+    bare = replace(measured("B", pedestal=0.7), light=None)
+    known = dr.known_systematics(frame, library=dr.PatternLibrary((other, bare, measured("C"))))
+    assert known is not None
+    assert known.pedestal == 0.7
+    both = dr.PatternLibrary((bare, replace(measured("C"), light=None)))
+    with pytest.raises(IncompatibleSetupError, match="without its star"):
+        dr.known_systematics(frame, library=both)
+
+
+def test_libraries_survive_their_files_and_are_combined(tmp_path: Path) -> None:
+    unknown = measured("B").variance.copy()
+    unknown[3, 4] = np.inf
+    catalogue = replace(measured("A").catalogue, names=("A", "Ä 1"), coordinates=(10.0, 2.0))
+    first = dr.PatternLibrary((measured("A", catalogue=catalogue), measured("B", variance=unknown)))
+    second = dr.PatternLibrary(
+        (measured("B", value=np.zeros_like(unknown)), measured("C", light=None))
+    )
+    first.write(tmp_path / "one.fits.gz")
+    second.write(tmp_path / "two.fits")
+    both = dr.PatternLibrary.read(tmp_path)
+    assert [each.frame for each in both.patterns] == ["A 1.fits", "B 1.fits", "C 1.fits"]
+    a, b, c = both.patterns
+    np.testing.assert_allclose(a.value, measured("A").value, rtol=1e-6)
+    np.testing.assert_allclose(b.variance, unknown, rtol=1e-6)
+    assert a.light is not None
+    assert c.light is None
+    assert (a.detector, a.flat, a.image_mask) == ("NRCALONG", "new.fits", "MASK335R")
+    assert a.catalogue == replace(catalogue, names=("A", "A 1"))
+    assert len(dr.combine_libraries([both, package_library()]).patterns) == 11
+    (tmp_path / "one.fits.gz").unlink()
+    measured_file = dr.Systematics(np.zeros((8, 8)), np.ones((8, 8)), (15.5, 15.5), 0.1)
+    measured_file.write(tmp_path / "systematics.fits")
+    with pytest.raises(CorruptFileError, match=r"systematics.fits: got no version"):
+        dr.PatternLibrary.read(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CorruptFileError, match="no FITS files"):
+        dr.PatternLibrary.read(tmp_path / "empty")
+
+
+def test_a_folder_of_libraries_is_a_choice_of_systematics(tmp_path: Path) -> None:
+    dr.PatternLibrary((measured("A"), measured("B"))).write(tmp_path / "own" / "one.fits")
+    options = ReduceOptions(size=SIZE, systematics=tmp_path / "own")
+    assert isinstance(options.systematics, dr.PatternLibrary)
+    frame = observation(R_FLAT="new.fits")
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=64, fov_pixels=SIZE)
+    chosen = choose_systematics([frame], [], model, OPD, systematics=options.systematics)
+    assert chosen.label == "library (A, B)"
+    # Where the folder has nothing, the package's library may have something.
+    other = replace(observation(R_FLAT="jwst_nircam_flat_0465.fits"), first_pixel=(620, 1650))
+    chosen = choose_systematics([other], [], model, OPD, systematics=options.systematics)
+    assert chosen.label == "library (HIP17695, G-7-34)"
+    check_settings(dr.DiffrenderSettings(systematics=tmp_path / "own"))
+    with pytest.raises(IncompatibleSetupError, match=r"systematics: got .*nowhere"):
+        check_settings(dr.DiffrenderSettings(systematics=tmp_path / "nowhere"))
+
+
+# -- the command ----------------------------------------------------------------------------------
+
+
+def test_the_command_says_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = ["-o", str(tmp_path / "patterns.fits"), "--opd", "flat"]
+    assert main(["learn", *output]) == 2
+    assert "Missing argument 'FRAMES...'" in capsys.readouterr().err
+    (tmp_path / "patterns.fits").touch()
+    assert main(["learn", str(tmp_path), *output]) == 1
+    assert "--overwrite" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_real_stars_teach_the_pattern_of_another(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two rolls each of two stars; one of the library's frames is of another filter."""
+    path = tmp_path / "patterns.fits"
+    arguments = [
+        "learn", str(shared_data / "gto1184"), "--star", "HIP 17695", "--star", "G 7-34",
+        "--filter", "F444W", "--size", "32", "-o", str(path),
+        "--opd", str(shared_data / "opd_2022-08-14.fits.gz"),
+    ]  # fmt: skip
+    assert main(arguments) == 0
+    assert "chi2_with_others" in capsys.readouterr().out
+    library = dr.PatternLibrary.read(path)
+    rows = library.validation
+    assert list(rows["star"]) == ["HIP17695", "G-7-34"]
+    assert (rows["chi2_with_others"] < 0.5 * rows["chi2_alone"]).all()
+    # The package's own patterns are of the same frames, from fits of larger squares.
+    own = {each.frame: each for each in package_library().patterns}
+    for pattern in library.patterns:
+        other = own[pattern.frame]
+        x, y = np.subtract(pattern.first_pixel, other.first_pixel)
+        there = (slice(y, y + 32), slice(x, x + 32))
+        both = np.isfinite(pattern.variance) & np.isfinite(other.variance[there])
+        assert np.corrcoef(pattern.value[both], other.value[there][both])[0, 1] > 0.7
