@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -116,7 +115,7 @@ def test_derivatives_are_those_of_modes_propagated_one_by_one(route: str, basis:
     seen = torch.zeros(count, dtype=torch.int64)
     for modes, (change,) in fields.batches(10):
         assert 0 < len(modes) <= 10
-        assert difference(change, expected[modes]) < 1e-3
+        assert difference(change, expected[modes]) < (1e-3 if route == "lattice" else 1e-6)
         seen[modes] += 1
     # The modes with fx = 0 may come twice.
     assert (seen > 0).all()
