@@ -76,7 +76,7 @@ MODES = (0, 1, 29, 41, 54, 57, 90, len(BASIS) - 1)
     [{}, pytest.param({"monochromatic": None, "nlambda": 2}, marks=pytest.mark.slow)],
     ids=["1", "2"],
 )
-@pytest.mark.parametrize(("npix", "tolerance"), [(NPIX, 1e-4), (128, 0.025)])
+@pytest.mark.parametrize(("npix", "tolerance"), [(NPIX, 1e-3), (128, 0.025)])
 def test_wavefront_response_is_the_slope_of_the_fine_model(
     opd: torch.Tensor,
     values: dict[str, torch.Tensor],
@@ -84,7 +84,7 @@ def test_wavefront_response_is_the_slope_of_the_fine_model(
     npix: int,
     tolerance: float,
 ) -> None:
-    """To single precision on the same grid; a coarse copy is off by a percent or two."""
+    """To the wrapped light of the occulter on the same grid; a coarse copy is off by a percent."""
     model = system(**changes)
     response = WavefrontResponse(model, BASIS, opd, values, npix=npix)
     assert response.coarse.npix == npix

@@ -28,7 +28,8 @@ Wrapping. The FFTs need as many points as there are differences x - c, about twi
 With fewer points, the largest differences, of samples at one edge from cells at the opposite one,
 are taken for smaller ones on the other side. Little light is on the outer cells, and little is
 diffracted so far: fields change by 1e-4 (F444W behind MASK335R, 80 x 80 pixels, 128 points rather
-than 160), and take two thirds of the time. That is enough for derivatives, not for the star.
+than 160), and take two thirds of the time. That is enough for derivatives and for the templates of
+planets, which change by 5e-5, but not for the star.
 
 Sampling. The sum over cells equals the integral if the spectrum of 1 - t vanishes at the
 frequencies that alias onto the band of F[E] F[L], up to (D_E + D_L) / 2 lambda < D / lambda. The
