@@ -40,7 +40,7 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.linear.frames import LinearFrame
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.linear.noise import curvature_of
+from pyklip_diffrender.linear.noise import weighted_rows
 from pyklip_diffrender.linear.response import downsample
 
 FAR = 6.0
@@ -92,10 +92,9 @@ def fainter(fit: Any, floors: list[float], factor: float, seed: int = 1) -> Line
         added = (wanted - variance / factor**2).clamp(min=0.0).sqrt() * noise
         residual = torch.where(counts, part.residual / factor + (added if factor > 1 else 0), 0.0)
         shared[0] = shared[0] + (part.weight * part.common) ** 2
-        parts.append(
-            (replace(part, residual=residual, weight=weight, jacobian=part.jacobian / factor,
-                     light=part.light / factor), part.common)
-        )  # fmt: skip
+        jacobian = part.jacobian / factor
+        changed = replace(part, residual=residual, weight=weight, jacobian=jacobian)
+        parts.append((changed, part.common))
     # The pattern's error times the star, u, from c = u / sqrt(1 + sum w^2 u^2), and c anew.
     total = shared[0] / (1 - shared[0]).clamp(min=1e-12)
     errors = [common * (1 + total).sqrt() / factor for _, common in parts]
@@ -117,13 +116,17 @@ def cut(linear: LinearModel, size: int) -> LinearModel:
             residual=f.residual[a:b, a:b],
             weight=f.weight[a:b, a:b],
             common=f.common[a:b, a:b],
-            light=f.light[a:b, a:b],
             jacobian=f.jacobian[:, a:b, a:b].contiguous(),
         )
         for f in linear.frames
     )
     smaller = replace(linear, frames=frames)
-    return replace(smaller, curvature=curvature_of(frames, smaller.noise, len(linear.vector)))
+    count = len(linear.vector)
+    curvature = torch.zeros(count, count, dtype=torch.float64)
+    for f, inverse in zip(frames, weighted_rows(frames, smaller.noise, count), strict=True):
+        whitened = f.weight.flatten() * f.onto_unknowns(f.jacobian, count).flatten(1)
+        curvature += inverse.double() @ whitened.T
+    return replace(smaller, curvature=curvature)
 
 
 def with_fewer_modes(linear: LinearModel, frequencies: Tensor, share: float) -> LinearModel:

@@ -70,6 +70,38 @@ def test_the_log_gets_stages_and_at_most_a_line_a_minute(
     ]
 
 
+def test_the_time_that_is_left_follows_the_stages_that_have_ended(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 1000.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    with (
+        caplog.at_level(logging.INFO),
+        numbered_stages({"wavefront": 60.0, "search": 30.0, "products": 10.0}),
+    ):
+        with stage("wavefront"), ProgressBar("x", shown=False) as bar:
+            now += 60.0
+            bar.update()
+            now += 120.0
+            bar.update()
+        # A stage that nobody expected does not count.
+        with stage("another fit"):
+            now += 500.0
+        # The first stage took three times as long as expected, so the others will.
+        with stage("search"):
+            now += 90.0
+        with stage("products"):
+            pass
+    assert [record.getMessage() for record in caplog.records] == [
+        "1. wavefront, about 2 min left",
+        "1. wavefront, about 40 s left, step 1",
+        "1. wavefront, more than 2 min left, step 2",
+        "2. another fit, about 2 min left",
+        "3. search, about 2 min left",
+        "4. products, about 30 s left",
+    ]
+
+
 def test_a_stage_ends_with_its_block_even_when_it_fails() -> None:
     with pytest.raises(ValueError, match="no"), stage("frames"):
         raise ValueError("no")

@@ -36,10 +36,11 @@ Examples:
   pyklip-diffrender demo
   pyklip-diffrender demo --contrast 3e-7 --separation 1 -o faint""",
 )
-@option("--contrast", type=float, default=1e-6, show_default=True, help="Of the planet.")
-@option("--separation", type=float, default=0.6, show_default=True, metavar="ARCSEC",
-        help="Of the planet from the star.")  # fmt: skip
-@option("--hours", type=float, default=40.0, show_default=True, metavar="H",
+@option("--contrast", type=click.FloatRange(min=0), default=1e-6, show_default=True,
+        metavar="RATIO", help="Flux of the planet over that of the star.")  # fmt: skip
+@option("--separation", type=click.FloatRange(0, 2.3), default=0.6, show_default=True,
+        metavar="ARCSEC", help="Separation of the planet from the star.")  # fmt: skip
+@option("--hours", type=click.FloatRange(min=0), default=40.0, show_default=True, metavar="H",
         help="Age of the wavefront map.")  # fmt: skip
 @option("--seed", type=int, default=1, show_default=True, metavar="N",
         help="Random seed of wavefront, drift and noise.")  # fmt: skip
@@ -131,8 +132,6 @@ def reduce_frames(
     than 5 days apart are reduced one by one, into a folder for each, and compared on one page.
     """
     require_frames(frames, program)
-    if program is not None and options["dry_run"] and _is_to_fetch(program, target, filter, cache):
-        return
 
     def read() -> tuple[Sequence, ...]:
         from pyklip_diffrender.archive import fetch_calints
@@ -140,6 +139,8 @@ def reduce_frames(
 
         files: Any = frames[0] if len(frames) == 1 else frames
         if program is not None:
+            if options["dry_run"] and _is_to_fetch(program, target, filter, cache):
+                return ()
             files = fetch_calints(
                 program, target, filter=filter, folder=cache, progress=run.progress
             )
@@ -189,14 +190,17 @@ def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
     epilog="""\b
 Examples:
   pyklip-diffrender psf star.fits --filter F356W --offset 0.02 0
+  pyklip-diffrender psf star.fits --filter F460M --mask MASKLWB
   pyklip-diffrender psf star.fits --monochromatic 4.5e-6 --opd map.fits""",
 )
 @click.argument("output", type=file_type())
 @option("--filter", default="F444W", show_default=True, metavar="NAME", help="Filter of NIRCam.")
+@option("--mask", default="MASK335R", show_default=True, metavar="NAME",
+        help="Coronagraph mask of NIRCam.")  # fmt: skip
 @option("--monochromatic", type=float, metavar="M", help="A single wavelength, m.")
-@option("--opd", type=file_type(), metavar="FILE",
-        help="Wavefront map (FITS); default a flat wavefront.")  # fmt: skip
-@option("--size", type=int, default=80, show_default=True, metavar="N",
+@option("--opd", default="flat", show_default=True, metavar="FILE|flat",
+        help="Wavefront map: a FITS file, or flat.")  # fmt: skip
+@option("--size", type=click.IntRange(min=1), default=80, show_default=True, metavar="N",
         help="Side of the image, pixels.")  # fmt: skip
 @option("--offset", type=float, nargs=2, default=(0.0, 0.0), show_default=True,
         metavar="X Y", help="Star from the occulter's centre, arcsec.")  # fmt: skip
@@ -206,8 +210,9 @@ def psf(
     run: Run,
     output: Path,
     filter: str,
+    mask: str,
     monochromatic: float | None,
-    opd: Path | None,
+    opd: str,
     size: int,
     offset: tuple[float, float],
     overwrite: bool,
@@ -217,22 +222,35 @@ def psf(
     OUTPUT is the FITS file to write.
     """
     run.claim_file(output, overwrite)
-    import torch
+    import numpy as np
     from astropy.io import fits
 
     from pyklip_diffrender.instrument.nircam import nircam_coronagraph
     from pyklip_diffrender.io.files import write_fits
-    from pyklip_diffrender.wavefront.opd import read_opd, resample
+    from pyklip_diffrender.io.headers import fits_text
+    from pyklip_diffrender.wavefront.opd import as_opd_map, resample
 
     model = nircam_coronagraph(
-        filter, monochromatic=monochromatic, fov_pixels=size, device=run.device
+        filter,
+        image_mask=mask,
+        monochromatic=monochromatic,
+        fov_pixels=size,
+        device=run.device,
     )
-    map_ = None if opd is None else resample(read_opd(opd).data, model.npix)
-    with torch.no_grad():
-        image = model(map_, offset)
-    hdu = fits.PrimaryHDU(image.cpu().numpy())
-    hdu.header["PIXELSCL"] = (model.detector.pixelscale[0], "arcsec")
-    hdu.header["FILTER"] = filter.upper()
+    edge = size / 2 * min(model.detector.pixelscale)
+    if not np.abs(offset).max() < edge:
+        raise IncompatibleSetupError(
+            f"offset: got {offset[0]:g} {offset[1]:g}, expected a star inside the image, less "
+            f"than {edge:.3g} arcsec from its centre along x and y. Choose a larger size (--size)"
+        )
+    map_ = as_opd_map(opd)
+    pixels = model.calc_psf(opd=resample(map_.data, model.npix), star_offset=offset)["DET_SAMP"]
+    hdu = fits.PrimaryHDU(pixels.data, pixels.header)
+    del hdu.header["EXTNAME"]
+    hdu.header["BUNIT"] = ("", "fraction of the light that the pupil collects")
+    hdu.header["PUPILOPD"] = (fits_text(map_.name), "Pupil OPD source")
+    hdu.header["STAROFFX"] = (offset[0], "x of the star from the mask's centre, arcsec")
+    hdu.header["STAROFFY"] = (offset[1], "y of the star from the mask's centre, arcsec")
     write_fits(fits.HDUList([hdu]), output)
     click.echo(f"wrote {output}")
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 from pyklip_diffrender.cli.machine import free_memory
 from pyklip_diffrender.detection.recovery import TOGETHER
+from pyklip_diffrender.io.progress import duration
 from pyklip_diffrender.pattern import (
     PatternLibrary,
     combine_libraries,
@@ -41,7 +43,7 @@ _DERIVATIVES = 50e6
 
 
 def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, float]]:
-    """The steps of a reduction, each with its duration on two cores, s.
+    """The stages of a reduction, each with its duration on two cores, s.
 
     Parameters
     ----------
@@ -58,27 +60,27 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
     libraries = [systematics] if isinstance(systematics, PatternLibrary) else []
     library = combine_libraries([*libraries, package_library()])
     known = searched and known_systematics(sequence.science[0], library=library) is not None
-    unplaced = sum(each.first_pixel is None for each in sequence.science)
-    stars = {each.target for each in sequence.references}
-    if known and unplaced:
-        steps.append((f"place on the detector of {_frames(unplaced)}", _PLACE * fit * unplaced))
-    elif not known and (searched or systematics == "references") and stars:
-        frames = len(sequence.references)
-        steps.append((f"reference stars: {', '.join(sorted(stars))}", fit * frames**_FRAMES))
+    stars = Counter(each.target for each in sequence.references)
+    if known:
+        steps += [
+            (f"place of {each.name} on the detector", _PLACE * fit)
+            for each in sequence.science
+            if each.first_pixel is None
+        ]
+    elif searched or systematics == "references":
+        steps += [(f"reference star {star}", fit * n**_FRAMES) for star, n in stars.items()]
     joint = fit * count**_FRAMES * (1 + _TIED * (options.star_flux is not None))
-    steps.append((f"wavefront: {_frames(count)} of the target", joint))
+    steps.append(("wavefront", joint))
     if options.disk:
         refit = _DISK * joint
-        steps.append(("extended light, and the wavefront without it", refit))
-    steps.append(("search of point sources", _SEARCH * area * count))
+        steps.append(("extended light, and wavefront without it", refit))
+    steps.append(("search", _SEARCH * area * count + _WIDE * count * options.wide))
     if options.injections:
         seconds = joint + _SEARCH * area * count
         rounds = math.ceil(options.injections / TOGETHER)
         steps.append((f"{options.injections} injected planets", rounds * seconds))
     if options.completeness:
         steps.append(("completeness", _COMPLETENESS * area * count))
-    if options.wide:
-        steps.append(("search of the whole frames", _WIDE * count))
     steps.append(("products", _WRITE))
     return steps
 
@@ -93,21 +95,13 @@ def size_of_products(sequence: Sequence, *, derivatives: bool) -> float:
 def describe_plan(sequence: Sequence, options: ReduceOptions) -> str:
     """Steps, time and memory as lines of text; arguments as for `steps_of`."""
     steps = steps_of(sequence, options)
-    lines = [f"{k}. {name}: about {_duration(s)}" for k, (name, s) in enumerate(steps, 1)]
+    lines = [f"{k}. {name}: about {duration(s)}" for k, (name, s) in enumerate(steps, 1)]
     total = sum(seconds for _, seconds in steps)
     memory = _MEMORY + _MEMORY_PER_FRAME * len(sequence.science) * (options.size / 80) ** 2
     free = free_memory()
     of = "" if free is None else f" ({free / 1e9:.1f} GB are free)"
     lines.append(
-        f"in all about {_duration(total)} on two cores, up to twice as long if a companion makes "
+        f"in all about {duration(total)} on two cores, up to twice as long if a companion makes "
         f"a second fit necessary, and {memory / 1e9:.1f} GB of memory{of}"
     )
     return "\n".join(lines)
-
-
-def _frames(count: int) -> str:
-    return f"{count} file" if count == 1 else f"{count} files"
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext, redirect_stdout
+from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import replace
 from json import dumps, loads
 from pathlib import Path
@@ -12,13 +12,20 @@ from typing import Any
 
 import click
 
-from pyklip_diffrender.cli.estimate import describe_plan, size_of_products
+from pyklip_diffrender.cli.estimate import describe_plan, size_of_products, steps_of
 from pyklip_diffrender.cli.session import Run, with_options
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument.star_flux import star_flux_density
 from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.progress import numbered_stages, stage
-from pyklip_diffrender.reduction import EPOCHS, PRODUCTS, ReduceOptions, prepare, write_epochs
+from pyklip_diffrender.reduction import (
+    EPOCHS,
+    PRODUCTS,
+    ReduceOptions,
+    existing_products,
+    prepare,
+    write_epochs,
+)
 from pyklip_diffrender.scene.admission_table import SHORT
 from pyklip_diffrender.scene.catalogue_star import proper_motion
 from pyklip_diffrender.scene.sequence import Sequence
@@ -62,6 +69,8 @@ def run_reduction(
     # Libraries may print, too.
     with redirect_stdout(sys.stderr) if json else nullcontext():
         sequences = read()
+        if not sequences:
+            return
         if star_sed is not None:
             name = sequences[0].filter or "unknown"
             flux = star_flux_density(star_sed, name)
@@ -86,22 +95,42 @@ def run_reduction(
             return
         summaries = {}
         for preparation, folder in zip(prepared, folders, strict=True):
-            with numbered_stages():
+            with numbered_stages(dict(steps_of(preparation.sequence, checked))):
                 reduction = preparation.run(progress=run.progress)
                 with stage("products"):
                     written = reduction.write(folder, overwrite=overwrite, derivatives=derivatives)
             summary = loads((folder / "summary.json").read_text(encoding="utf-8"))
             summaries[folder.name] = summary
-            click.echo(f"\n{summary['sentence']}\n{with_options(summary['status']['advice'])}\n")
             click.echo(f"wrote {folder / 'report.html'} and {len(written) - 1} more files")
+            click.echo(f"\n{summary['sentence']}\n{with_options(summary['status']['advice'])}")
+        if overwrite:
+            _remove_others(output, folders)
         if several:
             first = sequences[0].science[0]
             motion = proper_motion(first.header, first.name)
             page, data = write_epochs(summaries, motion, output)
             summary = loads(data.read_text(encoding="utf-8"))
-            click.echo(f"wrote {page}, which compares the epochs")
+            click.echo(f"\nwrote {page}, which compares the epochs")
     if json:
         click.echo(dumps(summary, indent=2))
+
+
+def _remove_others(output: Path, folders: list[Path]) -> None:
+    """Remove the products of an earlier run from other folders than those of this one."""
+    earlier = [output]
+    page, data = (output / name for name in EPOCHS)
+    if data.exists():
+        with suppress(ValueError, KeyError, TypeError):
+            listed = loads(data.read_text(encoding="utf-8"))["epochs"]
+            # Only names, so that a file that was changed cannot point outside the folder.
+            earlier += [output / Path(each["folder"]).name for each in listed]
+    for folder in set(earlier) - set(folders):
+        for path in existing_products(folder):
+            path.unlink()
+        if folder != output and folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+    for path in (page, data):
+        path.unlink(missing_ok=True)
 
 
 def _day(sequence: Sequence) -> str:

@@ -24,13 +24,20 @@ _log = logging.getLogger(__name__)
 
 
 _ARGUMENTS = "|".join([
-    "completeness", "disk", "filter", "injections", "memory", "opd", "program", "size", "star_flux",
+    "completeness", "contrast", "disk", "filter", "hours", "injections", "mask", "memory",
+    "monochromatic", "offset", "opd", "overwrite", "program", "separation", "size", "star_flux",
     "star_flux_error", "systematics", "target", "threshold", "wide",
 ])  # fmt: skip
-"""Arguments of `reduce` and `fetch_calints` that are options of the command line."""
+"""Arguments that have the names of options of the command line."""
+
+_OTHERS = {"image_mask": "mask"}
+"""Arguments with other names than their options."""
 
 _BOTH = re.compile(r"\w+(=True)? \((--[\w-]+)( on the command line)?\)")
 _FIRST = re.compile(rf"(?<![\w.-])({_ARGUMENTS})(?=(, ({_ARGUMENTS}))*: )")
+_ASSIGNED = re.compile(rf"(?<![\w.-])({_ARGUMENTS})=(True|\.\.\.)")
+_CLASS = re.compile(r"\ban? [A-Z][a-z]+[A-Z]?\w*, (?=.* or )")
+_QUANTITY = re.compile(r" or an? [\w ]+ \([^()]* \* u\.\w+\)")
 
 
 def with_options(message: str) -> str:
@@ -42,9 +49,15 @@ def with_options(message: str) -> str:
     '--threshold: got -3 sigma, expected a positive number'
     >>> with_options("repeat the reduction with disk=True (--disk on the command line)")
     'repeat the reduction with --disk'
+    >>> with_options("a.fits exists; replace it with overwrite=True")
+    'a.fits exists; replace it with --overwrite'
     """
-    message = _BOTH.sub(r"\2", message)
-    return _FIRST.sub(lambda found: f"--{found[0].replace('_', '-')}", message)
+    for name, other in _OTHERS.items():
+        message = message.replace(f"{name}: ", f"{other}: ")
+    message = _QUANTITY.sub("", _CLASS.sub("", _BOTH.sub(r"\2", message)))
+    for pattern in (_FIRST, _ASSIGNED):
+        message = pattern.sub(lambda found: f"--{found[1].replace('_', '-')}", message)
+    return message
 
 
 class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]

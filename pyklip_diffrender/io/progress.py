@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Self
 
 from tqdm import tqdm
 
-__all__ = ["ProgressBar", "numbered_stages", "stage"]
+__all__ = ["ProgressBar", "duration", "numbered_stages", "stage"]
 
 _log = logging.getLogger(__name__)
 
 _STAGE: ContextVar[str] = ContextVar("stage", default="")
 
-_COUNT: ContextVar[int | None] = ContextVar("count", default=None)
-"""Number of stages that have begun; None where they are not numbered."""
+_SCHEDULE: ContextVar[_Schedule | None] = ContextVar("schedule", default=None)
+"""None where stages are not numbered."""
 
 _BUSY: ContextVar[bool] = ContextVar("busy", default=False)
 """Whether a bar is shown already; bars inside it are not."""
@@ -31,32 +32,100 @@ _COUNTED = "{desc}: {percentage:3.0f} % [{elapsed}<{remaining}]"
 _OPEN = "{desc}, step {n} [{elapsed}]"
 
 
+def duration(seconds: float) -> str:
+    """Return a duration as a person would say it: 40 s, 12 min, 3.5 h."""
+    if seconds < 100:
+        return f"{max(seconds, 1):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"
+
+
+@dataclass
+class _Schedule:
+    """Stages and how long they take, compared with what was expected.
+
+    Attributes
+    ----------
+    expected : dict of str to float
+        Durations of the stages that have not begun, s, by name.
+    count : int
+        Number of stages that have begun.
+    """
+
+    expected: dict[str, float]
+    count: int = 0
+    _own: float = 0.0
+    _began: float = field(default_factory=time.monotonic)
+    _done: float = 0.0
+    _spent: float = 0.0
+
+    def begin(self, name: str) -> str:
+        """Begin a stage; its name with its number."""
+        self.count += 1
+        self._own, self._began = self.expected.pop(name, 0.0), time.monotonic()
+        return f"{self.count}. {name}"
+
+    def end(self) -> None:
+        """End the stage: the next estimates are by the speed of all stages that were expected."""
+        if self._own:
+            self._done += self._own
+            self._spent += time.monotonic() - self._began
+        self._own = 0.0
+
+    @property
+    def left(self) -> str:
+        """Time that this stage and the next ones take, as far as they were expected."""
+        if not (self._own or self.expected):
+            return ""
+        spent, later = time.monotonic() - self._began, sum(self.expected.values())
+        pace = self._spent / self._done if self._done else 1.0
+        if spent <= self._own * pace:
+            return f", about {duration((self._own + later) * pace - spent)} left"
+        if not later:
+            return ""
+        # This stage takes longer than expected, and so may the next ones.
+        pace = (self._spent + spent) / (self._done + self._own)
+        return f", more than {duration(later * pace)} left"
+
+
 @contextmanager
-def numbered_stages() -> Iterator[None]:
-    """Number the stages inside from 1, unless they are part of stages that are numbered."""
-    outermost = _COUNT.get() is None
-    if outermost:
-        _COUNT.set(0)
+def numbered_stages(expected: Mapping[str, float] | None = None) -> Iterator[None]:
+    """Number the stages inside from 1, unless they are part of stages that are numbered.
+
+    Parameters
+    ----------
+    expected : mapping of str to float, optional
+        Durations of the stages, s, by name. With it, messages say how much time is left, by the
+        speed of the stages that have ended.
+    """
+    token = None
+    if _SCHEDULE.get() is None:
+        token = _SCHEDULE.set(_Schedule(dict(expected or {})))
     try:
         yield
     finally:
-        if outermost:
-            _COUNT.set(None)
+        if token is not None:
+            _SCHEDULE.reset(token)
+
+
+def _left() -> str:
+    schedule = _SCHEDULE.get()
+    return "" if schedule is None else schedule.left
 
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
     """Name what is being done, such as "wavefront", for bars inside and for the log."""
-    count = _COUNT.get()
-    if count is not None:
-        _COUNT.set(count + 1)
-        name = f"{count + 1}. {name}"
+    schedule = _SCHEDULE.get()
+    if schedule is not None:
+        name = schedule.begin(name)
     token = _STAGE.set(name)
-    _log.info("%s", name)
+    _log.info("%s%s", name, _left())
     try:
         yield
     finally:
         _STAGE.reset(token)
+        if schedule is not None:
+            schedule.end()
 
 
 class ProgressBar:
@@ -101,6 +170,7 @@ class ProgressBar:
         """Count steps, and show values such as ``chi2=4.1`` beside the name."""
         self._steps += steps
         text = ", ".join([self._name, *(f"{key} {value:.3g}" for key, value in values.items())])
+        text += "" if self._nested else _left()
         self._bar.set_description_str(text, refresh=False)
         self._bar.update(steps)
         if not self._nested and time.monotonic() - self._logged >= _INTERVAL:

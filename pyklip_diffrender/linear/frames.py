@@ -84,15 +84,12 @@ class LinearFrame(FrameRows):
     common : Tensor, (ny, nx), float64
         c of the pattern that the frames share, see `linear.noise`, in the data's unit; 0 without
         one.
-    light : Tensor, (ny, nx), float64
-        Starlight, in the data's unit, to which the correlated error of the model is proportional.
     """
 
     residual: Tensor
     weight: Tensor
     jacobian: Tensor
     common: Tensor
-    light: Tensor
 
     def image(self, values: Tensor) -> Tensor:
         """Change of the image, (..., ny, nx), for changes of the unknowns, (size, ...)."""

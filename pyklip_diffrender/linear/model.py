@@ -28,13 +28,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.linear.frames import LinearFrame, Unknown, pixel_pieces
-from pyklip_diffrender.linear.noise import (
-    UNCORRELATED,
-    CorrelatedError,
-    Noise,
-    curvature_of,
-    weighted_rows,
-)
+from pyklip_diffrender.linear.noise import Noise, weighted_rows
 
 __all__ = ["LinearModel", "TemplateProducts"]
 
@@ -76,8 +70,6 @@ class LinearModel:
         Mean and standard deviation of the priors; inf for no prior.
     curvature : Tensor, (unknowns, unknowns)
         J C^-1 J^T over all frames, float64.
-    correlated : CorrelatedError
-        Size of the error of the model that neighbouring pixels share.
 
     Examples
     --------
@@ -98,7 +90,6 @@ class LinearModel:
     mean: Tensor
     deviation: Tensor
     curvature: Tensor
-    correlated: CorrelatedError = UNCORRELATED
 
     def __repr__(self) -> str:
         ny, nx = self.frames[0].residual.shape
@@ -116,15 +107,7 @@ class LinearModel:
         return Noise(
             tuple(frame.weight for frame in self.frames),
             tuple(frame.common for frame in self.frames),
-            tuple(frame.light for frame in self.frames),
-            self.correlated,
         )
-
-    def with_correlated_error(self, error: CorrelatedError) -> LinearModel:
-        """Return the model with another size of the error that neighbouring pixels share."""
-        changed = replace(self, correlated=error)
-        curvature = curvature_of(changed.frames, changed.noise, len(self.vector))
-        return replace(changed, curvature=curvature)
 
     @cached_property
     def _weighted_rows(self) -> tuple[Tensor, ...]:
@@ -174,27 +157,10 @@ class LinearModel:
         )
         return tuple(whitened[k] for k in range(len(self.frames)))
 
-    @cached_property
-    def log_evidence(self) -> float:
-        """Logarithm of the evidence, up to a constant of the data, their noise and the unknowns.
-
-        Differences compare sizes of the correlated error.
-        """
-        images = [frame.residual - frame.image(self.step) for frame in self.frames]
-        offset = (self.vector + self.step - self.mean) / self.deviation
-        determinant = 2 * float((self._factor.diagonal() / self._scale).log().sum())
-        determinant += self.noise.log_determinant
-        return -0.5 * (self.noise.chi2(images) + float((offset**2).sum()) + determinant)
-
     def _pulled(self, images: Mapping[int, Tensor]) -> Tensor:
         """J C^-1 x of images x, (k, ny, nx) by frame, (unknowns, k), float64."""
         size = len(self.vector)
         total = torch.zeros(size, len(next(iter(images.values()))), dtype=torch.float64)
-        if self.correlated:
-            for k, image in images.items():
-                weighted = image * self.frames[k].weight.to(image.dtype)
-                total += (self._weighted_rows[k] @ weighted.flatten(1).T.float()).double()
-            return total
         for k, weighted in self.noise.weighted(images).items():
             frame = self.frames[k]
             on_rows = frame.jacobian.flatten(1) @ weighted.flatten(1).T.to(frame.jacobian.dtype)
@@ -320,7 +286,6 @@ class LinearModel:
             self.mean[remaining],
             self.deviation[remaining],
             self.curvature[remaining][:, remaining],
-            self.correlated,
         )
 
     def _predictors(self, frame: int) -> Tensor:

@@ -27,7 +27,6 @@ from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.companions import bright_companions
 from pyklip_diffrender.refinement.conclusion import conclude
-from pyklip_diffrender.refinement.correlated_error import fitted_correlated_error
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.mode_priors import ModePriors, count_modes_below
 from pyklip_diffrender.refinement.objective import State
@@ -273,25 +272,10 @@ class Annealing:
             best = self._with_wider_prior(best)
         if best.flux <= 0:
             return best, Status.DIVERGED
-        if self.settings.correlated_error and self.problems[0].systematics is not None:
-            best = self._with_correlated_error(best)
         if not converged:
             return best, Status.ITERATION_LIMIT
         explained = self.objective.chi2_per_pixel(best) < _EXPLAINED
         return best, Status.CONVERGED if explained else Status.MODEL_MISMATCH
-
-    def _with_correlated_error(self, state: State) -> State:
-        """Fit the size of the error that neighbouring pixels share, and go on with it."""
-        kappa = self._unexplained(state)
-        robust = self.objective.robust if kappa else math.inf
-        linear = self.solver.linear_model(state, kappa, self._all_modes, robust)
-        error = fitted_correlated_error(linear)
-        del linear  # The next one is as large.
-        if not error:
-            return state
-        _log.info("error of the model that neighbouring pixels share: %s", error)
-        self.solver.set_correlated_error(error)
-        return self._settled(state, _STEPS)
 
     def _without_outliers(self, state: State) -> State:
         """Leave out bad pixels that stand alone, and go on without them."""

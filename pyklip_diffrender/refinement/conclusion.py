@@ -93,6 +93,5 @@ def conclude(
         log_evidence=update.log_evidence,
         stored_linear=linear,
         systematics=problems[0].systematics,
-        correlated_error=solver.objective.correlated,
         **about,
     )

@@ -25,7 +25,6 @@ from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.frames import LinearFrame, Unknown
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.linear.noise import CorrelatedError
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.scene.objects import Planet
@@ -46,9 +45,7 @@ __all__ = [
     "text_hdu",
 ]
 
-_DATACLASSES = {
-    each.__name__: each for each in (GaussNewton, WavefrontPrior, Planet, CorrelatedError)
-}
+_DATACLASSES = {each.__name__: each for each in (GaussNewton, WavefrontPrior, Planet)}
 _DTYPES = {"torch.float64": torch.float64, "torch.float32": torch.float32}
 
 
@@ -242,7 +239,7 @@ def observation_of(hdus: fits.HDUList, facts: dict[str, Any], frame: int) -> Obs
     )
 
 
-_FRAME_ARRAYS = ("residual", "weight", "jacobian", "rows", "drift", "common", "light")
+_FRAME_ARRAYS = ("residual", "weight", "jacobian", "rows", "drift", "common")
 
 
 def linear_hdus(linear: LinearModel) -> list[Any]:
@@ -259,8 +256,6 @@ def linear_hdus(linear: LinearModel) -> list[Any]:
         fits.BinTableHDU.from_columns(columns, name="UNKNOWNS"),
         fits.ImageHDU(linear.curvature.numpy(), name="CURVATURE"),
     ]
-    hdus[1].header["SHARED"] = (linear.correlated.shared, "correlated error, of the starlight")
-    hdus[1].header["OWN"] = (linear.correlated.own, "that of single frames")
     for k, frame in enumerate(linear.frames):
         for name in _FRAME_ARRAYS:
             array = getattr(frame, name).numpy()
@@ -302,8 +297,6 @@ def linear_of(hdus: fits.HDUList, frames: int, name: str) -> LinearModel:
         torch.from_numpy(native_float64(table[key])) for key in ("VECTOR", "MEAN", "DEVIATION")
     )
     curvature = torch.from_numpy(native_float64(hdus["CURVATURE"].data))
-    header = hdus["CURVATURE"].header
-    correlated = CorrelatedError(header["SHARED"], header["OWN"])
     count = len(unknowns)
     wrong = curvature.shape != (count, count) or any(
         len(part.jacobian) != len(part.rows)
@@ -316,4 +309,4 @@ def linear_of(hdus: fits.HDUList, frames: int, name: str) -> LinearModel:
             f"curvature {tuple(curvature.shape)}, rows {[len(part.rows) for part in parts]}. "
             "Write the fit again"
         )
-    return LinearModel(unknowns, tuple(parts), vector, mean, deviation, curvature, correlated)
+    return LinearModel(unknowns, tuple(parts), vector, mean, deviation, curvature)

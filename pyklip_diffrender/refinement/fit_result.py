@@ -23,7 +23,6 @@ from pyklip_diffrender.io.files import require_new, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.linear.noise import UNCORRELATED, CorrelatedError
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.refinement.fit_file import (
@@ -53,7 +52,6 @@ _PLAIN = (
     "basis",
     "chi2_per_pixel",
     "model_error",
-    "correlated_error",
     *_ARRAYS,
     "scales",
     "prior_ratios",
@@ -85,9 +83,6 @@ class Refinement:
     model_error : float
         Assumed error of the star model, as a fraction of the star's light in a pixel, added in
         quadrature to the noise; 0 if chi-squared per pixel is near 1.
-    correlated_error : CorrelatedError
-        Size of the error of the model that neighbouring pixels share, as a fraction of the
-        starlight, see `GaussNewton.correlated_error`. Errors include it, `chi2_per_pixel` does not.
     companions, companion_errors : ndarray, (companions, 3)
         Companions that were part of the fit: contrast, and x and y from the star in the first
         frame, arcsec.
@@ -137,7 +132,6 @@ class Refinement:
     basis: Basis
     stored_linear: LinearModel | None
     model_error: float = math.nan
-    correlated_error: CorrelatedError = UNCORRELATED
     companions: Image = field(default_factory=lambda: np.zeros((0, 3)))
     companion_errors: Image = field(default_factory=lambda: np.zeros((0, 3)))
     scales: dict[str, float] = field(default_factory=dict)
@@ -168,11 +162,6 @@ class Refinement:
                 "Frames": ", ".join(frame.observation.name for frame in self.frames),
                 "Chi-squared per pixel": f"{self.chi2_per_pixel:.3g}",
                 "Model error": f"{100 * self.model_error:.2g} % of the star",
-                "Error shared by neighbouring pixels": (
-                    f"{100 * self.correlated_error.total:.2g} % of the starlight"
-                    if self.correlated_error
-                    else None
-                ),
                 "Wavefront map": self.initial.name,
                 "Systematics": None if self.systematics is None else self.systematics.name,
                 "Companions in the fit": len(self.companions) or None,
@@ -424,7 +413,6 @@ class Refinement:
             "frames": len(self.frames),
             "chi2_per_pixel": self.chi2_per_pixel,
             "model_error": self.model_error,
-            "correlated_error": self.correlated_error.total,
             "seconds": self.seconds,
             "seed": self.seed,
             "opd": self.initial.name,

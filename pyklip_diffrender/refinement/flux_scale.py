@@ -98,8 +98,8 @@ def to_jansky(star_flux: float | str | u.Quantity) -> float:
         jansky = float(value.to_value(u.Jy))
     except (TypeError, ValueError) as error:  # Units that cannot be converted are TypeErrors.
         raise IncompatibleSetupError(
-            f"star_flux: got {star_flux!r}, expected a flux density such as 0.45 * u.Jy or "
-            "'0.45 Jy', or an AB magnitude such as 9.8 * u.ABmag"
+            f"star_flux: got {star_flux!r}, expected a flux density such as '0.45 Jy' or "
+            "an AB magnitude (9.8 * u.ABmag)"
         ) from error
     if not 0 < jansky < np.inf:
         raise IncompatibleSetupError(f"star_flux: got {star_flux}, expected a positive number")

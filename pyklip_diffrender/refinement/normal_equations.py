@@ -11,7 +11,7 @@ from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
 from pyklip_diffrender.linear.frames import LinearFrame, pixel_pieces
-from pyklip_diffrender.linear.noise import curvature_of, summed_rows
+from pyklip_diffrender.linear.noise import summed_rows
 from pyklip_diffrender.refinement.objective import Objective, State
 
 __all__ = ["NormalEquations", "linearise"]
@@ -100,14 +100,14 @@ def linearise(
     residuals = objective.residuals(state)
     whitened = noise.inverse(dict(enumerate(residuals)))
     for k, (forward, point) in enumerate(zip(objective.forwards, state.points, strict=True)):
-        residual, weight, common, light = (
-            each.cpu() for each in (residuals[k], noise.weight[k], noise.common[k], noise.light[k])
+        residual, weight, common = (
+            each.cpu() for each in (residuals[k], noise.weight[k], noise.common[k])
         )
         rendered = jacobians[k] if jacobians else forward.jacobian(point, modes)
         part = state.unknowns.rows[k]
         rows, drift = part.rows[: len(rendered)], part.drift if modes else part.drift[:0]
         first = part.first_mode
-        frames.append(LinearFrame(rows, drift, first, residual, weight, rendered, common, light))
+        frames.append(LinearFrame(rows, drift, first, residual, weight, rendered, common))
         product, pulled = _accumulate(
             rendered.flatten(1), weight.flatten(), whitened[k].cpu().flatten()
         )
@@ -119,9 +119,7 @@ def linearise(
             gradient.index_add_(0, to, pulled[which])
             for onto, selection in ((rows, slice(None)), (drift, leading)):
                 curvature[to[:, None], onto] += product[which, selection]
-    if noise.correlated:
-        curvature = curvature_of(frames, noise.to_cpu(), size)
-    elif noise.shares_pattern:
+    if noise.shares_pattern:
         rows = summed_rows(frames, size)
         ones = torch.ones(rows.shape[1], dtype=torch.float64)
         curvature -= _accumulate(rows, ones, ones)[0]

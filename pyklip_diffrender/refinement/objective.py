@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.linear.noise import UNCORRELATED, Noise
+from pyklip_diffrender.linear.noise import Noise
 from pyklip_diffrender.refinement.forward import Forward, Point
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.unknowns import Unknowns
@@ -58,15 +58,12 @@ class Objective:
     shares_pattern : bool
         Whether all frames show the same pixels of the detector, and the error of the systematics
         is therefore one unknown in all of them; otherwise it is noise of every frame.
-    correlated : CorrelatedError
-        Error of the model that neighbouring pixels share; none until it is set.
     """
 
     def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
         self.forwards = tuple(forwards)
         self.shares_pattern = _share_pattern([forward.problem for forward in self.forwards])
         self.robust = robust
-        self.correlated = UNCORRELATED
 
     @property
     def pixels(self) -> int:
@@ -126,8 +123,7 @@ class Objective:
             seen = sum((weight * s) ** 2 for weight, s in zip(weights, light, strict=True))
             scale = error / torch.sqrt(1 + error**2 * seen)
             common = [s * scale for s in light]
-        star = tuple(point.light.clamp(min=0.0) for point in state.points)
-        return Noise(tuple(weights), tuple(common), star, self.correlated)
+        return Noise(tuple(weights), tuple(common))
 
     def residual(self, frame: int, point: Point) -> Tensor:
         """Data minus model; 0 where masked."""
@@ -144,8 +140,7 @@ class Objective:
 
     def chi2_per_pixel(self, state: State) -> float:
         """Chi-squared per pixel without a model error."""
-        noise = replace(self.errors(state, 0.0, math.inf), correlated=UNCORRELATED)
-        return self.chi2(state, noise) / self.pixels
+        return self.chi2(state, self.errors(state, 0.0, math.inf)) / self.pixels
 
     def model_error(self, state: State) -> float:
         """The model error kappa at which chi-squared per pixel is 1, at least 0 and at most 10."""

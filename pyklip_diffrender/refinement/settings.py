@@ -33,7 +33,7 @@ _LONG_WAVE = 2.4e-6
 
 _SWITCHES = (
     "wavefront", "grow_basis", "coarse_first", "widen_prior", "companions_if_stalled",
-    "accurate_steps", "correlated_error",
+    "accurate_steps",
 )  # fmt: skip
 """Fields of `GaussNewton` that are True or False."""
 
@@ -110,11 +110,6 @@ class GaussNewton:
     relinearise : float
         Relative error of derivatives (radians of phase, rms over the pupil) beyond which the
         response to the wavefront is recomputed, see ``linear.response_cache``.
-    correlated_error : bool
-        Fit the size of an error of the model that is proportional to starlight and correlated over
-        about a pixel, see ``pyklip_diffrender.linear.noise``, where the pattern of the model's
-        error is known or shared. Errors of the result include it. No preset does: a fit takes two
-        to three times as long, and what it gains on real frames has not been established.
     accurate_steps : bool
         Follow a step that fails, gains less than expected or is the last by steps with derivatives
         of the model itself, see ``pyklip_diffrender.refinement.accurate_step``. Fits of bright
@@ -167,7 +162,6 @@ class GaussNewton:
     min_model_error: float = 0.0
     relinearise: float = 0.05
     accurate_steps: bool = False
-    correlated_error: bool = False
     robust: float = math.inf
     star_flux_error: float | None = None
     memory: float | None = None

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.linear.noise import CorrelatedError, Noise
+from pyklip_diffrender.linear.noise import Noise
 from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.refinement.accurate_step import ModelDerivatives, accurate_step
 from pyklip_diffrender.refinement.forward import Forward
@@ -307,11 +307,6 @@ class Solver:
         vector[: len(step)] += step
         return self.objective.at(state.unknowns, state.unknowns.clamped(vector))
 
-    def set_correlated_error(self, error: CorrelatedError) -> None:
-        """Include an error of the model that neighbouring pixels share from now on."""
-        self.objective.correlated = error
-        self._forget_weights()
-
     def _forget_weights(self) -> None:
         """Keep the Jacobians of the last equations, but not what follows from their weights."""
         if self._equations is not None:
@@ -361,7 +356,6 @@ class Solver:
             mean=unknowns.initial()[:count],
             deviation=self.prior_deviation(unknowns)[:count],
             curvature=equations.curvature,
-            correlated=self.objective.correlated,
         )
 
     def posterior(self, state: State) -> EvidenceUpdate:

@@ -370,11 +370,11 @@ class Observation:
             corners = np.tile(np.subtract(first_pixel, self.first_pixel), (len(self), 1))
         ny, nx = self.shape
         if corners.min() < 0 or (corners + size > (nx, ny)).any():
+            x, y = self.center[0]
             raise ShapeError(
-                f"{self.name}: {size} x {size} pixels about {tuple(self.center[0])} do not fit "
-                f"into {nx} x {ny}. Choose a smaller size"
+                f"{self.name}: {size} x {size} pixels about the star at x, y = {x:.1f}, {y:.1f} do "
+                f"not fit into {nx} x {ny}. Choose a smaller size (--size)"
             )
-
         return self._cut([Window(int(y), int(x), (size, size)) for x, y in corners])
 
     def within(self, window: Window) -> Observation:
@@ -393,8 +393,8 @@ class Observation:
         if not np.any(part.valid, axis=(1, 2)).all():
             raise NoValidPixelsError(
                 f"{self.name}: no valid pixel within {window.shape[1]} x {window.shape[0]} "
-                "pixels of the star. Check the star centre in the header, or fit a larger field "
-                "with fit_pixels"
+                "pixels of the star. Check the star centre in the header, or fit more pixels: a "
+                "larger size (--size)"
             )
         return part
 

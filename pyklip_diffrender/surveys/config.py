@@ -26,7 +26,7 @@ _SETTINGS = (
     "free", "own", "wavefront", "cycles", "grow_basis", "coarse_first", "deviations",
     "drift_cycles", "max_companions", "companion_threshold", "companions_if_stalled",
     "response_npix", "response_wavelengths", "max_iterations", "tolerance", "min_model_error",
-    "relinearise", "accurate_steps", "correlated_error", "robust",
+    "relinearise", "accurate_steps", "robust",
 )  # fmt: skip
 """Fields of GaussNewton whose values TOML can hold."""
 
