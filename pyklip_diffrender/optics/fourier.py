@@ -20,7 +20,15 @@ from torch import Tensor
 
 from pyklip_diffrender.optics.grid import PupilGrid
 
-__all__ = ["MatrixFourier", "RowTransform", "centred", "kernel", "symmetric", "tilt_phases"]
+__all__ = [
+    "MatrixFourier",
+    "RowTransform",
+    "centred",
+    "fold",
+    "kernel",
+    "symmetric",
+    "tilt_phases",
+]
 
 
 def centred(grid: PupilGrid) -> PupilGrid:
@@ -93,7 +101,7 @@ class RowTransform:
         """(..., pupil, k) to (..., image, k)."""
         if not self._image_folds:
             return self._matrix @ field
-        even, odd = _fold(field) if self._pupil_folds else (field, field)
+        even, odd = fold(field) if self._pupil_folds else (field, field)
         return _unfold(
             _real_product(self._cosine, even),
             self.sign * _real_product(self._sine, odd),
@@ -104,7 +112,7 @@ class RowTransform:
         """(..., image, k) to (..., pupil, k)."""
         if not self._image_folds:
             return self._matrix.conj().T @ field
-        even, odd = _fold(field)
+        even, odd = fold(field)
         cosine = _real_product(self._cosine.T, even)
         sine = -self.sign * _real_product(self._sine.T, odd)
         return _unfold(cosine, sine, self.sizes[1]) if self._pupil_folds else cosine + 1j * sine
@@ -118,7 +126,7 @@ def symmetric(positions: Tensor) -> bool:
     return float((positions + positions.flip(0)).abs().max()) < 1e-12 * step * len(positions)
 
 
-def _fold(field: Tensor) -> tuple[Tensor, Tensor]:
+def fold(field: Tensor) -> tuple[Tensor, Tensor]:
     """Even and odd parts along axis -2 on the half at and above zero, as sums over +-."""
     half = field.shape[-2] // 2
     upper, lower = field[..., half:, :], field[..., :half, :].flip(-2)
