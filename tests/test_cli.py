@@ -536,8 +536,8 @@ def test_overwriting_leaves_no_products_of_other_epochs(
     (products / "other").mkdir()
     (products / "other" / "report.html").write_text("mine")
     listed = [{"folder": name} for name in ("2022-01-02", "2022-07-30", "../../frames")]
-    (products / "epochs.json").write_text(json.dumps({"epochs": listed}))
-    (products / "epochs.html").write_text("earlier")
+    (products / "comparison.json").write_text(json.dumps({"reductions": listed}))
+    (products / "comparison.html").write_text("earlier")
     arguments = ["reduce", str(frames), "--opd", "flat", "-o", str(products), "--size", "8"]
     assert main(arguments) == 1
     assert main([*arguments, "--overwrite"]) == 0
