@@ -32,7 +32,7 @@ from pyklip_diffrender.pattern import PatternChoice
 from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     backend,
-    reduction,
+    klip_call,
     subtract_by_refinement,
 )
 from pyklip_diffrender.pyklip_backend.throughput import on_product, throughput_map
@@ -273,7 +273,7 @@ def test_copies_with_added_sources_are_not_fitted_again(
 ) -> None:
     """A fit of flux and background is linear, so that a new fit would do exactly the same."""
     # The map of the throughput takes seconds, and has tests of its own.
-    monkeypatch.setattr(reduction, "throughput_map", lambda fit: np.ones((32, 32)))
+    monkeypatch.setattr(klip_call, "throughput_map", lambda fit: np.ones((32, 32)))
     made = dataset(frames, small, fit=ALIGNED, error=1e3, plan="off")
     untouched = copy.deepcopy(made)
     pixels = np.indices(frames.shape[1:])

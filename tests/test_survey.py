@@ -36,7 +36,7 @@ from pyklip_diffrender.errors import (
 )
 from pyklip_diffrender.reduction import ReduceOptions
 from pyklip_diffrender.refinement import FrameFit, GaussNewton
-from pyklip_diffrender.surveys import execution, folders, page, runs, work
+from pyklip_diffrender.surveys import execution, folders, runs, survey_page, work
 from pyklip_diffrender.surveys.config import read_config
 from pyklip_diffrender.surveys.driver import run_survey, survey
 from pyklip_diffrender.surveys.jobs import Injection, Job, jobs_of
@@ -558,7 +558,7 @@ def test_a_survey_of_many_stars_has_one_picture(tmp_path: Path) -> None:
     (job,) = planned(inputs(tmp_path / "data", 1))
     record = {"status": "finished", "result": result(), "seconds": 1.0}
     rows = [(replace(job, name=f"star {k}"), record) for k in range(12)]
-    text = page.page([*rows, (job, None)], "survey")
+    text = survey_page.page([*rows, (job, None)], "survey")
     assert "12 of 13 jobs finished, 1 not finished yet" in text
     assert "12 sequences reduced, 12 companion candidates in 12 of them." in text
 
