@@ -166,7 +166,7 @@ def computed_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
         "left_out": (image(hdus, "LEFT_OUT", 0), image(hdus, "LEFT_OUT_ERROR", 0)),
         "_calibration_errors": np.array(facts["calibration_errors"], dtype=float),
         "sky": Sky(**facts["sky"]),
-        "_provenance": {
+        "provenance": {
             key: list(value) if isinstance(value, tuple) else value
             for key, value in facts["provenance"].items()
         },
