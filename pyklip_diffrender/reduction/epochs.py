@@ -47,7 +47,7 @@ def compare_epochs(
     Parameters
     ----------
     summaries : sequence of dict
-        Those of `summarise`, in order of time.
+        Summaries from `summarise`, in order of time.
     motion : tuple of float or None
         Proper motion of the star, mu_alpha cos(delta) and mu_delta, arcsec per year; None if it is
         not known, and then no source in the background is recognised.

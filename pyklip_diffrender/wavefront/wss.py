@@ -139,7 +139,7 @@ def load_wss_opd(
 
 def _warn_of_terms(name: str, reason: Exception) -> None:
     warnings.warn(
-        f"{name}: the map is what the sensing camera saw. It contains that camera's own "
+        f"{name}: the map is as the sensing camera saw it, with that camera's own "
         "aberration and the telescope's field dependence at the sensing field point, typically "
         "63 nm rms in all where the telescope alone has 54 nm rms, because stpsf's models of them "
         f"are not available ({reason}). A refinement with a wide enough prior corrects for it; "
