@@ -177,7 +177,7 @@ def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
         _star(detection, frame),
         (
             f"Image of {observation.target} behind the coronagraph, in {unit}.",
-            f"The observed image{mean}. The scale is linear near 0 and logarithmic in bright parts; "
+            f"Observed{mean}. The scale is linear near 0 and logarithmic in bright parts; "
             "the cross marks the star.",
         ),
         (
