@@ -513,6 +513,17 @@ def test_an_integration_that_deviates_is_left_out_and_named(
     assert away.std() < 0.5
 
 
+def test_integrations_have_their_numbers_in_the_file(tmp_path: Path) -> None:
+    def change(arrays: dict[str, np.ndarray]) -> None:
+        arrays["DQ"][1] = 1
+        arrays["SCI"][5] *= 0.6
+
+    remarks = cube(tmp_path / "x.fits", change).remarks
+    assert [remark.split(" is left out")[0] for remark in remarks] == [
+        "integration 2 of 8", "integration 6 of 8",
+    ]  # fmt: skip
+
+
 def test_an_afterglow_in_one_integration_is_masked(tmp_path: Path) -> None:
     def change(arrays: dict[str, np.ndarray]) -> None:
         y, x = np.indices((SIDE, SIDE))

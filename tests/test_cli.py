@@ -536,8 +536,8 @@ def test_overwriting_leaves_no_products_of_other_epochs(
     (products / "other").mkdir()
     (products / "other" / "report.html").write_text("mine")
     listed = [{"folder": name} for name in ("2022-01-02", "2022-07-30", "../../frames")]
-    (products / "epochs.json").write_text(json.dumps({"epochs": listed}))
-    (products / "epochs.html").write_text("earlier")
+    (products / "comparison.json").write_text(json.dumps({"reductions": listed}))
+    (products / "comparison.html").write_text("earlier")
     arguments = ["reduce", str(frames), "--opd", "flat", "-o", str(products), "--size", "8"]
     assert main(arguments) == 1
     assert main([*arguments, "--overwrite"]) == 0
@@ -706,7 +706,7 @@ def test_mast_is_asked_for_the_map_of_the_date(
     capsys.readouterr()
     assert main([*arguments, "--opd-date", "after", "--overwrite"]) == 1
     assert "no route to host" in capsys.readouterr().err
-    assert asked == [("2022-07-30T02:03:04", "closest"), ("2022-07-30T02:03:04", "after")]
+    assert asked == [("2022-07-30T02:03:04", "nearest"), ("2022-07-30T02:03:04", "after")]
 
 
 @pytest.mark.parametrize(

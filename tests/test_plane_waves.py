@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -53,14 +52,18 @@ def test_plane_waves_are_propagated_as_any_field(
     wavefront, checked = start(model, values)
     waves = model.plane_waves(wavefront, checked, 9)
     assert waves is not None
-    cycles = torch.tensor([[0, 0], [3, -2], [-9, 9], [1, 7]])
     grid = wavefront.grid
-    turns = (
-        cycles[:, 0, None, None] * grid.x + cycles[:, 1, None, None] * grid.y[:, None]
-    ) / grid.diameter
-    moved = wavefront.field * torch.exp(2j * torch.pi * turns)
-    expected = model.propagate(Wavefront(moved, wavefront.wavelength, wavefront.grid), checked)
-    assert difference(waves.fields(cycles), expected) < 1e-12
+    for fx, fy in ((0, slice(0, 3)), (3, slice(2, 3)), (-9, slice(8, 10))):
+        signs = torch.tensor([1, -1])
+        cycles_x = (fx * signs)[:, None, None].expand(2, 2, fy.stop - fy.start)
+        cycles_y = (signs[:, None] * torch.arange(fy.start, fy.stop)).expand(cycles_x.shape)
+        turns = (
+            cycles_x[..., None, None] * grid.x + cycles_y[..., None, None] * grid.y[:, None]
+        ) / grid.diameter
+        moved = wavefront.field * torch.exp(2j * torch.pi * turns)
+        expected = model.propagate(Wavefront(moved, wavefront.wavelength, grid), checked)
+        # The light of the outer cells is wrapped, which changes these fields by up to 3e-4.
+        assert difference(waves.fields(fx, fy), expected) < 1e-3
 
 
 def test_without_the_lattice_there_are_no_plane_waves() -> None:
@@ -109,9 +112,10 @@ def test_derivatives_are_those_of_modes_propagated_one_by_one(route: str, basis:
     factor = 2j * torch.pi / 4.5e-6 * 1e-9
     moved = Wavefront(modes * factor * wavefront.field, 4.5e-6, wavefront.grid)
     expected = model.propagate(moved, checked).to(torch.complex64)
-    # Parts that begin and end anywhere: between kinds of modes, and between a cosine and its sine.
-    cuts = [0, 1, min(50, count // 2), count - 6, count - 5, count - 2, count]
-    for first, last in pairwise(cuts):
-        (change,) = fields.changes(slice(first, last))
-        assert change.shape == expected[first:last].shape
-        assert difference(change, expected[first:last]) < 1e-6
+    seen = torch.zeros(count, dtype=torch.int64)
+    for modes, (change,) in fields.batches(10):
+        assert 0 < len(modes) <= 10
+        assert difference(change, expected[modes]) < (1e-3 if route == "lattice" else 1e-6)
+        seen[modes] += 1
+    # The modes with fx = 0 may come twice.
+    assert (seen > 0).all()

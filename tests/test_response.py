@@ -76,7 +76,7 @@ MODES = (0, 1, 29, 41, 54, 57, 90, len(BASIS) - 1)
     [{}, pytest.param({"monochromatic": None, "nlambda": 2}, marks=pytest.mark.slow)],
     ids=["1", "2"],
 )
-@pytest.mark.parametrize(("npix", "tolerance"), [(NPIX, 1e-4), (128, 0.025)])
+@pytest.mark.parametrize(("npix", "tolerance"), [(NPIX, 1e-3), (128, 0.025)])
 def test_wavefront_response_is_the_slope_of_the_fine_model(
     opd: torch.Tensor,
     values: dict[str, torch.Tensor],
@@ -84,7 +84,7 @@ def test_wavefront_response_is_the_slope_of_the_fine_model(
     npix: int,
     tolerance: float,
 ) -> None:
-    """To single precision on the same grid; a coarse copy is off by a percent or two."""
+    """To the wrapped light of the occulter on the same grid; a coarse copy is off by a percent."""
     model = system(**changes)
     response = WavefrontResponse(model, BASIS, opd, values, npix=npix)
     assert response.coarse.npix == npix
@@ -148,6 +148,12 @@ def test_responses_that_are_not_stored_are_the_same(
     assert float((every[0][0] - every[0][1]).norm() / every[0][0].norm()) > 0.01
 
 
+def stored(response: WavefrontResponse) -> list[torch.Tensor]:
+    """Derivatives of the field, for each wavelength, in the order of the modes."""
+    batches = [changes for _, changes in response._batches()]
+    return [torch.cat(each) for each in zip(*batches, strict=True)]
+
+
 def relative(fields: list[torch.Tensor], expected: list[torch.Tensor], edge: int = 0) -> float:
     """Relative difference of fields, without so many pixels at the edges."""
     inside = slice(edge, -edge or None)
@@ -179,16 +185,16 @@ def test_derivatives_follow_changes_in_the_last_pupil(
     for each in MOVES if name == "all" else (name,):
         after[each] = before[each] + torch.as_tensor(MOVES[each])
     kept, anew = (WavefrontResponse(model, BASIS, start, at, npix=64) for at in (before, after))
-    old, expected = kept._changes(slice(0, None)), anew._changes(slice(0, None))
+    old, expected = stored(kept), stored(anew)
     old = [each.clone() for each in old]
     last = LastPupil(kept.coarse)
     assert 0.05 < last.change(before, after) < 1
     kept.follow(last, after)
-    followed = kept._changes(slice(0, None))
+    followed = stored(kept)
     assert relative(followed, expected) < 0.35 * relative(old, expected)
     assert relative(followed, expected, 12) < 0.2 * relative(old, expected, 12)
     kept.follow(last, before)
-    assert relative(kept._changes(slice(0, None)), old) < 1e-5
+    assert relative(stored(kept), old) < 1e-5
 
 
 def test_frames_share_derivatives_that_follow(
@@ -201,15 +207,15 @@ def test_frames_share_derivatives_that_follow(
     moved = {**values, "star_offset": values["star_offset"] + torch.tensor([0.008, 0.0])}
     far = {**values, "star_offset": values["star_offset"] + torch.tensor([0.05, 0.0])}
     first = responses.near(start, values)
-    before = [each.clone() for each in first._changes(slice(0, None))]
+    before = [each.clone() for each in stored(first)]
     assert responses.near(start, moved) is first
-    assert relative(first._changes(slice(0, None)), before) > 0.05
+    assert relative(stored(first), before) > 0.05
     assert 0.01 < responses.farthest < 0.05
     second = responses.near(start, far)
     assert second is not first
     assert responses.near(start, values) is first
     assert responses.near(start, far) is second
-    assert relative(first._changes(slice(0, None)), before) < 1e-5
+    assert relative(stored(first), before) < 1e-5
     names = ("star_offset", "blur")
     fields = model.fields(start, **moved)
     slopes = responses.parameters(start, values, names, model.fields(start, **values))

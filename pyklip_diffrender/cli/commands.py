@@ -110,7 +110,12 @@ Examples:
 @click.argument("frames", type=file_type(), nargs=-1)
 @option("--target", metavar="STAR", section="Frames",
         help="Name of the target, in any spelling; the other stars are references.")  # fmt: skip
-@option("--filter", metavar="NAME", section="Frames", help="Which filter, if there are several.")
+@option(
+    "--filter",
+    metavar="NAME",
+    section="Frames",
+    help="Which filter; default: all of the target's, one by one.",
+)
 @archive
 @wavefront
 @search
@@ -128,8 +133,9 @@ def reduce_frames(
 ) -> None:
     """Subtract the star from all rolls of a target and search for planets.
 
-    FRAMES are calints files, or one folder of them. With --program they come from MAST. Epochs more
-    than 5 days apart are reduced one by one, into a folder for each, and compared on one page.
+    FRAMES are calints files, or one folder of them. With --program they come from MAST. Filters,
+    and epochs more than 5 days apart, are reduced one by one, into a folder for each, and compared
+    on one page.
     """
     require_frames(frames, program)
 
@@ -144,7 +150,7 @@ def reduce_frames(
             files = fetch_calints(
                 program, target, filter=filter, folder=cache, progress=run.progress
             )
-        return Sequence.by_epoch(files, target=target, filter=filter)
+        return Sequence.by_filter_and_epoch(files, target=target, filter=filter)
 
     from pyklip_diffrender.cli.reducing import run_reduction
 

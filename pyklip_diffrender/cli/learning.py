@@ -120,7 +120,7 @@ def learn(
         device=run.device,
         progress=run.progress,
     )
-    library.write(output)
+    library.write(output, overwrite=overwrite)
     table = library.validation
     for name in ("chi2_alone", "chi2_with_others", "shown"):
         table[name].info.format = ".2f"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import abc
 from collections.abc import Callable
 from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import replace
@@ -19,12 +20,12 @@ from pyklip_diffrender.instrument.star_flux import star_flux_density
 from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.reduction import (
-    EPOCHS,
+    COMPARISON,
     PRODUCTS,
     ReduceOptions,
     existing_products,
     prepare,
-    write_epochs,
+    write_comparison,
 )
 from pyklip_diffrender.scene.admission_table import SHORT
 from pyklip_diffrender.scene.catalogue_star import proper_motion
@@ -53,7 +54,7 @@ def run_reduction(
     star_sed: Path | None,
     **options: Any,
 ) -> None:
-    """Reduce the epochs of a target, write all products and say what they show.
+    """Reduce the epochs and filters of a target, write all products and say what they show.
 
     A dry run makes all the checks of a run, and stops before the first fit.
     """
@@ -65,37 +66,38 @@ def run_reduction(
         checked = ReduceOptions(device=run.device, **options)
     except DiffrenderError as error:
         raise click.UsageError(with_options(str(error))) from error
-    run.claim_folder(output, (*PRODUCTS, *EPOCHS), overwrite)
+    run.claim_folder(output, (*PRODUCTS, *COMPARISON), overwrite)
     # Libraries may print, too.
     with redirect_stdout(sys.stderr) if json else nullcontext():
         sequences = read()
         if not sequences:
             return
-        if star_sed is not None:
-            name = sequences[0].filter or "unknown"
-            flux = star_flux_density(star_sed, name)
-            click.echo(f"star: {flux.value:.4g} Jy in {name}, by {star_sed.name}")
-            checked = replace(checked, star_flux=flux)
         several = len(sequences) > 1
-        folders = [output / _day(each) for each in sequences] if several else [output]
+        folders = [output / name for name in _names(sequences)] if several else [output]
+        filters = list(dict.fromkeys(each.filter or "unknown" for each in sequences))
+        if checked.star_flux is not None and len(filters) > 1:
+            raise IncompatibleSetupError(
+                f"star_flux: got one flux density for {', '.join(filters)}, expected one for each. "
+                "Choose a --filter, or give the star's spectrum with --star-sed"
+            )
         prepared = []
         for sequence, folder in zip(sequences, folders, strict=True):
             if several:
                 run.claim_folder(folder, tuple(PRODUCTS), overwrite)
-                click.echo(f"\nepoch {folder.name}, {len(sequences)} in all:")
+                click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
             _show(sequence)
             map_ = map_for(sequence, opd, opd_date)
             click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
-            prepared.append(prepare(sequence, map_, checked))
+            prepared.append(prepare(sequence, map_, _with_flux(checked, star_sed, sequence.filter)))
             if dry_run:
-                click.echo(describe_plan(prepared[-1].sequence, checked))
+                click.echo(describe_plan(prepared[-1].sequence, prepared[-1].options))
         sizes = (size_of_products(each.sequence, derivatives=derivatives) for each in prepared)
         run.require_room(output, sum(sizes))
         if dry_run:
             return
         summaries = {}
         for preparation, folder in zip(prepared, folders, strict=True):
-            with numbered_stages(dict(steps_of(preparation.sequence, checked))):
+            with numbered_stages(dict(steps_of(preparation.sequence, preparation.options))):
                 reduction = preparation.run(progress=run.progress)
                 with stage("products"):
                     written = reduction.write(folder, overwrite=overwrite, derivatives=derivatives)
@@ -108,20 +110,40 @@ def run_reduction(
         if several:
             first = sequences[0].science[0]
             motion = proper_motion(first.header, first.name)
-            page, data = write_epochs(summaries, motion, output)
+            page, data = write_comparison(summaries, motion, output)
             summary = loads(data.read_text(encoding="utf-8"))
-            click.echo(f"\nwrote {page}, which compares the epochs")
+            click.echo(f"\nwrote {page}, which compares them")
     if json:
         click.echo(dumps(summary, indent=2))
+
+
+def _with_flux(options: ReduceOptions, star_sed: Path | None, name: str | None) -> ReduceOptions:
+    """Options with the star's flux density in a filter, from its spectrum if there is one."""
+    if star_sed is None:
+        return options
+    flux = star_flux_density(star_sed, name or "unknown")
+    click.echo(f"star: {flux.value:.4g} Jy in {name}, by {star_sed.name}")
+    return replace(options, star_flux=flux)
+
+
+def _names(sequences: abc.Sequence[Sequence]) -> list[str]:
+    """Names of the folders of sequences: their dates or filters, or both if both differ."""
+    days = [_day(each) for each in sequences]
+    filters = [each.filter or "unknown" for each in sequences]
+    if len(set(filters)) == 1:
+        return days
+    if len(set(filters)) == len(filters):
+        return filters
+    return [f"{day}_{name}" for day, name in zip(days, filters, strict=True)]
 
 
 def _remove_others(output: Path, folders: list[Path]) -> None:
     """Remove the products of an earlier run from other folders than those of this one."""
     earlier = [output]
-    page, data = (output / name for name in EPOCHS)
+    page, data = (output / name for name in COMPARISON)
     if data.exists():
         with suppress(ValueError, KeyError, TypeError):
-            listed = loads(data.read_text(encoding="utf-8"))["epochs"]
+            listed = loads(data.read_text(encoding="utf-8"))["reductions"]
             # Only names, so that a file that was changed cannot point outside the folder.
             earlier += [output / Path(each["folder"]).name for each in listed]
     for folder in set(earlier) - set(folders):
@@ -166,7 +188,7 @@ def map_for(sequence: Sequence, opd: str, rule: Rule | None) -> OPDMap:
         )
     if is_folder:
         return choose_map(opd, date, rule)
-    return load_wss_opd_by_date(date, "closest" if rule == "nearest" else rule)
+    return load_wss_opd_by_date(date, rule)
 
 
 def _age(opd: OPDMap, sequence: Sequence) -> str:

@@ -100,6 +100,7 @@ class Templates:
                 _as_tensor(frame.opd),
                 frame.optical_values,
                 offset=(x, y + detector.shear * x),
+                wrapped=True,
             )
         return self._sources[key]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -43,53 +44,75 @@ class ModeFields:
         wavelengths = model.bandpass.wavelengths
         with torch.no_grad():
             self._pupils = [model.pupil_field(opd, each, self._values) for each in wavelengths]
-        self._fourier = fourier_part(basis)
-        self._waves: list[PlaneWaves | None] | None = None
 
     @torch.no_grad()
-    def changes(self, part: slice) -> list[Tensor]:
-        """Derivatives with respect to some modes, for each wavelength, (modes, ny, nx), per nm."""
-        first, fourier = self._fourier or (len(self._basis), None)
-        split = min(max(part.start, first), part.stop)
-        pieces = []
-        if part.start < split:
-            pieces.append(self._propagated(slice(part.start, split)))
-        if split < part.stop:
-            assert fourier is not None
-            pieces.append(self._from_waves(fourier, slice(split - first, part.stop - first)))
-        return [torch.cat(each).to(torch.complex64) for each in zip(*pieces, strict=True)]
+    def batches(self, size: int) -> Iterator[tuple[Tensor, list[Tensor]]]:
+        """Compute the derivatives with respect to all modes, up to `size` of them at a time.
 
-    def _propagated(self, part: slice) -> list[Tensor]:
+        Parameters
+        ----------
+        size : int
+            At least 4.
+
+        Yields
+        ------
+        modes : Tensor, (modes,), int64
+            Their places in the basis.
+        changes : list of Tensor, (modes, ny, nx), complex64
+            For each wavelength, per nm.
+        """
+        first, fourier = fourier_part(self._basis) or (len(self._basis), None)
+        waves = [] if fourier is None else self._plane_waves(fourier.reach)
+        if not waves:
+            first = len(self._basis)
+        for modes in torch.arange(first).split(size) if first else ():
+            yield modes, [each.to(torch.complex64) for each in self._propagated(modes)]
+        if waves:
+            assert fourier is not None
+            for modes, changes in self._from_waves(waves, fourier, size):
+                yield first + modes, [each.to(torch.complex64) for each in changes]
+
+    def _plane_waves(self, reach: int) -> list[PlaneWaves]:
+        """For each wavelength; an empty list if the model has none."""
+        waves = [self._model.plane_waves(each, self._values, reach) for each in self._pupils]
+        return [each for each in waves if each is not None]
+
+    def _propagated(self, modes: Tensor) -> list[Tensor]:
         model = self._model
         full = PupilGrid.full(model.npix, model.diameter)
-        sampled = self._basis.modes(full, part.start, part.stop)
-        modes = model.entrance.on_window(sampled).to(model.device, model.dtype)
+        sampled = self._basis.modes(full, int(modes[0]), int(modes[-1]) + 1)
+        shapes = model.entrance.on_window(sampled).to(model.device, model.dtype)
         changes = []
         for wavefront in self._pupils:
-            moved = replace(wavefront, field=modes * (_factor(wavefront) * wavefront.field))
+            moved = replace(wavefront, field=shapes * (_factor(wavefront) * wavefront.field))
             changes.append(model.propagate(moved, self._values))
         return changes
 
-    def _from_waves(self, fourier: FourierModes, part: slice) -> list[Tensor]:
-        """For modes of the Fourier part, counted from its first one."""
-        if self._waves is None:
-            self._waves = [
-                self._model.plane_waves(wavefront, self._values, fourier.reach)
-                for wavefront in self._pupils
-            ]
-        first = 2 * (part.start // 2)
-        cycles = fourier.cycles[part.start // 2 : (part.stop + 1) // 2]
-        changes = []
-        for wavefront, waves in zip(self._pupils, self._waves, strict=True):
-            if waves is None:
-                offset = len(self._basis) - len(fourier)
-                return self._propagated(slice(part.start + offset, part.stop + offset))
-            plus, minus = waves.fields(torch.cat([cycles, -cycles])).chunk(2)
-            cosines, sines = plus + minus, -1j * (plus - minus)
-            pairs = torch.stack([cosines, sines], dim=1).flatten(0, 1)
-            scale = fourier.amplitude / 2 * _factor(wavefront)
-            changes.append(scale * pairs[part.start - first : part.stop - first])
-        return changes
+    def _from_waves(
+        self, waves: list[PlaneWaves], fourier: FourierModes, size: int
+    ) -> Iterator[tuple[Tensor, list[Tensor]]]:
+        """For the Fourier part, with places counted from its first mode.
+
+        A cosine and a sine are the sum and the difference of two opposite waves.
+        """
+        places = {(fx, fy): 2 * k for k, (fx, fy) in enumerate(fourier.cycles.tolist())}
+        scales = [fourier.amplitude / 2 * _factor(each) for each in self._pupils]
+        for fx in range(fourier.reach + 1):
+            every = [fy for fy in range(fourier.reach + 1) if (fx, fy) in places]
+            for start in range(0, len(every), max(1, size // 4)):
+                fy = every[start : start + max(1, size // 4)]
+                pairs = [(fx, each) for each in fy] + [(-fx, each) for each in fy]
+                # The wave opposite to (fx, 0) is (-fx, 0), so that only one of them is a pair.
+                known = [k for k, pair in enumerate(pairs) if pair in places]
+                cosines = torch.tensor([places[pairs[k]] for k in known])
+                changes = []
+                for each, scale in zip(waves, scales, strict=True):
+                    fields = each.fields(fx, slice(fy[0], fy[-1] + 1))
+                    plus = fields[:, 0].flatten(0, 1)[known]
+                    minus = fields[[1, 0], 1].flatten(0, 1)[known]
+                    pair = [scale * (plus + minus), 1j * scale * (minus - plus)]
+                    changes.append(torch.stack(pair, dim=1).flatten(0, 1))
+                yield torch.stack([cosines, cosines + 1], dim=1).flatten(), changes
 
 
 def _factor(wavefront: Wavefront) -> complex:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -152,11 +152,10 @@ class WavefrontResponse:
             for _ in self.coarse.bandpass.wavelengths
         ]
         with ProgressBar("response", count, shown=self._progress) as bar:
-            for start in range(0, count, self._batch):
-                part = slice(start, min(start + self._batch, count))
-                for kept, change in zip(fields, self._changes(part), strict=True):
-                    kept[part] = change
-                bar.update(part.stop - start)
+            for modes, changes in self._batches():
+                for kept, change in zip(fields, changes, strict=True):
+                    kept.index_copy_(0, modes.to(kept.device), change)
+                bar.update(len(modes))
         self._fields, self._mode_fields = fields, None
         _log.debug("response of %d modes at %d pupil samples", count, self.coarse.npix)
 
@@ -170,13 +169,20 @@ class WavefrontResponse:
         """Free the memory of the derivatives."""
         self._fields = None
 
-    def _changes(self, part: slice) -> list[Tensor]:
-        """Derivatives of the field with respect to some modes, for each wavelength."""
-        if self._fields is not None:
-            return [kept[part] for kept in self._fields]
-        if self._mode_fields is None:
-            self._mode_fields = ModeFields(self.coarse, self.basis, self._opd, self._values)
-        return self._mode_fields.changes(part)
+    def _batches(self, count: int | None = None) -> Iterator[tuple[Tensor, list[Tensor]]]:
+        """Places of modes, and the derivatives of the field by them for each wavelength.
+
+        At least the leading `count` modes, if it is given.
+        """
+        if self._fields is None:
+            if self._mode_fields is None:
+                self._mode_fields = ModeFields(self.coarse, self.basis, self._opd, self._values)
+            yield from self._mode_fields.batches(self._batch)
+            return
+        every = torch.arange(len(self.basis) if count is None else count)
+        for modes in every.split(_ROWS):
+            part = slice(int(modes[0]), int(modes[-1]) + 1)
+            yield modes, [kept[part] for kept in self._fields]
 
     def image(
         self,
@@ -213,13 +219,14 @@ class WavefrontResponse:
             (2 * weight) * field.to(torch.complex64).conj()
             for field, weight in zip(self._kept(fields), self.coarse.bandpass.weights, strict=True)
         ]
-        step = _ROWS if self.stored else self._batch
-        for start in range(0, count, step):
-            part = slice(start, min(start + step, count))
-            total = _weighted_sum(self._changes(part), conjugates)
+        for places, changes in self._batches(count):
+            total = _weighted_sum(changes, conjugates)
             for rows, parts in ((images[:modes], total.real), (images[modes:], total.imag)):
-                wanted = rows[part]
-                wanted.copy_(detector.image(parts[: len(wanted)].contiguous(), values))
+                wanted = places < len(rows)
+                if wanted.all():
+                    rows[places] = detector.image(parts.contiguous(), values)
+                elif wanted.any():
+                    rows[places[wanted]] = detector.image(parts[wanted], values)
         return images
 
     def _kept(self, fields: Sequence[Tensor]) -> list[Tensor]:

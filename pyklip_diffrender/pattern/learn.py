@@ -224,7 +224,7 @@ class _Fitter:
             )
         if path is not None:
             # With the linear model only where something is measured with it.
-            fit.write(path, linear=known is not None)
+            fit.write(path, linear=known is not None, overwrite=True)
         return fit, _shown(fit)
 
 

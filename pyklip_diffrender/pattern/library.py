@@ -19,7 +19,7 @@ from astropy.io import fits
 from astropy.table import QTable, vstack
 
 from pyklip_diffrender.errors import CorruptFileError
-from pyklip_diffrender.io.files import open_fits, write_fits
+from pyklip_diffrender.io.files import open_fits, require_new, write_fits
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.names import same_name
@@ -133,12 +133,24 @@ class PatternLibrary:
         several = combine_libraries([cls(*_read(each)) for each in files])
         return cls(several.patterns, several.validation)
 
-    def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write to a FITS file, atomically; an existing one is replaced.
+    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+        """Write to a FITS file, atomically.
 
         Each pattern has the extensions PATTERN and PATTERN_ERROR, as a `Systematics`, and STAR, if
         the star was kept, with the number of the pattern as EXTVER; VALIDATION is a table.
+
+        Parameters
+        ----------
+        path : path
+        overwrite : bool
+            Replace an existing file.
+
+        Raises
+        ------
+        ExistingFileError
+            If the file exists, and `overwrite` is False; it is also an `OSError`.
         """
+        require_new([path], overwrite)
         primary = fits.PrimaryHDU()
         primary.header["PATVERS"] = (_VERSION, "version of the layout")
         hdus = [primary]

@@ -1,6 +1,5 @@
 """`reduce`: from a sequence of frames to planets, with a report."""
 
-from pyklip_diffrender.reduction.epochs import EPOCHS, compare_epochs, write_epochs
 from pyklip_diffrender.reduction.options import ReduceOptions
 from pyklip_diffrender.reduction.pipeline import Preparation, prepare, reduce
 from pyklip_diffrender.reduction.products import (
@@ -10,20 +9,25 @@ from pyklip_diffrender.reduction.products import (
     write_report,
 )
 from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.several import (
+    COMPARISON,
+    compare_reductions,
+    write_comparison,
+)
 from pyklip_diffrender.reduction.summary import summarise
 
 __all__ = [
-    "EPOCHS",
+    "COMPARISON",
     "PRODUCTS",
     "Preparation",
     "ReduceOptions",
     "Reduction",
-    "compare_epochs",
+    "compare_reductions",
     "existing_products",
     "prepare",
     "reduce",
     "summarise",
-    "write_epochs",
+    "write_comparison",
     "write_products",
     "write_report",
 ]

@@ -6,7 +6,7 @@ empty, or has the afterglow of an earlier exposure, would spoil the average.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,7 +101,12 @@ def empty_integrations(data: Stack, valid: Mask) -> Judgement:
 
 
 def judge_integrations(
-    data: Stack, error: Stack, valid: Mask, center: Stack, pixelscale: tuple[float, float]
+    data: Stack,
+    error: Stack,
+    valid: Mask,
+    center: Stack,
+    pixelscale: tuple[float, float],
+    names: Sequence[str],
 ) -> Judgement:
     """Compare integrations of one pointing with their median.
 
@@ -117,6 +122,8 @@ def judge_integrations(
         x, y of the star.
     pixelscale : tuple of float
         x, y, arcsec per pixel.
+    names : sequence of str
+        Names of the integrations in remarks, such as "integration 3 of 8".
     """
     count = len(data)
     kept, left = np.ones(count, dtype=bool), valid.copy()
@@ -129,12 +136,12 @@ def judge_integrations(
     remarks = []
     slopes = np.hypot(*np.gradient(median))
     allowed = _JITTER * slopes + _CHANGE * np.abs(median)
-    for k, (frame, sigma, usable) in enumerate(zip(data, error, valid, strict=True)):
+    for k, (frame, sigma, usable, name) in enumerate(zip(data, error, valid, names, strict=True)):
         scale = _brightness(frame, median, sigma, usable & near)
         if abs(scale - 1) > _FACTOR:
             kept[k] = False
             remarks.append(
-                f"integration {k + 1} of {count} is left out: its star is {scale:.2f} times as "
+                f"{name} is left out: its star is {scale:.2f} times as "
                 "bright as in the median of all"
             )
             continue
@@ -143,14 +150,14 @@ def judge_integrations(
         if share > _MOST:
             kept[k] = False
             remarks.append(
-                f"integration {k + 1} of {count} is left out: {share:.0%} of its pixels within "
+                f"{name} is left out: {share:.0%} of its pixels within "
                 f"{_NEAR:g} arcsec of the star deviate from the median of all"
             )
         elif deviating.any():
             left[k] &= ~deviating
             if deviating.sum() > _PATCH**2:
                 remarks.append(
-                    f"integration {k + 1} of {count}: {int(deviating.sum())} pixels that deviate "
+                    f"{name}: {int(deviating.sum())} pixels that deviate "
                     "from the median of all are masked"
                 )
     return Judgement(kept, left, tuple(remarks))
@@ -163,12 +170,13 @@ def judge_pointings(
     center: Stack,
     angles: NDArray[np.float64] | None,
     pixelscale: tuple[float, float],
+    names: Sequence[str],
 ) -> Judgement:
     """Compare the integrations of every pointing with their median, see `judge_integrations`.
 
     Parameters
     ----------
-    data, error, valid, center, pixelscale
+    data, error, valid, center, pixelscale, names
         See `judge_integrations`.
     angles : ndarray, (frames,), or None
         Position angles, degrees.
@@ -176,8 +184,9 @@ def judge_pointings(
     kept, left = np.ones(len(data), dtype=bool), valid.copy()
     remarks: tuple[str, ...] = ()
     for group in pointings(center, angles):
+        named = [names[k] for k in group]
         part = judge_integrations(
-            data[group], error[group], valid[group], center[group], pixelscale
+            data[group], error[group], valid[group], center[group], pixelscale, named
         )
         kept[group], left[group] = part.kept, part.valid
         remarks += part.remarks

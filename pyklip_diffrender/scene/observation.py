@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -212,7 +213,10 @@ class Observation:
             )
             observation = replace(observation, error=error, noise_ratios=ratios)
         observation = replace(observation, remarks=() if empty is None else empty.remarks)
-        observation, kept = observation._judged()
+        original = np.ones(len(observation), dtype=bool) if empty is None else empty.kept
+        observation, kept = observation._judged(
+            [f"integration {k + 1} of {len(original)}" for k in np.flatnonzero(original)]
+        )
         if not every_integration:
             return observation if kept.all() else observation.part(np.flatnonzero(kept))
         if empty is not None:
@@ -222,14 +226,15 @@ class Observation:
             kept = every
         return observation._with_valid(observation.valid & kept[:, None, None])
 
-    def _judged(self) -> tuple[Observation, NDArray[np.bool_]]:
+    def _judged(self, names: Sequence[str]) -> tuple[Observation, NDArray[np.bool_]]:
         """Mask what deviates from the median of the integrations of one pointing.
 
         The second value says which integrations are kept.
         """
         judgement = judge_pointings(
-            self.data, self.error, self.valid, self.center, self.position_angles, self.pixelscale
-        )
+            self.data, self.error, self.valid, self.center, self.position_angles, self.pixelscale,
+            names,
+        )  # fmt: skip
         for remark in judgement.remarks:
             _log.warning("%s: %s", self.name, remark)
         cleaned = replace(self, remarks=(*self.remarks, *judgement.remarks))

@@ -182,9 +182,46 @@ class Sequence:
         tuple of Sequence
             In order of time.
         """
-        listed = exposures_in(files, references)
-        exclude_unusable(listed)
-        require_some(listed)
+        return cls._by_epoch(_usable(files, references), target, filter)
+
+    @classmethod
+    def by_filter_and_epoch(
+        cls,
+        files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+        *,
+        target: str | None = None,
+        filter: str | None = None,
+        references: Iterable[str | os.PathLike[str]] = (),
+    ) -> tuple[Sequence, ...]:
+        """Sort files into one sequence for each filter and epoch of the target.
+
+        Arguments are those of `by_epoch`; with `filter` there is one filter.
+
+        Returns
+        -------
+        tuple of Sequence
+            In order of time.
+        """
+        listed = _usable(files, references)
+        if filter is not None:
+            return cls._by_epoch(listed, target, filter)
+        science, _ = choose_target([replace(each) for each in listed], target)
+        names = {each.exposure.filter for each in science} - {None}
+        if len(names) < 2:
+            return cls._by_epoch(listed, target, next(iter(names), None))
+        star = target or science[0].star
+        sequences = [
+            each
+            for name in sorted(filter_ for filter_ in names if filter_ is not None)
+            for each in cls._by_epoch([replace(file) for file in listed], star, name)
+        ]
+        return tuple(sorted(sequences, key=lambda each: _time(each.science[0])))
+
+    @classmethod
+    def _by_epoch(
+        cls, listed: list[FrameFile], target: str | None, filter: str | None
+    ) -> tuple[Sequence, ...]:
+        """Sort files that were listed, whose reasons this fills in."""
         choose_filter(listed, filter)
         science, others = choose_target(listed, target)
         exclude_other_setups(science, others)
@@ -279,6 +316,17 @@ class Sequence:
             science=tuple(science),
             references=tuple(each.cutout(size) for each in self.references),
         )
+
+
+def _usable(
+    files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    references: Iterable[str | os.PathLike[str]],
+) -> list[FrameFile]:
+    """Files with the reasons of those that cannot be used, of which some are left."""
+    listed = exposures_in(files, references)
+    exclude_unusable(listed)
+    require_some(listed)
+    return listed
 
 
 def _rows(

@@ -24,6 +24,13 @@ the samples of equal index modulo p form a lattice of spacing h of their own, ea
 its own. Shear makes y depend on x and is part of the matrix transforms, so that pixels may be
 rectangular and sheared.
 
+Wrapping. The FFTs need as many points as there are differences x - c, about twice the detector's.
+With fewer points, the largest differences, of samples at one edge from cells at the opposite one,
+are taken for smaller ones on the other side. Little light is on the outer cells, and little is
+diffracted so far: fields change by 1e-4 (F444W behind MASK335R, 80 x 80 pixels, 128 points rather
+than 160), and take two thirds of the time. That is enough for derivatives and for the templates of
+planets, which change by 5e-5, but not for the star.
+
 Sampling. The sum over cells equals the integral if the spectrum of 1 - t vanishes at the
 frequencies that alias onto the band of F[E] F[L], up to (D_E + D_L) / 2 lambda < D / lambda. The
 spectrum of a mask with an edge does not vanish. It is cut off on a lattice `_FINER` times
@@ -64,6 +71,10 @@ the pupils (0.87 D / lambda) is well below the edge and the band that aliases on
 _MARGIN = 4
 """Number of cells of the band-limited mask beyond its edge."""
 
+_UNWRAPPED = 0.6
+"""Part of the cells along an axis, the middle ones, from which differences to all samples are
+right where the others may be wrapped."""
+
 
 @dataclass(frozen=True)
 class _Axis:
@@ -81,6 +92,8 @@ class _Axis:
         Cells are numbered from -half to half.
     spacing : float
         Distance between cells, radians.
+    wrapped : bool
+        Whether the largest differences may be wrapped.
     """
 
     samples: int
@@ -88,9 +101,18 @@ class _Axis:
     cells: int
     half: int
     spacing: float
+    wrapped: bool
 
     @classmethod
-    def fit(cls, samples: int, step: float, oversample: int, finest: float, reach: float) -> _Axis:
+    def fit(
+        cls,
+        samples: int,
+        step: float,
+        oversample: int,
+        finest: float,
+        reach: float,
+        wrapped: bool,
+    ) -> _Axis:
         """Choose the coarsest aligned cells that are at most `finest` radians wide.
 
         A pixel has a whole number of cells, so that its centre is on the lattice as well.
@@ -101,7 +123,8 @@ class _Axis:
         )
         cells = math.ceil(step / finest - 1e-9) if phases == 1 else 1
         spacing = step * phases / cells
-        return cls(samples, phases, cells, math.ceil(reach / spacing) + _MARGIN, spacing)
+        half = math.ceil(reach / spacing) + _MARGIN
+        return cls(samples, phases, cells, half, spacing, wrapped)
 
     @property
     def positions(self) -> Tensor:
@@ -116,14 +139,25 @@ class _Axis:
     @property
     def period(self) -> int:
         """Period of the convolution, in steps between samples of one phase."""
-        cells = (self.count - 1) * self.cells + 2 * self.half + 1
-        return int(next_fast_len(math.ceil(cells / self.cells)))
+        cells = math.ceil(_UNWRAPPED * 2 * self.half) if self.wrapped else 2 * self.half
+        needed = (self.count - 1) * self.cells + cells + 1
+        return int(next_fast_len(math.ceil(needed / self.cells)))
 
-    def differences(self, first: Tensor) -> Tensor:
-        """Samples of a phase minus cells, in order; `first` is the first sample, radians."""
-        index = torch.arange(-2 * self.half, (self.count - 1) * self.cells + 1)
-        offsets = (index + self.half).to(torch.float64) * self.spacing
-        return first + offsets.to(first.device)
+    @property
+    def differences(self) -> range:
+        """Differences of samples of a phase from cells, from the first sample and cell, in cells.
+
+        Those that fit in a period; the middle ones if there are more.
+        """
+        every = range(-2 * self.half, (self.count - 1) * self.cells + 1)
+        excess = max(0, len(every) - self.period * self.cells)
+        return every[excess // 2 : len(every) - (excess + 1) // 2]
+
+    def angles(self, first: Tensor) -> Tensor:
+        """The differences, radians, where the first sample of the phase is at `first`."""
+        span = self.differences
+        offsets = torch.arange(span.start, span.stop, dtype=torch.float64) + self.half
+        return first + (offsets * self.spacing).to(first.device)
 
     def band_limiting(self) -> Tensor:
         """Matrix from the mask on a finer lattice to the band-limited mask on the cells."""
@@ -136,7 +170,11 @@ class _Axis:
 
 
 def _axes(
-    occulter: CompactOcculter, detector: Detector, wavelength: float, sampling: float
+    occulter: CompactOcculter,
+    detector: Detector,
+    wavelength: float,
+    sampling: float,
+    wrapped: bool = False,
 ) -> tuple[_Axis, _Axis]:
     """Cells and samples along x and y."""
     finest = wavelength / occulter.diameter / sampling
@@ -145,7 +183,7 @@ def _axes(
     reaches = (half_x * (1 + shear), half_y + half_x * shear)
     k = detector.oversample
     x, y = (
-        _Axis.fit(count * k, scale * ARCSEC / k, k, finest, reach * ARCSEC)
+        _Axis.fit(count * k, scale * ARCSEC / k, k, finest, reach * ARCSEC, wrapped)
         for count, scale, reach in zip(
             detector.shape[::-1], detector.pixelscale, reaches, strict=True
         )
@@ -181,6 +219,8 @@ class OcculterLattice:
         m.
     sampling : float
         Smallest number of cells per lambda/D.
+    wrapped : bool
+        Whether the largest differences may be wrapped, see the top of this module.
 
     Attributes
     ----------
@@ -190,10 +230,16 @@ class OcculterLattice:
     """
 
     def __init__(
-        self, occulter: CompactOcculter, detector: Detector, wavelength: float, sampling: float
+        self,
+        occulter: CompactOcculter,
+        detector: Detector,
+        wavelength: float,
+        sampling: float,
+        *,
+        wrapped: bool = False,
     ) -> None:
         self.shear, self.wavelength = detector.shear, wavelength
-        self.x, self.y = _axes(occulter, detector, wavelength, sampling)
+        self.x, self.y = _axes(occulter, detector, wavelength, sampling, wrapped)
         x, y = (
             torch.arange(-n, n + 1, dtype=torch.float64) * (axis.spacing / _FINER / ARCSEC)
             for axis in (self.x, self.y)
@@ -242,11 +288,12 @@ class OcculterLattice:
         rows = []
         for b in range(self.y.phases):
             for a in range(self.x.phases):
-                x = self.x.differences(axes[0][a])
-                y = self.y.differences(axes[1][b])
+                x = self.x.angles(axes[0][a])
+                y = self.y.angles(axes[1][b])
                 values = self._transform(stop, x, y).forward(stop.field)
                 values = pad(values, (0, size[1] - len(x), 0, size[0] - len(y)))
-                rows.append(values.roll((-2 * self.y.half, -2 * self.x.half), dims=(-2, -1)))
+                starts = (self.y.differences.start, self.x.differences.start)
+                rows.append(values.roll(starts, dims=(-2, -1)))
         kernels = torch.stack(rows).unflatten(0, (self.y.phases, self.x.phases))
         # The inverse transform of a folded spectrum is smaller by this factor.
         return torch.fft.fft2(kernels) / (self.x.cells * self.y.cells)

@@ -48,7 +48,7 @@ class LatticeRoute:
         (self._place,) = (k for k, p in enumerate(planes) if isinstance(p, CompactOcculter))
         behind = planes[self._place + 1 :]
         self._moving = {name for plane in behind for name in plane.parameters} | {"detector_shift"}
-        self._lattices: Cache[float, OcculterLattice] = Cache()
+        self._lattices: Cache[tuple[float, bool], OcculterLattice] = Cache()
         # The most recent result at each wavelength, with the parameters that it depends on.
         self._stops: Cache[float, tuple[Position, Wavefront]] = Cache()
         self._kernels: Cache[float, tuple[Position, Tensor]] = Cache()
@@ -79,11 +79,13 @@ class LatticeRoute:
             for wavelength in wavelengths
         )
 
-    def lattice(self, wavelength: float) -> OcculterLattice:
-        """The cells at a wavelength."""
+    def lattice(self, wavelength: float, *, wrapped: bool = False) -> OcculterLattice:
+        """The cells at a wavelength; `wrapped` is explained in `occulter`."""
         return self._lattices.kept(
-            wavelength,
-            lambda: OcculterLattice(self.occulter, self.detector, wavelength, self.sampling),
+            (wavelength, wrapped),
+            lambda: OcculterLattice(
+                self.occulter, self.detector, wavelength, self.sampling, wrapped=wrapped
+            ),
         )
 
     def _stop(self, onto: Sequence[PupilGrid], wavelength: float, values: Values) -> Wavefront:
@@ -150,14 +152,14 @@ class LatticeRoute:
     ) -> PlaneWaves | None:
         """Prepare the propagation of a field times plane waves, up to `reach` cycles along an axis.
 
-        None if there are planes in front of the occulter.
+        None if there are planes in front of the occulter. The light of the outer cells is wrapped.
         """
         if self._place > 0:
             return None
-        lattice, detector = self.lattice(wavefront.wavelength), self.detector
+        lattice, detector = self.lattice(wavefront.wavelength, wrapped=True), self.detector
         stop = self._stop(onto, wavefront.wavelength, values)
         passed = replace(stop, field=wavefront.grid.crop(wavefront.field, stop.grid) * stop.field)
-        kernel = self._kernel(stop, values)
+        kernel = lattice.kernel(stop, detector.axes({}))
         x, y = detector.axes({})
         cells_x, cells_y = (a.positions.to(detector.device) for a in (lattice.x, lattice.y))
         return PlaneWaves(

@@ -71,6 +71,9 @@ class PointSources:
         Smallest number of cells of the occulter per lambda/D.
     offset : tuple of float
         x, y in arcsec from the centre of a pixel to the source.
+    wrapped : bool
+        Let the light of the mask's outer parts wrap around the detector, see `occulter`. Images
+        change by up to 5e-5, and take two thirds of the time.
 
     Attributes
     ----------
@@ -92,8 +95,9 @@ class PointSources:
         *,
         sampling: float = 1.5,
         offset: tuple[float, float] = (0.0, 0.0),
+        wrapped: bool = False,
     ) -> None:
-        self.model = model
+        self.model, self._wrapped = model, wrapped
         self._offset = torch.tensor(offset, dtype=torch.float64, device=model.device)
         fixed = {name: value for name, value in (values or {}).items() if name != "star_offset"}
         with torch.no_grad():
@@ -170,7 +174,7 @@ class PointSources:
             else:
                 stop = plane.apply(stop, values, onto)
         axes = tuple(model.detector.axes(values))
-        return _Wave(front, stop, occulter, model.detector, axes, sampling)
+        return _Wave(front, stop, occulter, model.detector, axes, sampling, self._wrapped)
 
     def positions(self, rows: Index, columns: Index) -> Tensor:
         """Sources of pixels relative to the optical axis, (k, 2) as x, y in arcsec, float64."""
@@ -284,6 +288,8 @@ class _Wave:
         Sample positions x, y, radians.
     sampling : float
         Smallest number of cells per lambda/D.
+    wrapped : bool
+        See `PointSources`.
     """
 
     def __init__(
@@ -294,6 +300,7 @@ class _Wave:
         detector: Detector,
         axes: tuple[Tensor, ...],
         sampling: float,
+        wrapped: bool,
     ) -> None:
         self._shape, self._oversample = detector.shape, detector.oversample
         counts = detector.shape[::-1]
@@ -311,7 +318,9 @@ class _Wave:
         self.size = math.prod(detector.shape) * k**2
         """Size of the largest array that a source needs."""
         if occulter is not None:
-            lattice = OcculterLattice(occulter, detector, stop.wavelength, sampling)
+            lattice = OcculterLattice(
+                occulter, detector, stop.wavelength, sampling, wrapped=wrapped
+            )
             lattice_axes = (lattice.x, lattice.y)
             self._per_pixel = [k * axis.cells // axis.phases for axis in lattice_axes]
             last = [float(axis[-k:].mean()) for axis in axes]

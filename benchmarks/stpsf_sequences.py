@@ -1,0 +1,331 @@
+"""Sequences whose images the real stpsf makes, reduced with the defaults: planets, errors, limits.
+
+Run from the root of the project, with stpsf installed and its data named by STPSF_PATH::
+
+    STPSF_PATH=... python -m benchmarks.stpsf_sequences --output FOLDER [--cases NAME ...]
+
+Each case has two rolls of a star with two planets, as calints files with the headers of MAST. The
+images are stpsf's, with its internal wavefront errors, jitter, distortion, charge diffusion and
+interpixel capacitance. The wavefront has drifted from stpsf's map, from which the reduction starts,
+and from roll to roll; the star is a few milliarcseconds from the middle of the mask. The flat field
+has an error of 2 % in every pixel, which nobody tells the reduction; pixels are bad, some of them
+without a flag; and there are photon and read noise. With ``--references`` a second, brighter star
+was observed at small dithers.
+
+Prints a row for each case: planets that were found and missed, false candidates, pulls of flux and
+position, scatter of the S/N without the candidates, limits over those for a known star beyond 0.5
+arcsec, time of the processor and memory. What is finished in FOLDER is not repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import resource
+import time
+import warnings
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from astropy.io import fits
+
+import pyklip_diffrender as dr
+from benchmarks.calints_files import calints
+from pyklip_diffrender.instrument import detector_place, filter_shift
+from pyklip_diffrender.optics import resample
+from pyklip_diffrender.scene import Planet, Sequence
+
+ROLLS = (70.0, 80.0)
+DRIFT, BETWEEN = 6e-9, 2e-9
+"""Rms of the wavefront's change since the map, and between frames, m."""
+
+STARS = ((0.002, -0.003), (-0.004, 0.001))
+"""Places of the star behind the mask, arcsec."""
+
+DITHERS = ((0.0, 0.0), (0.01, 0.01), (-0.01, 0.01), (0.01, -0.01), (-0.01, -0.01))
+FLAT_ERROR = 0.02
+FLAGGED, UNFLAGGED = 0.005, 4
+"""Fraction of the pixels with a flag, and number of bad ones without one near the star."""
+
+SIDE = 96
+MATCHED = 0.08
+"""arcsec from a planet within which a candidate is that planet."""
+
+INNER = 0.5
+
+
+@dataclass(frozen=True)
+class Case:
+    """A set-up, and planets with separations (arcsec) and position angles (deg) on the sky."""
+
+    filter: str
+    mask: str
+    aperture: str
+    size: int
+    planets: tuple[Planet, ...]
+    nlambda: tuple[int, int] = (3, 1)
+    """Number of wavelengths of the star and of planets."""
+    flux: float = 3e7
+
+    @property
+    def name(self) -> str:
+        return f"{self.filter} {self.mask}"
+
+
+def _planets(*places: tuple[float, float, float]) -> tuple[Planet, ...]:
+    return tuple(Planet(*place) for place in places)
+
+
+WIDE = (7, 3)
+SHORT = _planets((3e-5, 0.42, 40.0), (2e-5, 0.50, 210.0))
+CASES = {
+    case.name: case
+    for case in (
+        Case("F210M", "MASK335R", "NRCA2_FULL_MASK335R", 36, SHORT),
+        Case("F460M", "MASKLWB", "NRCA5_FULL_MASKLWB_F460M", 32,
+             _planets((1e-4, 0.65, 80.0), (5e-5, 0.85, 240.0))),
+        Case("F210M", "MASK210R", "NRCA2_FULL_MASK210R", 36, SHORT),
+        Case("F444W", "MASK335R", "NRCA5_FULL_MASK335R", 32,
+             _planets((5e-5, 0.65, 40.0), (2e-5, 0.85, 210.0)), WIDE),
+        Case("F356W", "MASK430R", "NRCA5_FULL_MASK430R", 32,
+             _planets((5e-5, 0.70, 40.0), (2e-5, 0.85, 210.0)), WIDE),
+        Case("F200W", "MASK335R", "NRCA2_FULL_MASK335R", 36, SHORT, WIDE),
+        Case("F210M", "MASKSWB", "NRCA4_FULL_MASKSWB_F210M", 36,
+             _planets((5e-5, 0.40, 80.0), (3e-5, 0.50, 240.0))),
+    )
+}  # fmt: skip
+
+
+def instrument_of(case: Case) -> Any:
+    """stpsf's NIRCam in the set-up of a case."""
+    import stpsf
+
+    nircam = stpsf.NIRCam()
+    nircam.filter = case.filter
+    bar = case.mask.endswith("WB")
+    nircam.image_mask, nircam.pupil_mask = case.mask, case.mask if bar else "MASKRND"
+    nircam.set_position_from_aperture_name(case.aperture)
+    nircam.options["nd_squares"] = False
+    return nircam
+
+
+def map_of(nircam: Any) -> tuple[np.ndarray, fits.Header]:
+    """The wavefront map that stpsf comes with, m."""
+    path = Path(os.environ["STPSF_PATH"]) / Path(str(nircam.pupilopd)).name
+    with fits.open(path) as hdus:
+        scale = u.Unit(hdus[0].header["BUNIT"].rstrip("s")).to(u.m)
+        data = hdus[0].data if hdus[0].data.ndim == 2 else hdus[0].data[0]
+        return scale * data.astype(float), hdus[0].header.copy()
+
+
+def image(
+    nircam: Any, case: Case, opd: np.ndarray, header: fits.Header, place: tuple[float, float],
+    nlambda: int,
+) -> np.ndarray:  # fmt: skip
+    """The image of a point source of unit flux at a place behind the mask, arcsec."""
+    header["BUNIT"] = "meter"
+    nircam.pupilopd = fits.HDUList([fits.PrimaryHDU(opd, header)])
+    nircam.options["source_offset_x"], nircam.options["source_offset_y"] = place
+    psf = nircam.calc_psf(nlambda=nlambda, fft_oversample=2, detector_oversample=2, fov_pixels=SIDE)
+    return np.array(psf["DET_DIST"].data, dtype=float)
+
+
+def write_frames(case: Case, folder: Path, references: int = 0) -> Path:
+    """Write the frames of a case and the map of before; returns the map."""
+    nircam = instrument_of(case)
+    opd, header = map_of(nircam)
+    before = folder / "opd_2022-10-01.fits"
+    hdu = fits.PrimaryHDU(opd, header)
+    hdu.header["BUNIT"] = "m"
+    hdu.writeto(before, overwrite=True)
+    rng = np.random.default_rng(335)
+    flat = 1 + FLAT_ERROR * rng.normal(size=(SIDE, SIDE))
+    flagged = rng.random((SIDE, SIDE)) < FLAGGED
+    hot = rng.integers(SIDE // 2 - 15, SIDE // 2 + 15, (UNFLAGGED, 2))
+    changed = opd + _change(1, DRIFT, opd)
+    for k, (roll, star) in enumerate(zip(ROLLS, STARS, strict=True), 1):
+        now = changed + _change(10 + k, BETWEEN, opd)
+        light = image(nircam, case, now, header, star, case.nlambda[0])
+        for planet in case.planets:
+            away = np.add(star, planet.rotated(-roll).offset)
+            source = image(nircam, case, now, header, (away[0], away[1]), case.nlambda[1])
+            light = light + planet.contrast * source
+        _write(case, folder, "HD 1", k, roll, flat * case.flux * light, flagged, hot)
+    for k, dither in enumerate(DITHERS[:references], len(ROLLS) + 1):
+        now = changed + _change(10 + k, BETWEEN, opd)
+        light = image(nircam, case, now, header, dither, case.nlambda[0])
+        _write(case, folder, "HD 2", k, 120.0, 2 * flat * case.flux * light, flagged, hot)
+    return before
+
+
+def _change(seed: int, rms: float, opd: np.ndarray) -> np.ndarray:
+    return np.asarray(resample(dr.random_opd(seed, npix=256, rms=rms).data, len(opd)))
+
+
+def _write(
+    case: Case, folder: Path, star: str, k: int, roll: float, light: np.ndarray,
+    flagged: np.ndarray, hot: np.ndarray,
+) -> None:  # fmt: skip
+    place = detector_place(case.mask, case.filter, case.aperture.rpartition("_")[2]
+                           if case.mask.endswith("WB") else None)  # fmt: skip
+    middle = (SIDE - 1) / 2
+    corner = np.round(np.add(place.center, filter_shift(case.filter)) - middle).astype(int) + 1
+    pixel = place.siaf_pixelscale
+    cards = {
+        "DETECTOR": place.header_detector, "FILTER": case.filter,
+        "CORONMSK": case.mask.replace("MASK", "MASKA"), "SUBARRAY": "FULL",
+        "PUPIL": "MASKBAR" if case.mask.endswith("WB") else "MASKRND",
+        "APERNAME": case.aperture, "IS_PSF": star != "HD 1",
+        "CRPIX1": middle + 1, "CRPIX2": middle + 1, "V3I_YANG": 0.0,
+        "PIXAR_A2": pixel[0] * pixel[1], "PIXAR_SR": pixel[0] * pixel[1] * 2.35044e-11,
+        "SUBSTRT1": int(corner[0]), "SUBSTRT2": int(corner[1]),
+    }  # fmt: skip
+
+    def spoil(arrays: dict[str, np.ndarray]) -> None:
+        arrays["SCI"][:, flagged] = 1e3
+        arrays["DQ"][:, flagged] = 1
+        for row, column in hot:
+            arrays["SCI"][:, row, column] += 20 * arrays["ERR"][:, row, column]
+
+    name = f"jw01184{k:03d}001_03106_00001_{place.header_detector.lower()}_calints.fits"
+    path = folder / "frames" / name
+    path.unlink(missing_ok=True)
+    calints(
+        path, star, observation=k, roll=roll, date=f"2022-10-03T0{k}:00:00", cards=cards,
+        light=light, change=spoil,
+    )  # fmt: skip
+
+
+def reduced(case: Case, folder: Path, references: int = 0) -> dict[str, Any]:
+    """Make the frames of a case, reduce them with the defaults, and compare with the truth."""
+    done = folder / "result.json"
+    if done.is_file():
+        result: dict[str, Any] = json.loads(done.read_text(encoding="utf-8"))
+        return result
+    folder.mkdir(parents=True, exist_ok=True)
+    made = time.process_time()
+    before = folder / "opd_2022-10-01.fits"
+    if len(list((folder / "frames").glob("*.fits"))) < len(ROLLS) + references:
+        before = write_frames(case, folder, references)
+    made = time.process_time() - made
+    sequence = Sequence.from_files(folder / "frames", target="HD 1")
+    began = time.process_time()
+    reduction = dr.reduce(sequence, before, size=case.size)
+    seconds = time.process_time() - began
+    result = compare(case, reduction) | {
+        "cpu_stpsf": made,
+        "cpu": seconds,
+        "memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+    }
+    done.write_text(json.dumps(result, indent=2), encoding="utf-8")
+    return result
+
+
+def compare(case: Case, reduction: dr.Reduction) -> dict[str, Any]:
+    """The candidates beside the planets, the scatter of the S/N, and the limits."""
+    detection = reduction.detection
+    table = detection.table
+    places = [_sky(row["separation"], row["position_angle"]) for row in table]
+    left, planets = set(range(len(table))), []
+    for planet in case.planets:
+        truth = _sky(planet.separation * u.arcsec, planet.position_angle * u.deg)
+        near = [k for k in left if np.hypot(*(places[k] - truth)) < MATCHED]
+        row: dict[str, Any] = {"contrast": planet.contrast, "separation": planet.separation}
+        if near:
+            k = min(near, key=lambda j: float(np.hypot(*(places[j] - truth))))
+            left.remove(k)
+            found = table[k]
+            error = float(found["contrast_error"])
+            along = float((found["separation"].to_value("arcsec") - planet.separation)
+                          / found["separation_error"].to_value("arcsec"))  # fmt: skip
+            turn = (found["position_angle"].to_value("deg") - planet.position_angle + 180) % 360
+            row |= {
+                "snr": float(found["snr"]),
+                "ratio": float(found["contrast"]) / planet.contrast,
+                "flux_pull": (float(found["contrast"]) - planet.contrast) / error,
+                "separation_pull": along,
+                "angle_pull": (turn - 180) / found["position_angle_error"].to_value("deg"),
+                "away_mas": 1e3 * float(np.hypot(*(places[k] - truth))),
+            }
+        planets.append(row)
+    curve = detection.contrast_curve
+    beyond = curve["separation"].to_value("arcsec") >= INNER
+    ratio = np.asarray(curve["contrast"] / curve["known_star"])[beyond]
+    distant = np.hypot(detection.grid[..., 0], detection.grid[..., 1]) > 0.3
+    return {
+        "case": case.name,
+        "size": case.size,
+        "status": reduction.fit.status.name,
+        "chi2": reduction.fit.chi2_per_pixel,
+        "planets": planets,
+        "false": [
+            {"snr": float(table["snr"][k]), "place": places[k].tolist()} for k in sorted(left)
+        ],
+        "snr_scatter": float(np.nanstd(detection.residual_snr[distant])),
+        "limits_over_known_star": float(np.median(ratio)) if len(ratio) else None,
+        "limits": [float(each) for each in curve["contrast"]],
+        "separations": [float(each.to_value("arcsec")) for each in curve["separation"]],
+    }
+
+
+def _sky(separation: u.Quantity, angle: u.Quantity) -> np.ndarray:
+    """Offset to the east and north, arcsec."""
+    r, t = separation.to_value(u.arcsec), angle.to_value(u.rad)
+    return np.array([r * np.sin(t), r * np.cos(t)])
+
+
+def line(result: dict[str, Any]) -> str:
+    """A row of the table of the documentation."""
+    planets = result["planets"]
+    found = [each for each in planets if "snr" in each]
+
+    def listed(key: str, spec: str) -> str:
+        return ", ".join(format(each[key], spec) for each in found) or "-"
+
+    limits = result["limits_over_known_star"]
+    return (
+        f"| {result['case']} | {len(found)} of {len(planets)} | {len(result['false'])} "
+        f"| {listed('snr', '.0f')} | {listed('ratio', '.2f')} | {listed('flux_pull', '+.1f')} "
+        f"| {listed('separation_pull', '+.1f')} | {listed('angle_pull', '+.1f')} "
+        f"| {listed('away_mas', '.1f')} | {result['snr_scatter']:.2f} "
+        f"| {'-' if limits is None else format(limits, '.2f')} | {result['status']} "
+        f"| {result['cpu']:.0f} | {result['memory_gb']:.1f} |"
+    )
+
+
+def _run(name: str, folder: Path, references: int) -> dict[str, Any]:
+    warnings.simplefilter("ignore")
+    return reduced(CASES[name], folder, references)
+
+
+def main() -> None:
+    """Run the cases one after another, each in a process of its own, and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--references", type=int, default=0, choices=range(len(DITHERS) + 1))
+    options = parser.parse_args()
+    columns = ["case", "found", "false", "S/N", "flux / truth", "pull of flux", "of separation",
+               "of angle", "away, mas", "S/N scatter", "limits / known star", "status", "CPU s",
+               "GB"]  # fmt: skip
+    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|", flush=True)
+    context = multiprocessing.get_context("spawn")
+    for name in options.cases:
+        folder = options.output / f"{name.replace(' ', '_')}_{options.references}"
+        with ProcessPoolExecutor(1, mp_context=context) as pool:
+            try:
+                result = pool.submit(_run, name, folder, options.references).result()
+            except Exception as error:
+                print(f"| {name} | {type(error).__name__}: {error} |", flush=True)
+            else:
+                print(line(result), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,389 @@
+"""Several epochs and filters of a star on one page: its candidates in all of them.
+
+Between epochs a companion moves with the star, and a source in the background does not. In the
+filters of one epoch a source is at one place, and has a colour.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from html import escape
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.reduction import html
+from pyklip_diffrender.reduction.words import plus_minus, scientific
+
+__all__ = ["COMPARISON", "compare_reductions", "sources_of", "write_comparison"]
+
+COMPARISON = ("comparison.html", "comparison.json")
+"""Files that `write_comparison` writes."""
+
+_EPOCH = 5.0
+"""Days between reductions of one epoch."""
+
+_YEAR = 365.25
+
+_AGREES = 11.8
+"""Chi-squared of two coordinates that agree within three standard deviations (99.7 %)."""
+
+_PREFERRED = 9.0
+"""Difference of chi-squared by which one explanation is preferred to the other."""
+
+_FLOOR = 0.003
+"""Error of positions between reductions beyond that of the fit, arcsec: orientation, distortion,
+and where the star is behind the mask."""
+
+
+def compare_reductions(
+    summaries: Sequence[Mapping[str, Any]], motion: tuple[float, float] | None
+) -> list[dict[str, Any]]:
+    """Compare the candidates of pairs of reductions, of several epochs or filters.
+
+    A companion stays where it is beside the star, apart from its orbit. A source in the background
+    stays on the sky, and moves opposite to the star's proper motion beside it; its parallax is
+    neglected, as is the star's, which moves it by at most twice the parallax.
+
+    Parameters
+    ----------
+    summaries : sequence of dict
+        Those of `summarise`, in order of time.
+    motion : tuple of float or None
+        Proper motion of the star, mu_alpha cos(delta) and mu_delta, arcsec per year; None if it is
+        not known, and then no source in the background is recognised.
+
+    Returns
+    -------
+    list of dict
+        For every pair of candidates that may be one source: the `reductions`, numbered from 0,
+        their `dates` and `filters`, the numbers of the candidates in their tables, counted from 1,
+        how far the position changed (`moved_arcsec` to the east and north), chi-squared of both
+        explanations (two degrees of freedom), the colour (magnitude in the first filter minus that
+        in the second, and its error; None for one filter, and where it is not known), and the
+        `verdict`.
+    """
+    pairs = []
+    for (i, first), (j, second) in combinations(enumerate(summaries), 2):
+        if not (first["oriented"] and second["oriented"]):
+            continue
+        years = (second["epoch_mjd"] - first["epoch_mjd"]) / _YEAR
+        sky = None if motion is None else -np.array(motion) * years
+        for k, one in enumerate(first["candidates"], 1):
+            for m, other in enumerate(second["candidates"], 1):
+                moved = _offset(other) - _offset(one)
+                inverse = np.linalg.inv(_covariance(one) + _covariance(other))
+                star = float(moved @ inverse @ moved)
+                away = None if sky is None else float((moved - sky) @ inverse @ (moved - sky))
+                if min(star, np.inf if away is None else away) > _AGREES:
+                    continue
+                colour, error = _colour(first, one, second, other)
+                pairs.append(
+                    {
+                        "reductions": [i, j],
+                        "dates": [str(each["first_date"])[:10] for each in (first, second)],
+                        "filters": [first["filter"], second["filter"]],
+                        "candidates": [k, m],
+                        "moved_arcsec": [float(each) for each in moved],
+                        "chi2_with_star": star,
+                        "chi2_with_sky": away,
+                        "colour_mag": colour,
+                        "colour_error_mag": error,
+                        "verdict": (
+                            "at one place" if _together(first, second) else _verdict(star, away)
+                        ),
+                    }
+                )
+    return pairs
+
+
+def _together(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
+    """Whether two reductions are of one epoch."""
+    return abs(first["epoch_mjd"] - second["epoch_mjd"]) <= _EPOCH
+
+
+def _colour(
+    first: Mapping[str, Any],
+    one: Mapping[str, Any],
+    second: Mapping[str, Any],
+    other: Mapping[str, Any],
+) -> tuple[float | None, float | None]:
+    """Difference of the magnitudes in two filters, and its error."""
+    if first["filter"] == second["filter"] or not ("ab_mag" in one and "ab_mag" in other):
+        return None, None
+    error = math.hypot(one["ab_mag_error"], other["ab_mag_error"])
+    return one["ab_mag"] - other["ab_mag"], error
+
+
+def sources_of(
+    summaries: Sequence[Mapping[str, Any]], pairs: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Group the candidates that the filters of one epoch have at one place.
+
+    Parameters
+    ----------
+    summaries : sequence of dict
+        As for `compare_reductions`.
+    pairs : sequence of dict
+        What that returned.
+
+    Returns
+    -------
+    list of dict
+        For every source of an epoch with several filters: the `date`, and `filters`, a list with
+        for each reduction of the epoch its number from 0 (`reduction`), the `filter`, the numbers
+        of its `candidates` in the table, and, where there are none, the `limit`: the contrast of a
+        source at that separation that would have been a candidate (None if the curve does not
+        reach it).
+    """
+    nodes = [(i, k) for i, each in enumerate(summaries) for k in range(len(each["candidates"]))]
+    number = {node: n for n, node in enumerate(nodes)}
+    links = [
+        tuple(number[i, k - 1] for i, k in zip(pair["reductions"], pair["candidates"], strict=True))
+        for pair in pairs
+        if _together(*(summaries[i] for i in pair["reductions"]))
+    ]
+    if not nodes:
+        return []
+    first, second = np.array(links, dtype=int).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(links)), (first, second)), shape=(len(nodes), len(nodes)))
+    _, labels = connected_components(graph, directed=False)
+    sources = []
+    for label in dict.fromkeys(labels.tolist()):
+        members = [node for node, own in zip(nodes, labels, strict=True) if own == label]
+        start = summaries[members[0][0]]
+        epoch = [i for i, each in enumerate(summaries) if _together(each, start)]
+        if len({summaries[i]["filter"] for i in epoch}) < 2:
+            continue
+        separation = start["candidates"][members[0][1]]["separation_arcsec"]
+        sources.append(
+            {
+                "date": str(start["first_date"])[:10],
+                "filters": [
+                    _in_filter(i, summaries[i], [k for j, k in members if j == i], separation)
+                    for i in epoch
+                ],
+            }
+        )
+    return sources
+
+
+def _in_filter(
+    number: int, summary: Mapping[str, Any], candidates: Sequence[int], separation: float
+) -> dict[str, Any]:
+    curve = summary["contrast_curve"]
+    limit = None
+    if not candidates and len(curve["separation_arcsec"]):
+        places = np.array(curve["separation_arcsec"], dtype=float)
+        if places[0] <= separation <= places[-1]:
+            contrasts = np.array(curve["contrast"], dtype=float)
+            five = float(np.interp(separation, places, contrasts))
+            value = five * summary["threshold_snr"] / curve["sigmas"]
+            limit = value if math.isfinite(value) else None
+    return {
+        "reduction": number,
+        "filter": summary["filter"],
+        "candidates": [k + 1 for k in candidates],
+        "limit": limit,
+    }
+
+
+def _verdict(star: float, sky: float | None) -> str:
+    if sky is None:
+        return "beside the star at the same place; the star's proper motion is not known"
+    if sky - star > _PREFERRED and star < _AGREES:
+        return "moves with the star"
+    if star - sky > _PREFERRED and sky < _AGREES:
+        return "stays on the sky: a source in the background"
+    return "either: the star has moved too little between the epochs"
+
+
+def _offset(candidate: Mapping[str, Any]) -> NDArray[np.float64]:
+    """Offset from the star to the east and north, arcsec."""
+    angle = np.deg2rad(candidate["position_angle_deg"])
+    separation = candidate["separation_arcsec"]
+    return np.array([separation * np.sin(angle), separation * np.cos(angle)])
+
+
+def _covariance(candidate: Mapping[str, Any]) -> NDArray[np.float64]:
+    """Covariance of the offset, arcsec^2."""
+    angle = np.deg2rad(candidate["position_angle_deg"])
+    along = candidate["separation_error_arcsec"]
+    across = candidate["separation_arcsec"] * np.deg2rad(candidate["position_angle_error_deg"])
+    turn = np.array([[np.sin(angle), np.cos(angle)], [np.cos(angle), -np.sin(angle)]])
+    scales = np.diag([along**2 + _FLOOR**2, across**2 + _FLOOR**2])
+    return np.asarray(turn @ scales @ turn.T)
+
+
+def write_comparison(
+    folders: Mapping[str, Mapping[str, Any]],
+    motion: tuple[float, float] | None,
+    folder: str | os.PathLike[str],
+) -> list[Path]:
+    """Write ``comparison.html`` and ``comparison.json``, above the products of every reduction.
+
+    Parameters
+    ----------
+    folders : mapping of str to dict
+        Summaries by the name of their folder, in order of time.
+    motion : tuple of float or None
+        Proper motion of the star, see `compare_reductions`.
+    folder : path
+        That the folders are in.
+
+    Returns
+    -------
+    list of Path
+    """
+    summaries = list(folders.values())
+    pairs = compare_reductions(summaries, motion)
+    sources = sources_of(summaries, pairs)
+    content = {
+        "target": summaries[0]["target"],
+        "proper_motion_arcsec_per_year": None if motion is None else list(motion),
+        "reductions": [
+            {"folder": name, "date": each["first_date"], "filter": each["filter"],
+             "sentence": each["sentence"], "candidates": each["candidates"]}
+            for name, each in folders.items()
+        ],
+        "pairs": pairs,
+        "sources": sources,
+    }  # fmt: skip
+    page, data = (Path(folder) / name for name in COMPARISON)
+    texts = {
+        page: _page(folders, pairs, sources, motion),
+        data: json.dumps(content, indent=2, allow_nan=False) + "\n",
+    }
+    for path, text in texts.items():
+        with replacing(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    return list(texts)
+
+
+def _page(
+    folders: Mapping[str, Mapping[str, Any]],
+    pairs: Sequence[Mapping[str, Any]],
+    sources: Sequence[Mapping[str, Any]],
+    motion: tuple[float, float] | None,
+) -> str:
+    target = next(iter(folders.values()))["target"]
+    reductions = [
+        [
+            html.link(f"{name}/report.html", str(each["first_date"])[:10]),
+            str(each["filter"] or ""),
+            each["sentence"],
+        ]
+        for name, each in folders.items()
+    ]
+    positions = [
+        [
+            str(each["first_date"])[:10],
+            str(each["filter"] or ""),
+            str(k),
+            plus_minus(row["separation_arcsec"], row["separation_error_arcsec"]),
+            plus_minus(row["position_angle_deg"], row["position_angle_error_deg"]),
+            f"{row['snr']:.1f}",
+            scientific(row["contrast"], row["contrast_error"]),
+            plus_minus(row["ab_mag"], row["ab_mag_error"]) if "ab_mag" in row else "not known",
+        ]
+        for each in folders.values()
+        for k, row in enumerate(each["candidates"], 1)
+    ]
+    moves = [
+        [
+            " and ".join(
+                f"{d} {f or ''} ({n})"
+                for d, f, n in zip(p["dates"], p["filters"], p["candidates"], strict=True)
+            ),
+            "{:+.3f}, {:+.3f}".format(*p["moved_arcsec"]),
+            f"{p['chi2_with_star']:.1f}",
+            "not known" if p["chi2_with_sky"] is None else f"{p['chi2_with_sky']:.1f}",
+            "" if p["colour_mag"] is None else plus_minus(p["colour_mag"], p["colour_error_mag"]),
+            p["verdict"],
+        ]
+        for p in pairs
+    ]
+    known = "not known" if motion is None else "{:+.3f}, {:+.3f} arcsec per year".format(*motion)
+    sections = [
+        html.section(
+            "Reductions", html.table(["Date", "Filter", "Result"], reductions, wrap=2)
+        ),
+        html.section(
+            "Candidates",
+            html.table(
+                ["Date", "Filter", "", "Separation (arcsec)", "Position angle (deg)", "S/N",
+                 "Contrast", "AB magnitude"],
+                positions
+            )
+            if positions
+            else html.note("There are no candidates."),
+        ),
+        *([_over_filters(list(folders.values()), sources)] if sources else []),
+        html.section(
+            "Pairs of candidates",
+            html.table(
+                ["Candidates", "Moved to east, north (arcsec)", "Chi-squared with the star",
+                 "Chi-squared with the sky", "Colour (mag)", "Verdict"],
+                moves, wrap=5,
+            )
+            if moves
+            else html.note("No candidate has a counterpart in another reduction."),
+            html.note(
+                "Every epoch and filter was reduced alone. Chi-squared has two degrees of freedom, "
+                "and is that of a source that moves with the star, or stays on the sky. The colour "
+                "is the AB magnitude in the first filter minus that in the second, without errors "
+                "of the photometric calibration. Orbits, the star's parallax and errors of its "
+                f"proper motion are neglected. Proper motion to east and north: {known}."
+            ),
+        ),
+    ]  # fmt: skip
+    header = f"<header><h1>{escape(str(target))}: {len(folders)} reductions</h1></header>\n"
+    return html.document(f"{target}: comparison", header, sections)
+
+
+def _over_filters(
+    summaries: Sequence[Mapping[str, Any]], sources: Sequence[Mapping[str, Any]]
+) -> str:
+    """The table of sources over the filters of their epochs."""
+    filters = list(dict.fromkeys(str(e["filter"]) for s in sources for e in s["filters"]))
+    rows = []
+    for source in sources:
+        cells = dict.fromkeys(filters, "")
+        for each in source["filters"]:
+            summary = summaries[each["reduction"]]
+            cells[str(each["filter"])] = _brightness(summary, each)
+        rows.append([source["date"], *cells.values()])
+    return html.section(
+        "Candidates over filters",
+        html.table(["Date", *filters], rows),
+        html.note(
+            "Candidates that the filters of an epoch have at one place, with their numbers: AB "
+            "magnitude (contrast where it is not known), S/N, or the contrast that a candidate "
+            "there would have needed."
+        ),
+    )
+
+
+def _brightness(summary: Mapping[str, Any], in_filter: Mapping[str, Any]) -> str:
+    if not in_filter["candidates"]:
+        limit = in_filter["limit"]
+        return "not searched" if limit is None else f"< {scientific(limit)}"
+    texts = []
+    for k in in_filter["candidates"]:
+        row = summary["candidates"][k - 1]
+        value = (
+            plus_minus(row["ab_mag"], row["ab_mag_error"])
+            if "ab_mag" in row
+            else scientific(row["contrast"], row["contrast_error"])
+        )
+        texts.append(f"({k}) {value}, S/N {row['snr']:.1f}")
+    return "; ".join(texts)

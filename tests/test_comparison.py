@@ -1,0 +1,194 @@
+"""Epochs and filters of a star: candidates that move with it, background sources, colours."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from benchmarks.calints_files import calints
+from pyklip_diffrender.cli import main
+from pyklip_diffrender.reduction import compare_reductions, write_comparison
+from pyklip_diffrender.reduction.several import sources_of
+
+MOTION = (0.28, -0.36)
+"""Of AU Mic, arcsec per year."""
+
+
+def summary(
+    mjd: float,
+    places: list[tuple[float, float]],
+    error: float = 0.01,
+    filter: str = "F444W",
+    mag: float = 20.0,
+) -> dict[str, Any]:
+    """What a reduction says about candidates at offsets to the east and north."""
+    candidates = [
+        {
+            "separation_arcsec": float(np.hypot(*place)),
+            "separation_error_arcsec": error,
+            "position_angle_deg": float(np.degrees(np.arctan2(*place))),
+            "position_angle_error_deg": float(np.degrees(error / np.hypot(*place))),
+            "snr": 9.0,
+            "contrast": 1e-5,
+            "contrast_error": 1e-6,
+            "ab_mag": mag,
+            "ab_mag_error": 0.1,
+        }
+        for place in places
+    ]
+    return {
+        "target": "AU Mic <b>", "oriented": True, "epoch_mjd": mjd, "sentence": "Result.",
+        "first_date": "2022-10-03T00:00:00" if mjd < 60000 else "2023-12-02T00:00:00",
+        "filter": filter, "candidates": candidates, "threshold_snr": 6.0,
+        "contrast_curve": {
+            "sigmas": 5.0, "separation_arcsec": [0.4, 1.0], "contrast": [1e-5, 3e-6],
+        },
+    }  # fmt: skip
+
+
+def test_filters_of_an_epoch_are_compared_by_place_and_colour() -> None:
+    """One source in both filters, one in the first only, one beyond the curve of the other."""
+    long = summary(59855.0, [(0.8, -0.5), (-0.5, 0.5), (1.5, 0.0)], mag=20.0)
+    short = summary(59855.1, [(0.81, -0.5)], filter="F210M", mag=21.5)
+    pairs = compare_reductions([long, short], MOTION)
+    (pair,) = pairs
+    assert pair["candidates"] == [1, 1]
+    assert pair["verdict"] == "at one place"
+    assert pair["colour_mag"] == pytest.approx(-1.5)
+    assert pair["colour_error_mag"] == pytest.approx(0.1 * np.sqrt(2))
+    sources = sources_of([long, short], pairs)
+    assert [[each["candidates"] for each in source["filters"]] for source in sources] == [
+        [[1], [1]], [[2], []], [[3], []]
+    ]  # fmt: skip
+    limits = [source["filters"][1]["limit"] for source in sources]
+    assert limits[0] is limits[2] is None
+    # Between the two points of the curve, for an S/N of 6.
+    fraction = (np.hypot(0.5, 0.5) - 0.4) / 0.6
+    assert limits[1] == pytest.approx(1.2 * (1e-5 + fraction * (3e-6 - 1e-5)))
+    # Epochs of one filter have no such table, and no colour.
+    later = summary(60280.0, [(0.8, -0.5)])
+    pairs = compare_reductions([long, later], MOTION)
+    assert all(each["colour_mag"] is None for each in pairs)
+    assert sources_of([long, later], pairs) == []
+    assert sources_of([summary(59855.0, []), short | {"candidates": []}], []) == []
+
+
+def test_a_companion_moves_with_the_star_and_the_background_stays() -> None:
+    years = 425 / 365.25
+    bound, sky = np.array([0.8, -0.5]), np.array([-1.2, 1.0])
+    first = summary(59855.0, [tuple(bound), tuple(sky)])
+    second = summary(
+        60280.0,
+        [tuple(sky - np.array(MOTION) * years), tuple(bound + np.array([0.01, -0.01])), (2.0, 2.0)],
+    )
+    pairs = compare_reductions([first, second], MOTION)
+    verdicts = {tuple(pair["candidates"]): pair["verdict"] for pair in pairs}
+    assert verdicts == {
+        (1, 2): "moves with the star",
+        (2, 1): "stays on the sky: a source in the background",
+    }
+    (pair,) = (each for each in pairs if each["candidates"] == [2, 1])
+    np.testing.assert_allclose(pair["moved_arcsec"], -np.array(MOTION) * years, atol=1e-9)
+    assert pair["chi2_with_sky"] == pytest.approx(0, abs=1e-9)
+    # Moved by (0.01, -0.01) with errors of hypot(0.01, 0.003) in each of two epochs.
+    (pair,) = (each for each in pairs if each["candidates"] == [1, 2])
+    assert pair["chi2_with_star"] == pytest.approx(2e-4 / (2 * 1.09e-4), rel=1e-6)
+
+
+def test_a_star_that_hardly_moves_tells_nothing() -> None:
+    places = [(0.8, -0.5)]
+    frames = [summary(59855.0, places), summary(60280.0, places)]
+    (pair,) = compare_reductions(frames, (0.002, 0.001))
+    assert pair["verdict"].startswith("either")
+    (pair,) = compare_reductions(frames, None)
+    assert pair["chi2_with_sky"] is None
+    assert "not known" in pair["verdict"]
+    assert compare_reductions([frames[0] | {"oriented": False}, frames[1]], MOTION) == []
+
+
+def test_the_page_of_epochs_links_to_each(tmp_path: Path) -> None:
+    folders = {
+        "2022-10-03": summary(59855.0, [(0.8, -0.5)]), "2023-12-02": summary(60280.0, [(0.8, -0.5)])
+    }  # fmt: skip
+    html, data = write_comparison(folders, MOTION, tmp_path)
+    text = html.read_text(encoding="utf-8")
+    assert 'href="2022-10-03/report.html"' in text
+    assert "moves with the star" in text
+    assert "<b>" not in text
+    content = json.loads(data.read_text(encoding="utf-8"))
+    assert [each["folder"] for each in content["reductions"]] == list(folders)
+    assert content["sources"] == []
+    assert content["pairs"][0]["verdict"] == "moves with the star"
+    write_comparison({key: summary(59855.0, []) for key in folders}, None, tmp_path)
+    assert "There are no candidates" in html.read_text(encoding="utf-8")
+
+
+def test_the_page_has_a_table_of_candidates_over_filters(tmp_path: Path) -> None:
+    folders = {
+        "F444W": summary(59855.0, [(0.8, -0.5), (-0.5, 0.5)]),
+        "F210M": summary(59855.1, [(0.8, -0.5)], filter="F210M", mag=21.5),
+    }
+    html, data = write_comparison(folders, None, tmp_path)
+    text = html.read_text(encoding="utf-8")
+    assert 'href="F210M/report.html"' in text
+    table = text.partition("Candidates over filters")[2].partition("</section>")[0]
+    assert "(1) 20.00 ± 0.10, S/N 9.0</td><td>(1) 21.50 ± 0.10, S/N 9.0" in table
+    assert "&lt; 7.7 × 10⁻⁶" in table
+    assert len(json.loads(data.read_text(encoding="utf-8"))["sources"]) == 2
+
+
+def test_the_command_shows_every_epoch_and_every_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = tmp_path / "frames"
+    calints(frames / "a.fits")
+    calints(frames / "b.fits", observation=2, date="2023-12-01T06:00:00", roll=90.0)
+    calints(frames / "ta.fits", observation=3, cards={"EXP_TYPE": "NRC_TACQ"})
+    opd = tmp_path / "opd.fits"
+    hdu = fits.PrimaryHDU(np.random.default_rng(1).normal(0, 30, (64, 64)))
+    hdu.header["BUNIT"] = "nm"
+    hdu.writeto(opd)
+    options = ["reduce", str(frames), "--opd", str(opd), "-o", str(tmp_path / "out"), "--dry-run"]
+    assert main(options) == 0
+    shown = capsys.readouterr().out
+    assert "2022-10-03, one of 2 reductions" in shown
+    assert "2023-12-01, one of 2 reductions" in shown
+    assert shown.count("left out: ta.fits: EXP_TYPE is NRC_TACQ") == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_takes_every_filter_of_the_target(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = tmp_path / "frames"
+    pixel = {"PIXAR_SR": 9.2e-14}
+    calints(frames / "a.fits", cards=pixel)
+    short = {"FILTER": "F356W", "ACT_ID": "07", **pixel}
+    calints(frames / "b.fits", date="2022-10-03T07:00:00", cards=short)
+    # A filter of a reference star alone.
+    alone = {"FILTER": "F300M", "IS_PSF": True, "ACT_ID": "08"}
+    calints(frames / "c.fits", "HD 2", observation=2, cards=alone)
+    opd = tmp_path / "opd.fits"
+    hdu = fits.PrimaryHDU(np.random.default_rng(1).normal(0, 30, (64, 64)))
+    hdu.header["BUNIT"] = "nm"
+    hdu.writeto(opd)
+    options = ["reduce", str(frames), "--opd", str(opd), "-o", str(tmp_path / "out"), "--dry-run"]
+    assert main(options) == 0
+    shown = capsys.readouterr().out
+    assert "\nF444W, one of 2 reductions:" in shown
+    assert "\nF356W, one of 2 reductions:" in shown
+    assert main([*options, "--filter", "F356W"]) == 0
+    assert "one of" not in capsys.readouterr().out
+    assert main([*options, "--star-flux", "1 Jy"]) == 1
+    assert "--star-flux: got one flux density for F444W, F356W" in capsys.readouterr().err
+    sed = tmp_path / "star.txt"
+    sed.write_text("1 2\n2 0.8\n3 0.4\n4 0.3\n5 0.2\n6 0.1\n", encoding="utf-8")
+    assert main([*options, "--star-sed", str(sed)]) == 0
+    shown = capsys.readouterr().out
+    assert "Jy in F444W" in shown
+    assert "Jy in F356W" in shown
