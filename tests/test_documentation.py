@@ -113,7 +113,9 @@ def test_documented_commands_parse(
         assert {word for word in rest if word.startswith("-")} <= options, place
         return
     try:
-        command.make_context(name, rest)
+        # In the context of the program, whose options for help the commands take over.
+        parent = click.Context(application, info_name=PROGRAM, **application.context_settings)
+        command.make_context(name, rest, parent=parent)
     except click.UsageError as error:
         pytest.fail(f"{place}: {error.format_message()}")
 

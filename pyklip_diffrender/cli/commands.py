@@ -93,8 +93,7 @@ def demo(
         )
     if not len(result.detection.candidates):
         click.echo(f"  none above {result.detection.threshold:g} sigma")
-    for path in (*written, figure):
-        click.echo(f"wrote {path}")
+    click.echo(f"\nwrote {figure} and {len(written)} more files")
 
 
 @click.command(
