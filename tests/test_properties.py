@@ -220,11 +220,11 @@ def test_a_tilted_wavefront_is_a_star_off_the_axis(
 
 
 @given(npix=st.integers(3, 9), data=st.data(), nx=SIDES, ny=SIDES, shear=st.floats(-0.1, 0.1),
-       centred=st.booleans(), fold=st.booleans())  # fmt: skip
+       centred=st.booleans())  # fmt: skip
 def test_the_matrix_transform_is_the_plain_sum(
-    npix: int, data: st.DataObject, nx: int, ny: int, shear: float, centred: bool, fold: bool
+    npix: int, data: st.DataObject, nx: int, ny: int, shear: float, centred: bool
 ) -> None:
-    """Any window, any positions, folded or not."""
+    """Any window, any positions."""
     limits = [sorted(data.draw(st.lists(st.integers(0, npix), min_size=2, max_size=2, unique=True)))
               for _ in range(2)]  # fmt: skip
     grid = PupilGrid(npix, JWST_DIAMETER, tuple(limits[0]), tuple(limits[1]))
@@ -235,7 +235,7 @@ def test_the_matrix_transform_is_the_plain_sum(
     )
     generator = torch.Generator().manual_seed(npix)
     field = torch.randn(*grid.shape, dtype=torch.complex128, generator=generator)
-    transform = MatrixFourier(grid, x, y, WAVELENGTH, shear=shear, fold=fold)
+    transform = MatrixFourier(grid, x, y, WAVELENGTH, shear=shear)
     true_y = y[:, None] + shear * x[None, :]
     phase = (
         x[None, :, None, None] * grid.x[None, None, None, :]

@@ -36,8 +36,8 @@ def _optics() -> list[Breakage]:
     return [
         Breakage(
             "fourier-sign", "the image is not mirrored in y",
-            "RowTransform(y, pupil_y, wavelength, -1, dtype, fold)",
-            "RowTransform(y, pupil_y, wavelength, +1, dtype, fold)",
+            "kernel(y, pupil_y, wavelength, -1).to(dtype)",
+            "kernel(y, pupil_y, wavelength, +1).to(dtype)",
             "optics propagation_poppy",
         ),
         Breakage(
@@ -46,7 +46,7 @@ def _optics() -> list[Breakage]:
         ),
         Breakage(
             "adjoint-conjugate", "the inverse transform is the adjoint",
-            "self._matrix.conj().T @ field", "self._matrix.T @ field", "optics lattice",
+            "self._rows.mH @ field", "self._rows.mT @ field", "optics lattice",
         ),
         Breakage(
             "pupil-centre", "the pupil is centred between samples",

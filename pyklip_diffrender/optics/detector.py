@@ -73,7 +73,6 @@ class Detector:
                 wavefront.wavelength,
                 self.dtype.to_complex(),
                 self.shear,
-                fold="detector_shift" not in values,
             )
 
         key = (wavefront.wavelength, wavefront.grid)

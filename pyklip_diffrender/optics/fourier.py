@@ -22,11 +22,8 @@ from pyklip_diffrender.optics.grid import PupilGrid
 
 __all__ = [
     "MatrixFourier",
-    "RowTransform",
     "centred",
-    "fold",
     "kernel",
-    "symmetric",
     "tilt_phases",
 ]
 
@@ -66,94 +63,6 @@ def tilt_phases(offset: Tensor, grid: PupilGrid, wavelength: float) -> tuple[Ten
     return tuple(2 * math.pi * (t - torch.round(t.detach())) for t in (x_turns, y_turns))  # type: ignore[return-value]
 
 
-class RowTransform:
-    """The kernel ``exp(sign 2 pi i q p / lambda)`` between positions q and p, along axis -2.
-
-    If the positions are symmetric about zero, as for cells and centred pixels, the kernel
-    splits into a cosine that is even and a sine that is odd: two real products of half the size,
-    and a quarter of it where both kinds of position are symmetric.
-    """
-
-    def __init__(
-        self,
-        image: Tensor,
-        pupil: Tensor,
-        wavelength: float,
-        sign: int,
-        dtype: torch.dtype,
-        fold: bool,
-    ) -> None:
-        self.sign = sign
-        self.sizes = len(image), len(pupil)
-        self._image_folds = fold and symmetric(image)
-        self._pupil_folds = self._image_folds and symmetric(pupil)
-        if self._image_folds:
-            image = image[len(image) // 2 :]
-            pupil = pupil[len(pupil) // 2 :] if self._pupil_folds else pupil
-        values = kernel(image, pupil, wavelength, sign)
-        if self._image_folds:
-            self._cosine = values.real.contiguous().to(dtype.to_real())
-            self._sine = (sign * values.imag).contiguous().to(dtype.to_real())
-        else:
-            self._matrix = values.to(dtype)
-
-    def forward(self, field: Tensor) -> Tensor:
-        """(..., pupil, k) to (..., image, k)."""
-        if not self._image_folds:
-            return self._matrix @ field
-        even, odd = fold(field) if self._pupil_folds else (field, field)
-        return _unfold(
-            _real_product(self._cosine, even),
-            self.sign * _real_product(self._sine, odd),
-            self.sizes[0],
-        )
-
-    def adjoint(self, field: Tensor) -> Tensor:
-        """(..., image, k) to (..., pupil, k)."""
-        if not self._image_folds:
-            return self._matrix.conj().T @ field
-        even, odd = fold(field)
-        cosine = _real_product(self._cosine.T, even)
-        sine = -self.sign * _real_product(self._sine.T, odd)
-        return _unfold(cosine, sine, self.sizes[1]) if self._pupil_folds else cosine + 1j * sine
-
-
-def symmetric(positions: Tensor) -> bool:
-    """Whether positions lie symmetrically about zero."""
-    if len(positions) < 2:
-        return False
-    step = float((positions[1] - positions[0]).abs())
-    return float((positions + positions.flip(0)).abs().max()) < 1e-12 * step * len(positions)
-
-
-def fold(field: Tensor) -> tuple[Tensor, Tensor]:
-    """Even and odd parts along axis -2 on the half at and above zero, as sums over +-."""
-    half = field.shape[-2] // 2
-    upper, lower = field[..., half:, :], field[..., :half, :].flip(-2)
-    if field.shape[-2] % 2:
-        # The middle is its own mirror image: it counts once and has no odd part.
-        middle, above = upper[..., :1, :], upper[..., 1:, :]
-        return (
-            torch.cat([middle, above + lower], dim=-2),
-            torch.cat([torch.zeros_like(middle), above - lower], dim=-2),
-        )
-    return upper + lower, upper - lower
-
-
-def _unfold(even: Tensor, odd: Tensor, size: int) -> Tensor:
-    """``even + i odd`` above zero and ``even - i odd`` mirrored below it."""
-    turned = 1j * odd
-    below = (even - turned)[..., size % 2 :, :].flip(-2)
-    return torch.cat([below, even + turned], dim=-2)
-
-
-def _real_product(matrix: Tensor, field: Tensor) -> Tensor:
-    """Real matrix times complex field, without complex arithmetic."""
-    parts = torch.view_as_real(field.contiguous())
-    product = matrix @ parts.flatten(-2)
-    return torch.view_as_complex(product.unflatten(-1, (-1, 2)))
-
-
 class MatrixFourier:
     """The Fourier transform between one pupil window and one set of image positions.
 
@@ -173,9 +82,6 @@ class MatrixFourier:
         complex128 or complex64.
     shear : float
         Increase of y with x on the image: the true y of pixel (i, j) is ``y[i] + shear x[j]``.
-    fold : bool
-        Use a symmetry of the positions about zero. False for positions that are differentiated,
-        because their changes may break it.
     """
 
     def __init__(
@@ -186,12 +92,11 @@ class MatrixFourier:
         wavelength: float,
         dtype: torch.dtype = torch.complex128,
         shear: float = 0.0,
-        fold: bool = True,
     ) -> None:
         self.grid = grid
         pupil_x, pupil_y = grid.x.to(x.device), grid.y.to(x.device)
-        self._columns = RowTransform(x, pupil_x, wavelength, +1, dtype, fold)
-        self._rows = RowTransform(y, pupil_y, wavelength, -1, dtype, fold)
+        self._columns = kernel(x, pupil_x, wavelength, +1).to(dtype).T.contiguous()
+        self._rows = kernel(y, pupil_y, wavelength, -1).to(dtype)
         self._shear = (
             kernel(shear * x, pupil_y, wavelength, -1).T.contiguous().to(dtype) if shear else None
         )
@@ -200,15 +105,11 @@ class MatrixFourier:
 
     def forward(self, field: Tensor) -> Tensor:
         """Pupil field (..., rows, columns), per m, to image field (..., y, x), per radian."""
-        if self._shear is None:
-            return self._scale * self._columns.forward(self._rows.forward(field).mT).mT
         # Along x first, so that every column can have its own shift in y.
-        return self._scale * self._rows.forward(self._columns.forward(field.mT).mT * self._shear)
+        columns = self._scale * (field @ self._columns)
+        return self._rows @ (columns if self._shear is None else columns * self._shear)
 
     def inverse(self, field: Tensor, cell: float) -> Tensor:
         """Image field (..., y, x) on cells of solid angle `cell` (sr), back to the pupil."""
-        scale = cell * self._inverse_scale
-        if self._shear is None:
-            return scale * self._rows.adjoint(self._columns.adjoint(field.mT).mT)
-        turned = self._rows.adjoint(field) * self._shear.conj()
-        return scale * self._columns.adjoint(turned.mT).mT
+        columns = (cell * self._inverse_scale) * (self._rows.mH @ field)
+        return (columns if self._shear is None else columns * self._shear.conj()) @ self._columns.mH

@@ -38,7 +38,7 @@ from torch import Tensor
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.differentiation import Cache, Position, cached, position_of
-from pyklip_diffrender.optics.fourier import MatrixFourier, centred, tilt_phases
+from pyklip_diffrender.optics.fourier import MatrixFourier, tilt_phases
 from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, transform_polygons
 from pyklip_diffrender.optics.zernike import zernike_basis
 
@@ -218,9 +218,8 @@ class LyotStop(Plane):
         self.diameter = diameter
         self.dtype, self.device = dtype, device
         full = PupilGrid.full(npix, diameter)
-        # Symmetric about the axis, which halves the transforms. Only these two windows occur,
-        # because other results are cached for each window.
-        self._tight = centred(full.around(polygon_coverage(openings, full)))
+        # Only these two windows occur, because other results are cached for each window.
+        self._tight = full.around(polygon_coverage(openings, full))
         self._wide = self._tight.widened(self.margin * diameter)
         self._latest: Cache[PupilGrid, tuple[Position, Tensor]] = Cache()
 

@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.headers import header_text
@@ -17,7 +18,7 @@ from pyklip_diffrender.pattern.pedestal import (
     light_and_residual,
     median_variance,
     pattern_pedestal,
-    rings_about,
+    widths_from_star,
 )
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.frame_fit import FrameFit
@@ -36,6 +37,10 @@ __all__ = [
 ]
 
 Image = NDArray[np.float64]
+
+
+_SMOOTH = 1.0
+"""Rings (standard deviation) over which the scatter between frames is averaged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,12 +203,13 @@ def combine_patterns(patterns: Sequence[MeasuredPattern], name: str | None = Non
     pedestal = common_pedestal(patterns)
     patterns = [pattern.with_pedestal(pedestal) for pattern in patterns]
     values, variances, center, first_pixel = _on_common_pixels(patterns)
-    ring = rings_about(values[0].shape, center)
+    away = widths_from_star(values[0].shape, center)
+    ring = away.astype(np.int64)
     stars = [pattern.star for pattern in patterns]
     variances = variances * _noise_ratio(values, variances, ring)
-    scatter = _scatter_between_frames(values, variances, stars, ring)
+    scatter = _scatter_between_frames(values, variances, stars, away)
     variances = np.where(_outliers(values, variances + scatter**2), np.inf, variances)
-    width = _prior_width(values, variances, ring)
+    width = _prior_width(values, variances, away)
     precision = (1 / (variances + scatter**2)).sum(axis=0)
     total = precision + width**-2.0
     pattern = (values / (variances + scatter**2)).sum(axis=0) / total
@@ -305,19 +311,21 @@ def _on_common_pixels(
     )
 
 
-def _by_ring(variance: NDArray[np.float64], ring: NDArray[np.int64]) -> Image:
-    """Standard deviations by ring, from variances that may be negative, on the pixels."""
-    return np.sqrt(np.maximum(variance, 0.0))[ring]
+def _on_pixels(variance: NDArray[np.float64], away: Image) -> Image:
+    """Standard deviations on the pixels, interpolated between rings, from variances by ring."""
+    return np.sqrt(np.interp(away - 0.5, np.arange(len(variance)), np.maximum(variance, 0.0)))
 
 
 def _scatter_between_frames(
-    values: Image, variances: Image, stars: Sequence[str], ring: NDArray[np.int64]
+    values: Image, variances: Image, stars: Sequence[str], away: Image
 ) -> Image:
     """Standard deviation of the ratio between frames beyond noise, on the pixels.
 
     From frames of different stars where there are any: frames of one star share what is
-    particular to it.
+    particular to it. The variance of a single ring is so uncertain that it may come out negative:
+    neighbouring rings are averaged.
     """
+    ring = away.astype(np.int64)
     pairs = [(a, b) for a in range(len(stars)) for b in range(a + 1, len(stars))]
     across = [(a, b) for a, b in pairs if stars[a] != stars[b]] or pairs
     count = ring.max() + 1
@@ -334,7 +342,8 @@ def _scatter_between_frames(
             share = 1 / np.median(noise[inside]) ** 2
             excess[k] += share * (spread - np.median(noise[inside]))
             weight[k] += share
-    return _by_ring(np.divide(excess, 2 * weight, where=weight > 0, out=np.zeros(count)), ring)
+    excess, weight = (gaussian_filter1d(each, _SMOOTH, mode="nearest") for each in (excess, weight))
+    return _on_pixels(np.divide(excess, 2 * weight, where=weight > 0, out=np.zeros(count)), away)
 
 
 def _noise_ratio(values: Image, variances: Image, ring: NDArray[np.int64]) -> Image:
@@ -367,12 +376,13 @@ def _outliers(values: Image, variances: Image) -> NDArray[np.bool_]:
     return ~known | (np.abs(values - middle) > OUTLIER * np.sqrt(variances))
 
 
-def _prior_width(values: Image, variances: Image, ring: NDArray[np.int64]) -> Image:
+def _prior_width(values: Image, variances: Image, away: Image) -> Image:
     """Standard deviation of the pattern over the pixels of a ring.
 
     From products of different frames, whose noise is independent: where noise dominates, squares of
     one frame would show how well its errors are known, and not the pattern.
     """
+    ring = away.astype(np.int64)
     count = ring.max() + 1
     total, weight = np.zeros(count), np.zeros(count)
     known = np.isfinite(variances)
@@ -387,4 +397,4 @@ def _prior_width(values: Image, variances: Image, ring: NDArray[np.int64]) -> Im
     # No ring is taken to be free of the pattern just because it is too faint to show it.
     seen = width[width > 0]
     floor = np.median(seen) / 4 if len(seen) else 1e-4
-    return _by_ring(np.maximum(width, floor), ring)
+    return _on_pixels(np.maximum(width, floor), away)

@@ -20,6 +20,7 @@ __all__ = [
     "median_variance",
     "pattern_pedestal",
     "rings_about",
+    "widths_from_star",
 ]
 
 Image = NDArray[np.float64]
@@ -171,8 +172,12 @@ def light_and_residual(frame: FrameFit) -> tuple[Image, Image, Image, NDArray[np
     return light, left, combined.error[0], combined.valid[0]
 
 
+def widths_from_star(shape: tuple[int, int], center: tuple[float, float]) -> Image:
+    """Distance of every pixel from the star, in widths of a ring."""
+    y, x = np.indices(shape)
+    return np.asarray(np.hypot(x - center[0], y - center[1]) / _RING)
+
+
 def rings_about(shape: tuple[int, int], center: tuple[float, float]) -> NDArray[np.int64]:
     """Number of the ring about the star that every pixel lies in."""
-    y, x = np.indices(shape)
-    distance = np.hypot(x - center[0], y - center[1])
-    return (distance / _RING).astype(np.int64)
+    return widths_from_star(shape, center).astype(np.int64)

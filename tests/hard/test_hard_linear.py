@@ -153,10 +153,10 @@ def test_a_mask_that_has_seen_single_precision_is_as_good_in_double(name: str) -
 @pytest.mark.parametrize("dtype", DTYPES, ids=["float64", "float32"])
 @pytest.mark.parametrize(("rows", "columns"), [(8, 9), (9, 8), (1, 5), (2, 1)])
 @pytest.mark.parametrize("window", [(0, N), (3, 44)], ids=["symmetric", "window"])
-def test_transform_and_inverse_are_adjoint_folded_or_not(
+def test_transform_and_inverse_are_adjoint(
     rows: int, columns: int, window: tuple[int, int], dtype: torch.dtype
 ) -> None:
-    """The inverse is written by hand; folding uses the symmetry of the positions."""
+    """The inverse is written by hand."""
     grid = PupilGrid(N, JWST_DIAMETER, window, window)
     x, y = (
         (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * 0.06 * ARCSEC
@@ -168,15 +168,9 @@ def test_transform_and_inverse_are_adjoint_folded_or_not(
         return torch.randn(*shape, dtype=dtype.to_complex(), generator=generator)
 
     pupil, image = noise(*grid.shape), noise(rows, columns)
-    results = []
-    for fold in (True, False):
-        transform = MatrixFourier(grid, x, y, WAVELENGTH, dtype.to_complex(), fold=fold)
-        there = transform.forward(pupil)
-        back = transform.inverse(image, 1.0) * grid.spacing**2
-        left = torch.vdot(image.flatten(), there.flatten())
-        right = torch.vdot(back.flatten(), pupil.flatten())
-        scale = float(image.norm() * there.norm())
-        assert abs(complex(left - right)) <= LIMITS[dtype] * scale
-        results.append((there, back))
-    for folded, plain in zip(*results, strict=True):
-        assert float((folded - plain).norm()) <= LIMITS[dtype] * float(plain.norm())
+    transform = MatrixFourier(grid, x, y, WAVELENGTH, dtype.to_complex(), shear=0.03)
+    there = transform.forward(pupil)
+    back = transform.inverse(image, 1.0) * grid.spacing**2
+    left = torch.vdot(image.flatten(), there.flatten())
+    right = torch.vdot(back.flatten(), pupil.flatten())
+    assert abs(complex(left - right)) <= LIMITS[dtype] * float(image.norm() * there.norm())

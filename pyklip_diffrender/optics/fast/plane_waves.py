@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pyklip_diffrender.optics.fourier import centred, fold, kernel
+from pyklip_diffrender.optics.fourier import centred, kernel
 from pyklip_diffrender.optics.planes import Wavefront
 
 __all__ = ["PlaneWaves", "ShiftedTransforms"]
@@ -56,7 +56,7 @@ class ShiftedTransforms:
             turned = kernel(shear * x, pupil_y, wavelength, -1).T
             along_x = along_x * turned.to(field.dtype)[:, None, :]
         along_x = (grid.spacing**2 / wavelength) * along_x.movedim(1, 0)
-        even, odd = fold(along_x)
+        even, odd = _fold(along_x)
         # Real and imaginary parts side by side, for products with real matrices.
         self._even, self._odd = (
             torch.view_as_real(each.contiguous()).flatten(-2) for each in (even, -1j * odd)
@@ -93,6 +93,20 @@ class ShiftedTransforms:
             )
             transforms += [even + odd, (even - odd).flip(-2)]
         return torch.stack(transforms).unflatten(0, (2, 2))
+
+
+def _fold(field: Tensor) -> tuple[Tensor, Tensor]:
+    """Even and odd parts along axis -2 on the half at and above zero, as sums over +-."""
+    half = field.shape[-2] // 2
+    upper, lower = field[..., half:, :], field[..., :half, :].flip(-2)
+    if field.shape[-2] % 2:
+        # The middle is its own mirror image: it counts once and has no odd part.
+        middle, above = upper[..., :1, :], upper[..., 1:, :]
+        return (
+            torch.cat([middle, above + lower], dim=-2),
+            torch.cat([torch.zeros_like(middle), above - lower], dim=-2),
+        )
+    return upper + lower, upper - lower
 
 
 @dataclass(frozen=True)
