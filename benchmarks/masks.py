@@ -11,7 +11,7 @@ with 2 cells. The error of either is the largest difference from its own limit (
 over the peak of the image, which the mask has made fainter. Times are those of the processor with
 one thread, after a first image that fills caches; of this package, the best of three.
 
-Prints a row for each mask.
+Prints a row for each mask; with ``--own``, without stpsf.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def error(image: Image, limit: Image) -> float:
     return float(np.abs(image - limit).max() / limit.max())
 
 
-def row(name: str) -> str:
-    """Times and errors of both for a mask."""
+def stpsf_cells(name: str) -> tuple[list[str], float]:
+    """Times and errors of stpsf for a mask, and its time with 4 points per lambda/D, s."""
     import stpsf
 
     aperture, band, wavelength = MASKS[name]
@@ -75,7 +75,7 @@ def row(name: str) -> str:
     nircam.options["nd_squares"] = False
     call = {"monochromatic": wavelength, "detector_oversample": 1, "fov_pixels": SIZE}
     limit = dr.from_webbpsf(nircam, **call, fft_oversample=8, add_distortion=False)().numpy()
-    theirs = []
+    cells, seconds = [], np.nan
     for points in (2, 4):
 
         def calculate(points: int = points) -> Image:
@@ -83,35 +83,44 @@ def row(name: str) -> str:
             return np.asarray(psf["DET_SAMP"].data)
 
         image, seconds = timed(calculate)
-        theirs += [f"{seconds:.1f}", f"{error(image, limit):.0e}"]
-    ours = {}
+        cells += [f"{seconds:.1f}", f"{error(image, limit):.0e}"]
+    return cells, seconds
+
+
+def own_cells(name: str) -> tuple[list[str], float]:
+    """Time and error of this package for a mask, and the time, s."""
+    aperture, band, wavelength = MASKS[name]
     opd = torch.from_numpy(dr.random_opd(1, npix=NPIX).data)
-    for cells in (2, 8):
+    images = {}
+    for cells in (8, 2):
         model = dr.nircam_coronagraph(
-            band, image_mask=mask, monochromatic=wavelength, npix=NPIX, fov_pixels=SIZE,
-            occulter_sampling=cells,
+            band, image_mask=aperture.split("_")[2], monochromatic=wavelength, npix=NPIX,
+            fov_pixels=SIZE, occulter_sampling=cells,
         )  # fmt: skip
         with torch.no_grad():
-            ours[cells] = timed(lambda model=model: model(opd).numpy(), 4)
-    (image, seconds), (exact, _) = ours[2], ours[8]
-    ratio = float(theirs[2]) / seconds
-    cells = [name, *theirs, f"{seconds:.3f}", f"{error(image, exact):.0e}", f"{ratio:.0f}"]
-    return f"| {' | '.join(cells)} |"
+            images[cells], seconds = timed(lambda model=model: model(opd).numpy(), 4)
+    return [f"{seconds:.3f}", f"{error(images[2], images[8]):.0e}"], seconds
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("names", nargs="*", default=list(MASKS))
-    names = parser.parse_args().names
+    parser.add_argument("--own", action="store_true", help="without stpsf")
+    options = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
-    columns = ["mask", "stpsf 2, s", "error", "stpsf 4, s", "error", "this, s", "error",
-               "stpsf 4 / this"]  # fmt: skip
+    columns = ["mask", "this, s", "error"]
+    if not options.own:
+        columns += ["stpsf 2, s", "error", "stpsf 4, s", "error", "stpsf 4 / this"]
+        stpsf_cells(options.names[0])  # Fills its caches.
     print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|", flush=True)
-    row(names[0])  # Fills the caches of stpsf.
-    for name in names:
-        print(row(name), flush=True)
+    for name in options.names:
+        cells, seconds = own_cells(name)
+        if not options.own:
+            theirs, longer = stpsf_cells(name)
+            cells += [*theirs, f"{longer / seconds:.0f}"]
+        print(f"| {' | '.join([name, *cells])} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ nitpick_ignore_regex = [
     ("py:obj", r"[^.]*"),
     ("py:obj", r"(poppy|pyklip|spaceKLIP|stpsf|torch|webbpsf)\..*"),
     ("py:obj", r"(GaussNewton|RoundMask|calibration|contrast|spectrum)\..*"),
-    ("py:obj", r"pyklip_diffrender\.(linear|pyklip_backend\.subtract|scene\.noise)\..*"),
+    ("py:obj", r"pyklip_diffrender\.(linear|pyklip_backend\.subtract|scene\.measured_noise)\..*"),
 ]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
@@ -67,6 +67,8 @@ nb_execution_cache_path = str(_cache)
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
+# Cells that are not run (nb_execution_mode=off) do not say their language.
+suppress_warnings = ["myst-nb.lexer"]
 # A cell prints in several pieces, and they are one output.
 nb_merge_streams = True
 # This one needs frames of the telescope. Without them the page has the outputs that its file has.

@@ -706,7 +706,7 @@ def test_mast_is_asked_for_the_map_of_the_date(
     capsys.readouterr()
     assert main([*arguments, "--opd-date", "after", "--overwrite"]) == 1
     assert "no route to host" in capsys.readouterr().err
-    assert asked == [("2022-07-30T02:03:04", "closest"), ("2022-07-30T02:03:04", "after")]
+    assert asked == [("2022-07-30T02:03:04", "nearest"), ("2022-07-30T02:03:04", "after")]
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from pyklip_diffrender.wavefront import choose_map, random_opd, read_opd, wavefr
 NPIX = 64
 
 # Kept without stpsf's data, which is not the subject here.
-pytestmark = pytest.mark.filterwarnings("ignore:.*what the sensing camera saw")
+pytestmark = pytest.mark.filterwarnings("ignore:.*as the sensing camera saw")
 
 
 def write_map(path: Path, seed: int, npix: int = NPIX, **cards: str | bool) -> Path:

@@ -93,8 +93,7 @@ def demo(
         )
     if not len(result.detection.candidates):
         click.echo(f"  none above {result.detection.threshold:g} sigma")
-    for path in (*written, figure):
-        click.echo(f"wrote {path}")
+    click.echo(f"\nwrote {figure} and {len(written)} more files")
 
 
 @click.command(
@@ -271,7 +270,7 @@ Examples:
 )
 @click.argument("file", type=file_type())
 @option("-o", "--output", type=file_type(), required=True, metavar="FOLDER",
-        help="Folder for jobs and tables. What is finished there is not repeated.")  # fmt: skip
+        help="Folder for jobs and tables. Finished jobs are not repeated.")  # fmt: skip
 @option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler; default a local cluster.")
 @common
 @click.pass_obj

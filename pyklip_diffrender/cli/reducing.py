@@ -90,14 +90,14 @@ def run_reduction(
             click.echo(f"wavefront map: {map_.name}{_age(map_, sequence)}")
             prepared.append(prepare(sequence, map_, _with_flux(checked, star_sed, sequence.filter)))
             if dry_run:
-                click.echo(describe_plan(prepared[-1].sequence, checked))
+                click.echo(describe_plan(prepared[-1].sequence, prepared[-1].options))
         sizes = (size_of_products(each.sequence, derivatives=derivatives) for each in prepared)
         run.require_room(output, sum(sizes))
         if dry_run:
             return
         summaries = {}
         for preparation, folder in zip(prepared, folders, strict=True):
-            with numbered_stages(dict(steps_of(preparation.sequence, checked))):
+            with numbered_stages(dict(steps_of(preparation.sequence, preparation.options))):
                 reduction = preparation.run(progress=run.progress)
                 with stage("products"):
                     written = reduction.write(folder, overwrite=overwrite, derivatives=derivatives)
@@ -188,7 +188,7 @@ def map_for(sequence: Sequence, opd: str, rule: Rule | None) -> OPDMap:
         )
     if is_folder:
         return choose_map(opd, date, rule)
-    return load_wss_opd_by_date(date, "closest" if rule == "nearest" else rule)
+    return load_wss_opd_by_date(date, rule)
 
 
 def _age(opd: OPDMap, sequence: Sequence) -> str:

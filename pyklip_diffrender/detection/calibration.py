@@ -44,7 +44,7 @@ def calibration_errors(
     Returns
     -------
     Tensor, (2, k), float64
-        Those of the contrasts, and those of the sources' own fluxes, which do not depend on the
+        Relative errors of the contrasts, and of the sources' own fluxes, which do not depend on the
         star's.
     """
     count = len(offsets)

@@ -47,7 +47,7 @@ def contrast_table(
     errors : list of ndarray
         Standard deviations of contrasts at the pixels of each ring, multiplied by the factor.
     photon : list of ndarray
-        The same for a known star.
+        Standard deviations for a known star.
     resolution : float
         lambda/D, arcsec.
     factor : ErrorFactor

@@ -306,7 +306,7 @@ class _Sources:
         Rows and columns.
     contrasts : ndarray, (k,)
     flux : float
-        That of the star, to which contrasts are relative.
+        Flux of the star, to which contrasts are relative.
     light : dict of int to ndarray, (ny, nx)
         By frame.
     gain : float

@@ -96,7 +96,7 @@ def throughput(
     image : ndarray, (ny, nx)
         Star-subtracted, with the planet. Pixels that are not finite are left out.
     planet : ndarray, (ny, nx)
-        What the planet alone would look like.
+        Image of the planet alone.
     noise : ndarray, (ny, nx)
         Standard deviation of every pixel.
     position : tuple of float

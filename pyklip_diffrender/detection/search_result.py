@@ -78,7 +78,7 @@ class Detection:
     snr : ndarray, (ny, nx)
         contrast / error.
     residual_snr : ndarray, (ny, nx)
-        The same after the candidates are removed from the data.
+        S/N after the candidates are removed from the data.
     error_factor : ErrorFactor
         Factor by which errors were multiplied, at every pixel; ``error_factor.at(0.5)`` is its
         median at 0.5 arcsec.

@@ -62,7 +62,7 @@ class WholeFrame:
     fit : FrameFit
         Fit of the star in the pixels about it.
     observation : Observation
-        The same observation, with all of its pixels.
+        The whole frame, of which the fit has a part.
     roll : float
         Rotation of the sky from the first frame to this one, degrees.
     candidates : ndarray, (k, 3)

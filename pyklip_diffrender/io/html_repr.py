@@ -26,7 +26,7 @@ def html_summary(
     table : Table, optional
         Shown below the facts, at most 20 rows of it.
     columns : iterable of str
-        Those of the table to show, as far as it has them.
+        Columns of the table to show, as far as it has them.
 
     Returns
     -------

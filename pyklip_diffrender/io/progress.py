@@ -134,7 +134,7 @@ class ProgressBar:
     Parameters
     ----------
     name : str
-        What is counted. Inside a `stage` the name of that is shown instead.
+        Name of the loop. Inside a `stage` the name of the stage is shown instead.
     total : int, optional
         Number of steps; None for a loop that ends when it has converged.
     shown : bool

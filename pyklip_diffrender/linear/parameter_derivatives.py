@@ -82,7 +82,7 @@ def image_derivatives(
     values : dict of Tensor
     names : tuple of str
     slopes : dict of str to list of Tensor
-        What `field_derivatives` returned.
+        Derivatives from `field_derivatives`.
 
     Returns
     -------

@@ -125,7 +125,7 @@ class ResponseCache:
             On the model's grid, m.
         values : dict of Tensor
         names : tuple of str
-            The same in every call.
+            Free parameters; they must not change between calls.
         fields : sequence of Tensor
             The star's field at each wavelength.
         """

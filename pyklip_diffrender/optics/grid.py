@@ -165,7 +165,7 @@ def resample(opd: NDArray[np.float64], npix: int) -> NDArray[np.float64]:
     if opd.ndim < 2 or opd.shape[-1] != opd.shape[-2] or not opd.size:
         raise ShapeError(
             f"opd: got shape {opd.shape}, expected square maps, (..., npix, npix), whose sides "
-            "are those of the pupil array. Pad what is missing with zeros"
+            "are those of the pupil array. Pad the missing samples with zeros"
         )
     count = opd.shape[-1]
     if npix == count:

@@ -65,7 +65,7 @@ class DiffrenderSettings:
         folder of maps, the one closest in time to the frames is taken; "flat" stands for a flat
         wavefront.
     opd_folder : path, optional
-        Folder of maps from which `opd` chooses: "closest", the last one "before" the frames, the
+        Folder of maps from which `opd` chooses: "nearest", the last one "before" the frames, the
         first one "after" them, or "interpolate"; see `choose_map`.
     model : optical model or mapping, optional
         From `nircam_coronagraph` or a bridge. For a dataset of several wavelengths, a mapping

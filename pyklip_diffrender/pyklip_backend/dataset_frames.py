@@ -66,7 +66,7 @@ class Frames:
     noise : str
         Origin of the errors: "ERR", "given" or "estimated".
     pointings : tuple of Pointing
-        The same frames, sorted by where they show the star.
+        Frames of the target, grouped by star position and orientation.
     references : tuple of Observation
         Frames of reference stars in the dataset and the library, by pointing.
     factor : ndarray, (m,)

@@ -104,7 +104,7 @@ class FittedPointing:
         Parameters
         ----------
         change : Tensor, (unknowns,)
-            Those of companions do not count.
+            Changes of the unknowns; those of companions do not count.
         """
         linear = self.result.linear
         star = torch.tensor([unknown.name != "companions" for unknown in linear.unknowns])

@@ -357,7 +357,7 @@ def _run_klip(
     Parameters
     ----------
     klip_dataset : callable
-        That of pyKLIP.
+        pyKLIP's function.
     arguments : mapping
         Of the call.
     before : mapping

@@ -54,7 +54,7 @@ class Picture:
     ----------
     png : bytes
     alt : str
-        What it shows, for readers who do not see it.
+        Description of the picture, for readers who do not see it.
     caption : str
     """
 

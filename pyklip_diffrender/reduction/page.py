@@ -53,7 +53,7 @@ def page(
     summary : dict
         See `summarise`.
     overview, curve, wavefront, wide, disk : sequence of Picture
-        Those of whole frames, `wide`, and of extended light, `disk`, may be missing.
+        Pictures of the whole frames, `wide`, and of extended light, `disk`, may be missing.
     stars : sequence of sequence of Picture
         One for each frame of the target that is shown.
     files : mapping of str to str, optional
@@ -140,7 +140,8 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         stars = ", ".join(used["stars"])
         pattern = used["name"] if stars in ("", used["name"]) else f"{used['name']} ({stars})"
         if used["size"] is not None:
-            pattern += f"; {plus_minus(used['size'], used['size_error'])} of it seen"
+            strength = plus_minus(used["size"], used["size_error"])
+            pattern += f"; strength in these frames {strength}"
     star = summary["star"]
     flux = []
     if star is not None:

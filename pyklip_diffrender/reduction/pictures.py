@@ -78,7 +78,7 @@ def curve_pictures(
     )
     sigmas = summary["contrast_curve"]["sigmas"]
     dotted = (
-        " Dotted: corrected for the small number of positions that tell of the scatter."
+        " Dotted: with the small-sample correction."
         if detection.error_factor.is_measured or klip is not None
         else ""
     )
@@ -97,8 +97,8 @@ def curve_pictures(
             f"Curve of the contrast at {sigmas:g} sigma against separation in arcsec"
             f"{': ' if limits else ''}{limits}.",
             f"Contrast, relative to the star without coronagraph, that gives S/N {sigmas:g}: the "
-            "median of all position angles and their range. Dashed: the same if the image of the "
-            f"star were known exactly.{beside}{dotted} {_scaled(detection)}",
+            "median of all position angles and their range. Dashed: the limit for "
+            f"an exactly known star.{beside}{dotted} {_scaled(detection)}",
         ),
     )
 
@@ -177,7 +177,7 @@ def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
         _star(detection, frame),
         (
             f"Image of {observation.target} behind the coronagraph, in {unit}.",
-            f"What was observed{mean}. The scale is linear near 0 and logarithmic in bright parts; "
+            f"Observed{mean}. The scale is linear near 0 and logarithmic in bright parts; "
             "the cross marks the star.",
         ),
         (

@@ -39,7 +39,7 @@ PRODUCTS = {
     "wide_field_candidates.ecsv": "candidates in the whole frames",
     "wide_field_contrast.ecsv": "contrast curve to the edge of the frames",
     "disk.fits": "the extended light: frames without the star, and its sources",
-    "injections.ecsv": "injected planets, and what was measured of them",
+    "injections.ecsv": "injected planets and their measurements",
     "completeness.ecsv": "fraction of planets that the search finds, by contrast and separation",
     "fit.fits": "the fit, for Refinement.read",
     "systematics.fits": "the flat-field pattern, for other reductions",

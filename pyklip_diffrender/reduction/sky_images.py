@@ -67,7 +67,7 @@ class SkyImages:
 
     @cached_property
     def posterior_mean(self) -> Image:
-        """What is neither star nor detector, in the frames' unit, see `imaging.sky_model`.
+        """Light of neither star nor detector, in the frames' unit, see `imaging.sky_model`.
 
         Of faint sources it has 0.4 to 0.8 of the peak.
         """
@@ -82,9 +82,9 @@ class SkyImages:
 
     @property
     def words(self) -> str:
-        """What `image` is."""
+        """Description of `image`."""
         if self._disk is None:
-            return "Most probable image of what is neither star nor detector, from all frames"
+            return "Most probable image of the sky without star and detector, from all frames"
         return "Mean of all frames without the star"
 
     def turned(self, on_frame: Image) -> Image:

@@ -63,7 +63,7 @@ def advice(status: Status, *, patterned: bool, remark: str = "") -> str:
     patterned : bool
         Whether the flat-field pattern was known.
     remark : str
-        What else there is to say about the reduction.
+        Further advice about the reduction.
     """
     missing = _REFERENCES if status is Status.MODEL_MISMATCH and not patterned else ""
     return f"{_ADVICE[status]}{missing} {remark}".rstrip()

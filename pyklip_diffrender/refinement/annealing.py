@@ -113,7 +113,7 @@ class _Course:
     error, chi2 : float
         Model error and chi-squared per pixel of `state`.
     least : (float, float)
-        Those of `best`.
+        Model error and chi-squared per pixel of `best`.
     """
 
     state: State

@@ -150,8 +150,8 @@ def with_star_flux(
 def star_flux_error(fit: Refinement) -> float:
     """Relative error of the star's flux that is not in the fit's own covariance.
 
-    That of its settings; by default 10 % for real frames (40 % without a wavefront map), and 0 for
-    others.
+    The error in the settings; by default 10 % for real frames (40 % without a wavefront map), and 0
+    for others.
     """
     known = fit.settings.star_flux_error
     if known is not None:

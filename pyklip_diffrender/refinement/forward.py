@@ -39,7 +39,7 @@ class Point:
         The star in the data's unit, with the known flat-field pattern (also that of the
         pedestal, see `Systematics`).
     star : Tensor, (ny, nx)
-        The same with the background.
+        The star and the background.
     total : Tensor, (ny, nx)
         With the companions.
     """

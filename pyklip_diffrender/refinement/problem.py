@@ -46,7 +46,7 @@ class Problem:
         Starting values of optical parameters (numbers in the units of the parameter table, or
         Quantities), and of "flux" and "background" where known.
     systematics : Systematics, optional
-        What is known of the model's error in these pixels.
+        Flat-field pattern of these pixels, with its error.
     """
 
     model: OpticalSystem

@@ -185,7 +185,7 @@ class Solver:
         Returns
         -------
         state : State
-            The same state if no step lowers the penalised chi-squared.
+            Unchanged if no step lowers the penalised chi-squared.
         gain : float
             Decrease, or expected decrease, of the penalised chi-squared per pixel.
         """

@@ -29,7 +29,7 @@ class Row:
     use : "target", "reference" or "excluded"
     star : str
     exposure : Exposure
-        What the header says.
+        Facts from the header.
     observation : Observation or None
         The frames, unless they are excluded.
     remark : str

@@ -68,7 +68,7 @@ class Judgement:
     valid : ndarray of bool, (frames, ny, nx)
         Pixels that are used.
     remarks : tuple of str
-        What was left out, and why.
+        Integrations and pixels that were left out, and why.
     """
 
     kept: NDArray[np.bool_]

@@ -70,7 +70,7 @@ class Observation:
     header : Header
         Primary and science headers of the file, merged.
     remarks : tuple of str
-        What was left out of the file when it was read, and why.
+        Parts of the file that were left out when it was read, and why.
     noise_ratios : tuple of float
         Scatter of the file's pixels far from the star over their stated errors, for every frame,
         before the errors were corrected; NaN where it could not be measured.

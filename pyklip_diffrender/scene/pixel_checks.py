@@ -199,7 +199,7 @@ def _pattern(observation: Observation) -> Image | None:
 
 
 def _turn(pattern: Image, other: Image) -> str:
-    """What was done to a pattern that another one did not undergo; empty if nothing was."""
+    """Rotation or flip that takes one pattern to the other, in words; empty for none."""
     if pattern.shape != other.shape:
         return ""
 

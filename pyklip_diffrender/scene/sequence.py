@@ -56,8 +56,7 @@ class Sequence:
     excluded : tuple of (str, str)
         Names of the files that were left out, and why.
     rows : tuple of Row
-        What every file is, and what it is used for; see `table`. Empty for a sequence that was not
-        made from files.
+        Kind and use of every file, see `table`. Empty for a sequence that was not made from files.
 
     Examples
     --------

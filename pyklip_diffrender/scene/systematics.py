@@ -70,8 +70,8 @@ def pattern_fields(hdus: fits.HDUList, version: int = 1) -> dict[str, Any]:
 class Systematics:
     """A multiplicative pattern that the star model misses, with its uncertainty.
 
-    What no wavefront explains in the image of one star is largely the same fraction of the light
-    in the image of another, on the same pixels of the detector: mostly an error of the flat field.
+    The part of a star's image that no wavefront explains is, on the same pixels of the detector,
+    largely the same fraction of the light of every star: mostly an error of the flat field.
     The star in pixel p is taken to be ``model_p * (1 + m_p) + pedestal * m_p``, where m_p is
     Gaussian with mean `pattern` and standard deviation `error`. Frames of the same pixels that are
     fitted together share m_p. Light of companions is not multiplied: nothing of it can be mistaken

@@ -50,7 +50,7 @@ class Job:
     key : str
         Hash of the package's version, the content of the input files, and the options.
     name : str
-        That of the sequence, with the date of the epoch if it has several.
+        Name of the sequence, with the date of the epoch if it has several.
     files : tuple of str
         Frames.
     opd : str

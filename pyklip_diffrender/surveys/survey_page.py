@@ -51,7 +51,7 @@ def page(rows: Rows, name: str) -> str:
     parts += [f"{failed} failed"] if failed else []
     parts += [f"{waiting} not finished yet"] if waiting else []
     advice = (
-        "When the survey has ended, start it again to do what is missing."
+        "When the survey has ended, start it again to do the missing jobs."
         if done < len(rows)
         else ""
     )

@@ -139,7 +139,7 @@ def load_wss_opd(
 
 def _warn_of_terms(name: str, reason: Exception) -> None:
     warnings.warn(
-        f"{name}: the map is what the sensing camera saw. It contains that camera's own "
+        f"{name}: the map is as the sensing camera saw it, with that camera's own "
         "aberration and the telescope's field dependence at the sensing field point, typically "
         "63 nm rms in all where the telescope alone has 54 nm rms, because stpsf's models of them "
         f"are not available ({reason}). A refinement with a wide enough prior corrects for it; "
@@ -151,7 +151,7 @@ def _warn_of_terms(name: str, reason: Exception) -> None:
 
 def load_wss_opd_by_date(
     date: str | Time,
-    choice: str = "closest",
+    choice: str = "nearest",
     *,
     npix: int | None = None,
     backout_si_wfe: bool | None = None,
@@ -162,8 +162,9 @@ def load_wss_opd_by_date(
     Parameters
     ----------
     date : str (ISO, UTC) or Time
-    choice : "closest", "before", "after" or "interpolate"
-        Measurement to take; the last interpolates linearly between the two around the date.
+    choice : "nearest", "before", "after" or "interpolate"
+        Measurement to take; the last interpolates linearly between the two around the date. stpsf's
+        name "closest" for the nearest one is accepted.
     npix, backout_si_wfe
         See `load_wss_opd`.
     folder : path, optional
@@ -180,10 +181,11 @@ def load_wss_opd_by_date(
     IncompatibleSetupError
         For another `choice`, or if stpsf is not installed.
     """
-    if choice not in ("closest", "before", "after", "interpolate"):
+    if choice not in ("closest", "nearest", "before", "after", "interpolate"):
         raise IncompatibleSetupError(
-            f"choice: got {choice!r}, expected 'closest', 'before', 'after' or 'interpolate'"
+            f"choice: got {choice!r}, expected 'nearest', 'before', 'after' or 'interpolate'"
         )
+    choice = "closest" if choice == "nearest" else choice  # As stpsf calls it.
     mast_wss = stpsf_module("to ask MAST").mast_wss
     when = Time(date)
     cache = None if folder is None else os.fspath(folder)

@@ -1,0 +1,253 @@
+"""Commands and code of the README and the documentation: they parse, and what they name exists.
+
+Code cells of the tutorials are run by the build of the documentation.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import importlib
+import inspect
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+
+import click
+import pytest
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.cli import application
+from pyklip_diffrender.reduction import ReduceOptions
+from pyklip_diffrender.wavefront.opd import OPDMap
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+PAGES += [path for path in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in path.parts]
+PROGRAM = "pyklip-diffrender"
+
+OBJECTS = {
+    "detection": dr.Detection,
+    "fit": dr.Refinement,
+    "result": dr.Reduction,
+    "sequence": dr.Sequence,
+    "wavefront": OPDMap,
+}
+"""Classes of variables that the documentation calls by these names."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of code."""
+
+    page: str
+    line: int
+    language: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.page}:{self.line}"
+
+
+@cache
+def blocks() -> tuple[Block, ...]:
+    found = []
+    for path in PAGES:
+        page = path.relative_to(ROOT).as_posix()
+        language, start, lines = None, 0, []
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            fence = re.match(r"(```+|:::+)(.*)", line)
+            if language is None and fence and fence[1].startswith("`"):
+                language, start, lines = fence[2].strip(), number + 1, []
+            elif language is not None and line.strip() == "```":
+                found.append(Block(page, start, language, "\n".join(lines)))
+                language = None
+            elif language is not None:
+                lines.append(line)
+        assert language is None, f"{page}:{start}: the block does not end"
+    return tuple(found)
+
+
+def commands(program: str) -> Iterator[tuple[str, list[str]]]:
+    """Where a program is called in blocks, by line, or in the text, and its arguments."""
+    calls: list[tuple[str, str]] = []
+    for block in blocks():
+        if block.language in ("", "bash", "text"):
+            text = block.text.replace("\\\n", " ")
+            calls += [(str(block), line) for line in text.splitlines()]
+    for path in PAGES:
+        prose = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+        quoted = re.findall(rf"`({program} [^`]+)`", prose.replace("\n", " "))
+        calls += [(path.relative_to(ROOT).as_posix(), call) for call in quoted]
+    for place, call in calls:
+        for part in re.split(r"&&|\||\$ ", call.partition("#")[0]):
+            # Environment variables may stand before the program.
+            words = shlex.split(re.sub(r"^\s*(\w+=\S+ )*", "", part)) if program in part else []
+            if words[: len(program.split())] == program.split() != words:
+                yield place, words[len(program.split()) :]
+
+
+CALLS = list(commands(PROGRAM))
+
+
+@pytest.mark.parametrize(
+    ("place", "arguments"),
+    [pytest.param(*call, id=f"{call[0]}-{k}") for k, call in enumerate(CALLS)],
+)
+def test_documented_commands_parse(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, arguments: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    name, *rest = arguments
+    if name == "COMMAND" or place.endswith("deprecations.md"):
+        return
+    page = (ROOT / "docs/reference/command_line.md").read_text(encoding="utf-8")
+    Path("run.toml").write_text(page.partition("```toml\n")[2].partition("```")[0])
+    assert name in application.commands, f"{place}: no command {name}"
+    command = application.commands[name]
+    if place.endswith(".md"):  # In the text a command need not be complete.
+        options = {option for each in command.params for option in each.opts}
+        assert {word for word in rest if word.startswith("-")} <= options, place
+        return
+    try:
+        # In the context of the program, whose options for help the commands take over.
+        parent = click.Context(application, info_name=PROGRAM, **application.context_settings)
+        command.make_context(name, rest, parent=parent)
+    except click.UsageError as error:
+        pytest.fail(f"{place}: {error.format_message()}")
+
+
+def test_many_commands_are_documented() -> None:
+    assert {arguments[0] for _, arguments in CALLS} >= set(application.commands)
+    assert len(CALLS) > 25
+
+
+@pytest.mark.parametrize("program", ["python -m", "python"])
+def test_documented_scripts_have_the_options(program: str) -> None:
+    checked = 0
+    for place, (script, *arguments) in commands(program):
+        if script.startswith("benchmarks"):
+            path = ROOT / script.replace(".", "/")
+            sources = list(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
+        elif script.startswith(("examples/", "tests/")):
+            sources = [ROOT / script]
+        else:
+            continue
+        for source in sources:
+            assert source.exists(), f"{place}: there is no {script}"
+        # Some share options in a module beside them.
+        sources += [ROOT / "benchmarks" / "real_options.py", ROOT / "examples/paper/scene.py"]
+        code = "".join(source.read_text(encoding="utf-8") for source in sources)
+        for option in arguments:
+            if option.startswith("--") and option != "--help":
+                assert f'"{option}"' in code, f"{place}: {script} has no option {option}"
+        checked += 1
+    assert checked > 2
+
+
+# -- Python ----------------------------------------------------------------------------------------
+
+
+PYTHON = [block for block in blocks() if block.language == "python"]
+
+
+@pytest.mark.parametrize("block", PYTHON, ids=str)
+def test_names_and_arguments_in_documented_code_exist(block: Block) -> None:
+    for node in ast.walk(ast.parse(block.text)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("pyklip_diffrender"):
+            module = importlib.import_module(node.module or "")
+            for name in node.names:
+                if not hasattr(module, name.name):
+                    importlib.import_module(f"{node.module}.{name.name}")
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            owner = dr if node.value.id == "dr" else OBJECTS.get(node.value.id)
+            if owner is not None:
+                assert node.attr in members(owner), f"{block}: no {node.value.id}.{node.attr}"
+        if isinstance(node, ast.Call):
+            require_arguments(block, node)
+
+
+def members(owner: object) -> set[str]:
+    names = set(dir(owner))
+    if is_dataclass(owner):
+        names |= {each.name for each in fields(owner)}
+    return names
+
+
+def require_arguments(block: Block, call: ast.Call) -> None:
+    """Check the keywords of calls of the package's functions and methods."""
+    if not (isinstance(call.func, ast.Attribute) and isinstance(call.func.value, ast.Name)):
+        return
+    variable = call.func.value.id
+    owner = dr if variable == "dr" else OBJECTS.get(variable)
+    function = getattr(owner, call.func.attr, None)
+    if owner is None or function is None:
+        return
+    parameters = inspect.signature(function).parameters
+    taken = {name for name, each in parameters.items() if each.kind is not each.VAR_KEYWORD}
+    # Keywords of these are fields of a class with settings.
+    taken |= {each.name for each in (*fields(dr.DiffrenderSettings), *fields(ReduceOptions))}
+    for keyword in call.keywords:
+        assert keyword.arg is None or keyword.arg in taken, (
+            f"{block}: {variable}.{call.func.attr} takes no {keyword.arg}"
+        )
+
+
+@pytest.mark.parametrize("page", sorted({block.page for block in PYTHON}))
+def test_documented_code_imports_names_before_it_uses_them(page: str) -> None:
+    def bound(tree: ast.AST) -> set[str]:
+        aliases = (n for n in ast.walk(tree) if isinstance(n, ast.Import | ast.ImportFrom))
+        return {(a.asname or a.name).split(".")[0] for each in aliases for a in each.names}
+
+    imported = {name for block in PYTHON for name in bound(ast.parse(block.text))}
+    known = set(dir(builtins))
+    # Cells of tutorials come before the other code of their pages.
+    for cell in (b for b in blocks() if b.page == page and b.language.startswith("{code-cell}")):
+        code = re.sub(
+            r"\A---\n.*?\n---\n|^:[^\n]*\n", "", cell.text, flags=re.DOTALL | re.MULTILINE
+        )
+        known |= bound(ast.parse(code))
+    for block in (each for each in PYTHON if each.page == page):
+        for statement in ast.parse(block.text).body:
+            names = [n for n in ast.walk(statement) if isinstance(n, ast.Name)]
+            loaded = {n.id for n in names if isinstance(n.ctx, ast.Load)}
+            missing = (loaded & imported) - known - bound(statement)
+            assert not missing, f"{block}: {', '.join(sorted(missing))} is used before its import"
+            known |= bound(statement) | {n.id for n in names if isinstance(n.ctx, ast.Store)}
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_attributes_that_the_text_names_exist(path: Path) -> None:
+    prose = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+    if path.name in ("changelog.md", "deprecations.md"):
+        return
+    for owner, name in re.findall(r"`(?:dr\.)?([A-Z]\w+)\.(\w+)", prose):
+        if owner in dr.__all__:
+            assert name in members(getattr(dr, owner)), f"{path.name}: no {owner}.{name}"
+    for name in re.findall(r"`dr\.(\w+)", prose):
+        assert hasattr(dr, name), f"{path.name}: no dr.{name}"
+
+
+def test_links_of_the_readme_exist() -> None:
+    for path in PAGES[:2]:
+        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text(encoding="utf-8")):
+            if not target.startswith("http"):
+                assert (ROOT / target).exists(), f"{path.name}: {target}"
+
+
+@pytest.mark.slow
+def test_the_first_example_gives_what_the_page_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = [block for block in blocks() if block.page == "docs/getting_started.md"]
+    (code,) = (block.text for block in page if "dr.simulate(" in block.text)
+    (stated,) = (block.text for block in page if block.language == "text")
+    exec(compile(code, "getting_started.md", "exec"), {})
+    shown = capsys.readouterr().out
+    for line in stated.splitlines():
+        assert line.strip() in shown
+    assert (tmp_path / "products" / "candidates.ecsv").exists()
