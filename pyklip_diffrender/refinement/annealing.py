@@ -366,7 +366,8 @@ class Annealing:
     def _significant(self, course: _Course) -> list[Planet]:
         """Companions in the residual of the alignment."""
         most, threshold = self._room(course), self.settings.companion_threshold
-        if most < 1 and self.settings.companions_if_stalled:
+        if most < 1 and self.settings.companions_if_stalled and self.settings.wavefront:
+            # Brighter than all that the wavefront can have left.
             most, threshold = min(1, most + _MOST_BRIGHT), _BRIGHT
         return bright_companions(
             self.objective, course.state, course.kappa, most=most, threshold=threshold

@@ -93,9 +93,9 @@ class GaussNewton:
     companion_threshold : float
         Smallest S/N of such companions, in units of the scatter of the matched filter.
     companions_if_stalled : bool
-        Where the fit of the wavefront stalls far above the noise, search the residual for bright
-        companions, one at a time and up to eight more than `max_companions`. False for frames
-        whose residual has peaks that are errors of the model.
+        Before the fit of the wavefront, and where it stalls far above the noise, search the
+        residual for bright companions, one at a time and up to eight more than `max_companions`.
+        False for frames whose residual has peaks that are errors of the model.
     response_npix : int
         Pupil samples of the coarse copy of the model that computes derivatives.
     response_wavelengths : int

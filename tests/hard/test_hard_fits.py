@@ -160,9 +160,10 @@ def test_the_jacobian_of_a_fit_matches_finite_differences_in_every_column() -> N
         step = STEPS[name]
         ends = [image({**at, label: at[label] + k * step}) for k in (1, -1)]
         slope = (ends[0] - ends[1]) / (2 * step)
-        # ResponseCache are kept in single precision; areas of pixels that an edge of the Lyot stop
-        # cuts are only once differentiable.
-        limit = 2e-3 if name.startswith("lyot") else 1e-4
+        # Responses are kept in single precision, those of modes with a short transform that wraps
+        # the faintest light; areas of pixels that an edge of the Lyot stop cuts are only once
+        # differentiable.
+        limit = 2e-3 if name.startswith("lyot") else 5e-4 if name == "modes" else 1e-4
         # Piston, the first Zernike, has no slope but rounding.
         rounding = 200 * np.finfo(float).eps * ends[0].max() / step
         assert np.abs(got - slope).max() < limit * np.abs(slope).max() + rounding, label
