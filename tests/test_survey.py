@@ -818,7 +818,7 @@ def test_real_frames_with_and_without_a_planet(tmp_path: Path, shared_data: Path
     config = {
         "workers": 0,
         "options": {
-            "size": 40, "systematics": "off", "settings": {"cycles": [8.0], "max_iterations": 6},
+            "size": 32, "systematics": "off", "settings": {"cycles": [8.0], "max_iterations": 4},
         },
         "injections": {"contrasts": [3e-3], "separations": [0.8], "angles": [330.0]},
         "sequence": [
