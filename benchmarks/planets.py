@@ -52,7 +52,7 @@ def verdict(seed: int) -> tuple[str, str]:
         return "found", words
     curve = found.contrast_curve
     limit = np.interp(separation, curve["separation"].value, curve["small_sample"], left=np.inf)
-    words = f"{words}, limit {limit:.2g}, candidates {found.table['snr'].round(1).tolist()}"
+    words = f"{words}, limit {limit:.2g}, candidates {found.candidates['snr'].round(1).tolist()}"
     return ("fainter than the curve" if contrast < limit else "lost"), words
 
 

@@ -230,7 +230,7 @@ def reduced(case: Case, folder: Path, references: int = 0) -> dict[str, Any]:
 def compare(case: Case, reduction: dr.Reduction) -> dict[str, Any]:
     """The candidates beside the planets, the scatter of the S/N, and the limits."""
     detection = reduction.detection
-    table = detection.table
+    table = detection.candidates
     places = [_sky(row["separation"], row["position_angle"]) for row in table]
     left, planets = set(range(len(table))), []
     for planet in case.planets:
