@@ -436,6 +436,16 @@ def test_of_two_frames_that_differ_in_brightness_none_is_right(folder: Path) -> 
         dr.Sequence.from_files(folder)
 
 
+def test_a_pixel_that_is_missing_at_the_peak_moves_nothing(folder: Path) -> None:
+    def hole(arrays: dict[str, np.ndarray]) -> None:
+        peak = np.unravel_index(arrays["SCI"][0].argmax(), arrays["SCI"][0].shape)
+        arrays["SCI"][0][peak] = np.nan
+
+    (folder / SECOND).unlink()
+    calints(folder / SECOND, observation=2, roll=80.0, date="2022-10-03T09:00:00", change=hole)
+    assert uses(dr.Sequence.from_files(folder))[SECOND] == "target"
+
+
 def test_of_two_frames_of_different_orientation_none_is_right(folder: Path) -> None:
     (folder / SECOND).unlink()
     next(folder.glob("jw01184003*")).unlink()

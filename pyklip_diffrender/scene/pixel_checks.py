@@ -64,6 +64,9 @@ _TURNED = 0.1
 """Gain in correlation above which frames are not of one orientation. Real frames of one filter
 correlate by 0.99, mirrored or turned ones by 0.2 to 0.7."""
 
+_ALIKE = 0.8
+"""Least correlation of a pattern with another when it is turned back."""
+
 _SYMMETRIES: dict[str, Callable[[Image], Image]] = {
     "mirrored left to right": lambda image: image[:, ::-1],
     "mirrored upside down": lambda image: image[::-1],
@@ -208,7 +211,7 @@ def _turn(pattern: Image, other: Image) -> str:
 
     likenesses = {name: likeness(undo(pattern)) for name, undo in _SYMMETRIES.items()}
     best = max(likenesses, key=lambda name: likenesses[name])
-    return best if likenesses[best] > likeness(pattern) + _TURNED else ""
+    return best if likenesses[best] > max(_ALIKE, likeness(pattern) + _TURNED) else ""
 
 
 def why_odd_unit(observation: Observation) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from astropy.convolution import Gaussian2DKernel, interpolate_replace_nans
 from numpy.typing import NDArray
 
 __all__ = ["center_of_symmetry", "measured_offset", "stamp_about"]
@@ -59,7 +60,9 @@ def stamp_about(
     all_rows, all_columns = np.indices(data.shape)
     outside = valid & (np.hypot(all_columns - x, all_rows - y) * pixelscale > _SKY)
     sky = data[outside] if outside.sum() > _ENOUGH else np.sort(data[valid])[: valid.sum() // 5 + 1]
-    image = np.where(valid[window], data[window] - float(np.median(sky)), 0.0)
+    image = np.where(valid[window], data[window] - float(np.median(sky)), np.nan)
+    # A pixel that is missing in the core would move the centre of symmetry.
+    image = np.nan_to_num(interpolate_replace_nans(image, Gaussian2DKernel(1.0)))
     return image, distance, error[window]
 
 
