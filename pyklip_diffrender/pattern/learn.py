@@ -61,7 +61,7 @@ _ALONE = 0.01
 """Smallest model error, as a fraction of the star, in the fit of a star without a pattern."""
 
 _KNOWN = 0.002
-"""The same with the pattern of the other stars, whose own error is counted apart."""
+"""Smallest model error with the pattern of the other stars, whose own error is counted apart."""
 
 
 def learn_library(

@@ -89,7 +89,7 @@ class MeasuredPattern:
     catalogue: CatalogueStar = field(default_factory=CatalogueStar)
 
     def with_pedestal(self, pedestal: float) -> MeasuredPattern:
-        """The same residual over the sum of the star and another pedestal.
+        """Return the pattern as a fraction of the sum of the star and another pedestal.
 
         Raises
         ------
