@@ -5,8 +5,8 @@ Run from the root of the project, with the package and its extra "webbpsf" insta
     python -m benchmarks.parity --official ../shared/data/stpsf-data
 
 It makes an offline STPSF data directory without symmetry, runs the real stpsf on it and on STScI's
-own files, and writes docs/parity.md. At 1024 samples it takes about ten minutes and 6 GB of memory.
-Speed is measured only if asked for (--speed); else that section of the page stays as it is.
+own files, and writes reports/parity.md. At 1024 samples it takes about ten minutes and 6 GB of
+memory. Speed is measured only if asked for (--speed). docs/validation/optics.md has the results.
 """
 
 from __future__ import annotations
@@ -235,13 +235,10 @@ def speed(folder: Path, npix: int, oversample: int) -> list[str]:
     return lines
 
 
-SPEED = "## Speed"
-
-
 def speed_section(rows: list[str], oversample: int) -> list[str]:
     """The page's section on speed."""
     return [
-        SPEED,
+        "## Speed",
         "",
         "One monochromatic image of a star on the axis, against `nircam.calc_psf` at "
         f"fft_oversample 4. The error is with respect to stpsf at fft_oversample "
@@ -266,7 +263,7 @@ def main() -> None:
     parser.add_argument("--official", type=Path, help="STScI's data directory for stpsf")
     parser.add_argument("--speed", action="store_true", help="measure speed anew")
     parser.add_argument("--oversample", type=int, default=8, help="of stpsf's FFTs")
-    parser.add_argument("--output", type=Path, default=TESTS.parent / "docs" / "parity.md")
+    parser.add_argument("--output", type=Path, default=TESTS.parent / "reports" / "parity.md")
     arguments = parser.parse_args()
     npix, oversample = arguments.npix, arguments.oversample
     logging.disable(logging.WARNING)
@@ -295,15 +292,11 @@ def main() -> None:
             *on_official_files(path),
             "",
         ]
-    page = arguments.output.read_text(encoding="utf-8") if arguments.output.exists() else ""
-    as_before = page[page.index(SPEED) :].splitlines() if SPEED in page else []
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(
         "\n".join(
             [
                 "# Parity with poppy and stpsf",
-                "",
-                "Written by a script, but for the section on speed, which stays as it is unless "
-                "the script is run with --speed.",
                 "",
                 *provenance("-m benchmarks.parity", ("poppy", "stpsf", "pysiaf")),
                 "",
@@ -319,11 +312,10 @@ def main() -> None:
                 "",
                 "The errors are rounding because the converted model samples image planes at the "
                 "points where stpsf's FFT does, if it is asked for the same oversampling; it only "
-                "leaves out the points where the mask is clear. What a coarser sampling costs is "
-                "in [accuracy](accuracy.md), and in the table below.",
+                "leaves out the points where the mask is clear.",
                 "",
                 *official,
-                *(speed_section(faster, oversample) if faster else as_before),
+                *(speed_section(faster, oversample) if faster else []),
                 "",
             ]
         ),

@@ -1,6 +1,6 @@
 """The table of parity with stpsf, at 256 samples across the pupil, and on STScI's own files.
 
-`benchmarks/parity.py` measures the same at 1024 and writes docs/parity.md.
+`benchmarks/parity.py` measures the same at 1024 and writes reports/parity.md.
 """
 
 from __future__ import annotations
