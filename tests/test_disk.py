@@ -15,7 +15,7 @@ from matplotlib import pyplot
 from scipy.optimize import nnls
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import disk as module
+from pyklip_diffrender.detection import disk_fit as module
 from pyklip_diffrender.detection.groups import groups_of
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.wavefront import random_drift

@@ -23,6 +23,7 @@ from pyklip_diffrender.bridges.image_masks import (
     padded_pupil,
 )
 from pyklip_diffrender.bridges.orientation import Orientation
+from pyklip_diffrender.bridges.plane_turns import free_turn, is_quarter_turn, turns_behind
 from pyklip_diffrender.bridges.rotation import FreeRotation
 from pyklip_diffrender.bridges.sampled_planes import (
     Gain,
@@ -113,7 +114,7 @@ class Conversion:
         self.propagation: dict[str, str] = {}
         self.fixed: set[str] = {"npix", "device"} if recipe["trainable"] else set()
         self._has_stop = False
-        turns = self._turns_behind()
+        turns = turns_behind(osys.planes)
         self.frames = [self._to_system(turn) for turn in turns]
         self.planes = self._convert_planes(turns)
         self.entrance = self._entrance()
@@ -136,7 +137,7 @@ class Conversion:
                 # poppy rotates the pupil array alone, without the light beyond it.
                 planes.append(
                     Gain(optic.name, edge=pupil)
-                    if _is_quarter_turn(optic)
+                    if is_quarter_turn(optic)
                     else FreeRotation(angle, self.npix, self.diameter, optic.name)
                 )
                 scattered = False
@@ -156,17 +157,6 @@ class Conversion:
                 planes.append(plane)
                 stack = []
         return planes
-
-    def _turns_behind(self) -> list[Orientation]:
-        """For every plane, the product of all quarter turns and inversions behind it."""
-        turns, turn = [], Orientation()
-        for optic in reversed(self.osys.planes):
-            turns.append(turn)
-            if optic.planetype == PlaneType.inversion:
-                turn = Orientation.inversion(optic.axis).then(turn)
-            elif _is_quarter_turn(optic):
-                turn = Orientation.quarter_turns(round(optic.angle / 90)).then(turn)
-        return turns[::-1]
 
     def _to_system(self, turn: Orientation) -> Orientation:
         """From the frame of a pupil plane to the system's, in which y is inverted."""
@@ -218,7 +208,7 @@ class Conversion:
             chromatic={
                 w: torch.from_numpy(opd - base) for w, opd in opds.items() if (opd != base).any()
             },
-            turned=self._free_turn(),
+            turned=free_turn(self.osys.planes),
             collected=float((amplitude**2).sum()) / self.block**2,
         )
 
@@ -232,16 +222,6 @@ class Conversion:
         window = slice(dropped, dropped + count * self.block)
         blocks = array[window, window].reshape(count, self.block, count, self.block)
         return np.asarray(blocks.mean(axis=(1, 3)))
-
-    def _free_turn(self) -> float:
-        """Rotation of the image by planes that turn by other than right angles, degrees."""
-        total, sense = 0.0, 1
-        for optic in reversed(self.osys.planes):
-            if optic.planetype == PlaneType.inversion and optic.axis != "both":
-                sense = -sense
-            elif optic.planetype == PlaneType.rotation and not _is_quarter_turn(optic):
-                total += optic.angle * sense
-        return total
 
     def _pupil(self, index: int, centred: str) -> tuple[Plane, str]:
         """A pupil plane, and where poppy centres the next image."""
@@ -402,13 +382,6 @@ class Conversion:
             # poppy counts in its own samples, y first.
             centre=(float(offset[1]) * samples, float(offset[0]) * samples),
         )
-
-
-def _is_quarter_turn(optic: Any) -> bool:
-    """Whether a plane rotates by a multiple of 90 degrees."""
-    return bool(
-        optic.planetype == PlaneType.rotation and round(optic.angle / 90) * 90 == optic.angle
-    )
 
 
 def _turned_factor(

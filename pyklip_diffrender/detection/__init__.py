@@ -11,7 +11,8 @@ from __future__ import annotations
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.combination import combine_frames
 from pyklip_diffrender.detection.detection_file import image_hdu
-from pyklip_diffrender.detection.disk import Disk, fit_disk
+from pyklip_diffrender.detection.disk import Disk
+from pyklip_diffrender.detection.disk_fit import fit_disk
 from pyklip_diffrender.detection.figure import draw_curve, draw_search
 from pyklip_diffrender.detection.recovery import measured_planet, recover_planets, with_planets
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure

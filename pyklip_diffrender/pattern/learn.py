@@ -34,7 +34,8 @@ from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.scene.admission import frames_by_star
-from pyklip_diffrender.scene.exposure import detector_of, image_mask
+from pyklip_diffrender.scene.archive_names import detector_of
+from pyklip_diffrender.scene.exposure import image_mask
 from pyklip_diffrender.scene.frame_files import (
     FrameFile,
     admissible,

@@ -22,8 +22,9 @@ from pyklip_diffrender.pattern.pedestal import (
 )
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.frame_fit import FrameFit
+from pyklip_diffrender.scene.archive_names import detector_of
 from pyklip_diffrender.scene.catalogue_star import CatalogueStar, star_of
-from pyklip_diffrender.scene.exposure import detector_of, image_mask
+from pyklip_diffrender.scene.exposure import image_mask
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 

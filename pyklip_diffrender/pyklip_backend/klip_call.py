@@ -58,11 +58,7 @@ from pyklip_diffrender.pyklip_backend.output_files import (
 from pyklip_diffrender.pyklip_backend.product_images import image_of
 from pyklip_diffrender.pyklip_backend.source import ATTRIBUTE, attach_source
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction, subtract_by_refinement
-from pyklip_diffrender.pyklip_backend.throughput import (
-    on_product,
-    throughput_map,
-    write_throughput,
-)
+from pyklip_diffrender.pyklip_backend.throughput import throughput_map, write_throughput
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 __all__ = ["RESULTS", "DatasetReduction", "mark_filtered"]
@@ -292,27 +288,13 @@ class DatasetReduction:
         if not linear or len(results) != len(self.records):
             return
         self._tell("throughput of faint sources")
-        dataset, maps = self.dataset, []
-        center = np.asarray(dataset.output_centers[0], dtype=float)
-        for k, (record, result) in enumerate(zip(self.records, results, strict=True)):
-            frame = result.frames[0].observation
-            turned = on_product(
-                self._throughput(record, result),
-                frame.center[0],
-                dataset.output.shape[-2:],
-                center,
-                0.0 if self.arguments["skip_derot"] else frame.position_angle,
-                dataset.flipx,
-            )
-            turned[np.isnan(dataset.output[0, :, k]).all(axis=0)] = np.inf
-            maps.append(turned)
-        cube = np.array(maps)
-        cards["DRTHRU"] = (
-            float(np.median(cube[np.isfinite(cube)])),
-            "median throughput of faint sources",
+        cards["DRTHRU"] = write_throughput(
+            stage / f"{prefix}-throughput.fits",
+            self.dataset,
+            list(map(self._throughput, self.records, results)),
+            [result.frames[0].observation for result in results],
+            is_turned=not self.arguments["skip_derot"],
         )
-        cube = np.where(np.isnan(cube), 1.0, np.where(np.isinf(cube), np.nan, cube))
-        write_throughput(stage / f"{prefix}-throughput.fits", cube, center)
 
     def _throughput(self, record: ReductionRecord, result: Any) -> NDArray[np.float64]:
         """Fraction of a faint source's peak that the products have, on the first frame's pixels."""

@@ -16,8 +16,9 @@ agrees with this within 2 % (1 sigma) on NIRCam frames; a fit of the whole image
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -25,6 +26,8 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
+
+from pyklip_diffrender.scene.observation import Observation
 
 if TYPE_CHECKING:
     from pyklip_diffrender.detection.templates import Templates
@@ -157,9 +160,46 @@ def on_product(
     return np.asarray(map_coordinates(image, places, order=1, cval=np.nan))
 
 
-def write_throughput(path: Path, maps: NDArray[np.float64], center: NDArray[np.float64]) -> None:
-    """Write maps (wavelengths, ny, nx), on the pixels of the products, to a FITS file."""
-    cube = maps[0] if len(maps) == 1 else maps
+def write_throughput(
+    path: Path,
+    dataset: Any,
+    maps: Sequence[NDArray[np.float64]],
+    frames: Sequence[Observation],
+    *,
+    is_turned: bool,
+) -> tuple[float, str]:
+    """Write maps of the throughput, on the pixels of the products, to a FITS file.
+
+    Parameters
+    ----------
+    path : Path
+    dataset : pyklip.instruments.Instrument.Data
+        With the output of the reduction.
+    maps : sequence of ndarray, (ny, nx)
+        For every wavelength, on the pixels of the first frame.
+    frames : sequence of Observation
+        These frames.
+    is_turned : bool
+        Whether pyKLIP has turned north up.
+
+    Returns
+    -------
+    median : float
+    comment : str
+        For the headers of all products.
+    """
+    turned = []
+    center = np.asarray(dataset.output_centers[0], dtype=float)
+    for k, (image, frame) in enumerate(zip(maps, frames, strict=True)):
+        angle = frame.position_angle if is_turned else 0.0
+        shape = dataset.output.shape[-2:]
+        each = on_product(image, frame.center[0], shape, center, angle, dataset.flipx)
+        each[np.isnan(dataset.output[0, :, k]).all(axis=0)] = np.inf
+        turned.append(each)
+    cube = np.array(turned)
+    median = float(np.median(cube[np.isfinite(cube)]))
+    cube = np.where(np.isnan(cube), 1.0, np.where(np.isinf(cube), np.nan, cube))
+    cube = cube[0] if len(cube) == 1 else cube
     hdu = fits.PrimaryHDU(cube.astype(np.float32))
     hdu.header["BUNIT"] = ("", "fraction of a faint point source's peak")
     hdu.header["PSFCENTX"], hdu.header["PSFCENTY"] = center
@@ -172,3 +212,4 @@ def write_throughput(path: Path, maps: NDArray[np.float64], center: NDArray[np.f
         "Detected companions that are in the model (DRKEPT) keep their light."
     )
     hdu.writeto(path)
+    return median, "median throughput of faint sources"

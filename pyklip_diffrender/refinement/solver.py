@@ -21,13 +21,14 @@ from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.linear.noise import Noise
 from pyklip_diffrender.linear.response_cache import ResponseCache
 from pyklip_diffrender.refinement.accurate_step import ModelDerivatives, accurate_step
+from pyklip_diffrender.refinement.first_unknowns import first_unknowns
 from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.mode_priors import ModePriors
 from pyklip_diffrender.refinement.normal_equations import NormalEquations, linearise
 from pyklip_diffrender.refinement.objective import Objective, State
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.settings import GaussNewton
-from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
+from pyklip_diffrender.refinement.unknowns import Unknowns
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import EvidenceUpdate, solve_with_evidence
 
@@ -47,9 +48,6 @@ the effects of unknowns cancel, the curvature of the coarse copy was 20 times to
 _FINAL = 0.01
 """Error of derivatives above which the linear model of such a fit gets new ones. With 0.05, limits
 were up to 10 % too shallow near the occulter."""
-
-_PEDESTAL = 0.5
-"""Relative prior deviation of the pedestal of a known pattern."""
 
 _FAR = 0.03
 """Model error above which steps fail because they are large. They are damped then."""
@@ -123,49 +121,7 @@ class Solver:
 
     def first_unknowns(self) -> Unknowns:
         """The unknowns, with starting values, before companions are added."""
-        problems = [forward.problem for forward in self.objective.forwards]
-        origin = problems[0].observation
-        frames = tuple(
-            self._unknowns_of(problem, forward, problem.observation.roll_from(origin))
-            for problem, forward in zip(problems, self.objective.forwards, strict=True)
-        )
-        own = (*self.settings.own, "pedestal") if len(frames) > 1 else ()
-        return Unknowns(frames, own, self.priors.drift)
-
-    def _unknowns_of(self, problem: Problem, forward: Forward, roll: float) -> FrameUnknowns:
-        free, deviations = self.settings.free, dict(self.settings.deviations)
-        start = problem.optical_start(tuple(n for n in free if n in problem.model.parameters))
-        if problem.has_free_pedestal:
-            free = (*free, "pedestal")
-            deviations["pedestal"] = _PEDESTAL * problem.pedestal
-        zero = torch.zeros(1, dtype=torch.float64)
-        levels = {"flux": zero, "background": zero, "pedestal": zero + problem.pedestal}
-        # The unknowns and their algebra stay on the CPU, wherever the model renders.
-        unknowns = FrameUnknowns(
-            free,
-            {**{n: v.cpu() for n, v in start.items()}, **levels},
-            len(self.basis),
-            len(self.priors.amplitude),
-            self.settings.companions,
-            roll,
-            not problem.observation.reference,
-        )
-        image = forward.at(unknowns, unknowns.initial()).image
-        # With photon-noise weights the faint pixels would dominate this first estimate.
-        flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
-        is_known = "flux" in deviations
-        if is_known and "flux" not in problem.start:
-            raise IncompatibleSetupError(
-                "deviations has 'flux', but start does not: how bright is the star? Give "
-                "start={'flux': ...} in the unit of the frames"
-            )
-        names = tuple(n for n in self.settings.free if not (is_known and n == "flux"))
-        flux, level = problem.flux_and_background(problem.gain * image, flat, names)
-        if is_known:
-            deviations["flux"] *= flux
-        levels["flux"] = torch.tensor([flux], dtype=torch.float64)
-        levels["background"] = torch.tensor([level], dtype=torch.float64)
-        return replace(unknowns, start={**unknowns.start, **levels}, deviations=deviations)
+        return first_unknowns(self.objective.forwards, self.settings, self.basis, self.priors)
 
     def prior_deviation(self, unknowns: Unknowns) -> Tensor:
         """Prior standard deviations of all unknowns."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from astropy import units as u
 from astropy.io import fits
@@ -22,13 +21,13 @@ from pyklip_diffrender.io.headers import (
     header_number,
     header_text,
 )
+from pyklip_diffrender.scene.archive_names import detector_of, identity_of, level_of
 from pyklip_diffrender.scene.catalogue_star import CatalogueStar, star_of
 
 __all__ = [
     "Exposure",
     "bar_place",
     "beginning",
-    "detector_of",
     "image_mask",
     "instrument_of",
     "is_reference",
@@ -36,29 +35,8 @@ __all__ = [
     "position_angle",
 ]
 
-_LEVEL = re.compile(r"_([a-z0-9]+)\.fits(\.gz)?$", re.IGNORECASE)
-_LEVELS = (
-    "calints", "crfints", "cal", "crf", "rateints", "rate", "uncal", "ramp", "jump", "dark",
-    "trapsfilled", "i2d", "s2d", "psfsub", "psfalign", "psfstack", "x1d", "segm", "cat",
-)  # fmt: skip
-"""Products of the pipeline: those that can be used come first, the best of them in front."""
-
-_STEPS = {"S_KLIP": "psfsub", "S_PSFALI": "psfalign", "S_PSFSTK": "psfstack", "S_RESAMP": "i2d"}
-"""Steps of the pipeline after which frames are no longer those of a detector."""
-
-_NAME = re.compile(
-    r"jw(\d{5})(\d{3})(\d{3})_(\d{2})(\d)(\w{2})_(\d{5})(?:-seg(\d{3}))?_([a-z0-9]+)", re.IGNORECASE
-)
-"""Programme, observation, visit, visit group, parallel sequence, activity, exposure, segment and
-detector in the name that the archive gives to a file."""
-
-_IDENTITY = ("PROGRAM", "OBSERVTN", "VISIT", "VISITGRP", "SEQ_ID", "ACT_ID", "EXPOSURE")
-
 _MASK = re.compile(r"(?<![A-Z0-9])(?:SUB\d+|MASK)?[AB]?(?:MASK)?(\d{3}R|LWB|SWB)(?![A-Z0-9])")
 """A mask in CORONMSK (MASKA335R), APERNAME (NRCA5_MASK335R) or SUBARRAY (SUB320A335R)."""
-
-_DETECTORS = {"NRCA5": "NRCALONG", "NRCB5": "NRCBLONG"}
-"""Detectors whose apertures (APERNAME) have another name."""
 
 _SAME_ANGLE = 0.1
 """Degrees by which the sum of two angles may differ from what a card says it is."""
@@ -152,9 +130,9 @@ class Exposure:
         x, y = (header_number(header, key, name) or 0.0 for key in ("XOFFSET", "YOFFSET"))
         return cls(
             name=name,
-            level=_level(header, name, len(shape)),
+            level=level_of(header, name, len(shape)),
             exposure_type=text("EXP_TYPE"),
-            identity=_identity(header, name),
+            identity=identity_of(header, name),
             instrument=instrument_of(header, name),
             detector=detector_of(header, name),
             mask=mask,
@@ -333,24 +311,6 @@ def middle(header: fits.Header, name: str) -> Time | None:
     return Time(day, format="mjd", scale="utc")
 
 
-def _level(header: fits.Header, name: str, dimensions: int) -> str | None:
-    """Product of the pipeline, from its steps, the unit, and the names of the file."""
-    for key, level in _STEPS.items():
-        if str(header.get(key, "")).strip().upper() == "COMPLETE":
-            return level
-    texts = (Path(name).name, header_text(header, "FILENAME", name) or "")
-    named = [match[1].lower() for match in map(_LEVEL.search, texts) if match]
-    known = [each for each in named if each in _LEVELS]
-    # If the names disagree, the frames are what they are least useful as.
-    stated = max(known, key=_LEVELS.index, default=None)
-    unit = (header_text(header, "BUNIT", name) or "").upper().replace(" ", "")
-    if unit in ("DN/S", "ADU/S", "COUNT/S") and stated in (None, "calints", "cal"):
-        return "rateints" if dimensions == 3 else "rate"
-    if stated == "calints" and dimensions == 2:
-        return "cal"
-    return stated
-
-
 def instrument_of(header: fits.Header, name: str) -> str | None:
     """Instrument, from INSTRUME or the detector; None if not stated."""
     stated = header_text(header, "INSTRUME", name)
@@ -365,40 +325,3 @@ def _unit(header: fits.Header, name: str) -> str | None:
     usual = u.MJy / u.sr
     is_usual = stated is not None and u.Unit(stated, parse_strict="silent") == usual
     return "MJy/sr" if is_usual else stated
-
-
-def detector_of(header: fits.Header, name: str) -> str | None:
-    """Detector, from DETECTOR, APERNAME or the archive's name of the file; None if not stated."""
-    stated = header_text(header, "DETECTOR", name)
-    if stated is not None:
-        return stated.upper()
-    aperture = (header_text(header, "APERNAME", name) or "").upper().partition("_")[0]
-    if re.fullmatch(r"NRC[AB]\d", aperture):
-        return _DETECTORS.get(aperture, aperture)
-    match = _NAME.search(Path(name).name)
-    return match[9].upper() if match else None
-
-
-def _identity(header: fits.Header, name: str) -> str | None:
-    """Name of the exposure, as the archive makes it; None if the header does not say."""
-    detector = detector_of(header, name)
-    parts = [str(header.get(key, "")).strip() for key in _IDENTITY]
-    if detector is not None and all(each and each.upper() != "UNKNOWN" for each in parts):
-        digits = [part.zfill(n) for part, n in zip(parts, (5, 3, 3, 2, 1, 2, 5), strict=True)]
-        segment = header_number(header, "EXSEGNUM", name) or 1
-        return _identified(digits, f"{segment:03.0f}", detector)
-    for text in (header_text(header, "FILENAME", name) or "", Path(name).name):
-        match = _NAME.search(text)
-        if match:
-            *digits, part, chip = match.groups()
-            return _identified(digits, part or "001", chip)
-    return None
-
-
-def _identified(digits: list[str], segment: str, detector: str) -> str:
-    program, observation, visit, group, sequence, activity, exposure = digits
-    part = "" if segment == "001" else f"-seg{segment}"
-    return (
-        f"jw{program}{observation}{visit}_{group}{sequence}{activity}_{exposure}{part}_"
-        f"{detector.lower()}"
-    )

@@ -21,6 +21,7 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import header_number, header_text, merged_header
 from pyklip_diffrender.io.units import native_float64
+from pyklip_diffrender.scene.archive_names import detector_of
 from pyklip_diffrender.scene.detector_pixels import (
     SHIFTS,
     first_pixel,
@@ -30,7 +31,7 @@ from pyklip_diffrender.scene.detector_pixels import (
     recorded_shifts,
     undo_shifts,
 )
-from pyklip_diffrender.scene.exposure import beginning, detector_of, middle, position_angle
+from pyklip_diffrender.scene.exposure import beginning, middle, position_angle
 from pyklip_diffrender.scene.integrations import Judgement, empty_integrations
 from pyklip_diffrender.scene.star_place import measured_offset
 

@@ -12,7 +12,8 @@ from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.optics.grid import samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.scene.exposure import bar_place, detector_of, image_mask
+from pyklip_diffrender.scene.archive_names import detector_of
+from pyklip_diffrender.scene.exposure import bar_place, image_mask
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["model_for"]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,19 @@ from typing import Any
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.geometry import full_circle
 from pyklip_diffrender.io.opd_map import FLAT
+from pyklip_diffrender.surveys.checked_table import (
+    CheckedTable,
+    as_count,
+    as_flag,
+    as_list,
+    as_number,
+    as_positive,
+    as_table,
+    as_text,
+    list_of,
+    only,
+    short,
+)
 
 __all__ = ["Config", "Injections", "Options", "SequenceConfig", "read_config"]
 
@@ -168,76 +180,23 @@ def read_config(source: str | os.PathLike[str] | Mapping[str, Any]) -> Config:
                 f"{path}: not a TOML file ({error}). Correct it; text needs quotes"
             ) from error
     problems: list[str] = []
-    config = _config(_Table(content, "", folder, problems))
+    config = _config(CheckedTable(content, "", folder, problems))
     if problems:
         raise IncompatibleSetupError("\n  ".join([f"{name}: nothing was started:", *problems]))
     return config
 
 
-class _Table:
-    """A table of the file, whose keys are taken one by one; mistakes go to `problems`."""
-
-    def __init__(self, content: Any, place: str, folder: Path, problems: list[str]) -> None:
-        self.place, self.folder, self.problems = place, folder, problems
-        if not isinstance(content, Mapping):
-            self.complain("", content, "a table with keys")
-            content = {}
-        self.content = dict(content)
-        self.known: list[str] = []
-
-    def complain(self, key: str, value: Any, expected: str) -> None:
-        where = ": ".join(filter(None, [self.place, key]))
-        self.problems.append(f"{where}: got {_short(value)}, expected {expected}")
-
-    def take(self, key: str, default: Any, expected: str, convert: Callable[[Any], Any]) -> Any:
-        """Value of a key; `convert` raises ValueError for one that is not as expected."""
-        self.known.append(key)
-        if key not in self.content:
-            return default
-        value = self.content.pop(key)
-        try:
-            return convert(value)
-        except (ValueError, OverflowError):
-            self.complain(key, value, expected)
-            return default
-
-    def table(self, key: str) -> _Table:
-        self.known.append(key)
-        where = ": ".join(filter(None, [self.place, key]))
-        return _Table(self.content.pop(key, {}), where, self.folder, self.problems)
-
-    def existing(self, value: Any) -> Path:
-        """A path that exists, relative to the configuration's folder."""
-        path = self.folder / _text(value)
-        try:
-            exists = path.exists()
-        except OSError as error:  # Such as a name that is too long.
-            raise ValueError(str(path)) from error
-        if not exists:
-            raise ValueError(str(path))
-        return path.absolute()
-
-    def finish(self) -> None:
-        """Complain about keys that nobody took."""
-        for key in self.content:
-            where = f"{self.place}: " if self.place else ""
-            self.problems.append(
-                f"{where}got the key {_short(key)}, expected one of {', '.join(self.known)}. "
-                "Check its name and in which table it is"
-            )
-
-
-def _config(top: _Table) -> Config:
-    workers = top.take("workers", None, "a number of processes, 0 or more", _count)
-    memory = top.take("memory_limit", None, 'text such as "4 GB"', _memory)
+def _config(top: CheckedTable) -> Config:
+    workers = top.take("workers", None, "a number of processes, 0 or more", as_count)
+    memory = top.take("memory_limit", None, 'text such as "4 GB"', only(as_text, _MEMORY.fullmatch))
     shared = top.table("options")
     options = _options(shared, Options())
     shared.finish()
     injections = _injections(top.table("injections"), Injections())
-    listed = top.take("sequence", [], "one or more tables [[sequence]]", _tables)
+    listed = top.take("sequence", [], "one or more tables [[sequence]]", as_list)
     sequences: list[SequenceConfig] = []
     for k, each in enumerate(listed, 1):
-        table = _Table(each, f"sequence {k}", top.folder, top.problems)
+        table = CheckedTable(each, f"sequence {k}", top.folder, top.problems)
         sequence = _sequence(table, options, injections)
         if sequence is None:
             continue
@@ -250,7 +209,9 @@ def _config(top: _Table) -> Config:
     return Config(tuple(sequences), workers, memory)
 
 
-def _sequence(table: _Table, options: Options, injections: Injections) -> SequenceConfig | None:
+def _sequence(
+    table: CheckedTable, options: Options, injections: Injections
+) -> SequenceConfig | None:
     expected = "FITS files, or one folder of them, that exist; paths are relative to the folder of "
     expected += "the configuration"
 
@@ -269,11 +230,11 @@ def _sequence(table: _Table, options: Options, injections: Injections) -> Sequen
         "opd", None, "a wavefront map or a folder of maps that exists, or 'flat'",
         lambda value: Path(FLAT) if value == FLAT else table.existing(value),
     )  # fmt: skip
-    target = table.take("target", None, "text, the name of the star", _text)
-    filter_ = table.take("filter", None, 'text such as "F444W"', _text)
+    target = table.take("target", None, "text, the name of the star", as_text)
+    filter_ = table.take("filter", None, 'text such as "F444W"', as_text)
     first = files[0] if files else Path("sequence")
     label = " ".join(filter(None, [target or first.name.split(".")[0], filter_]))
-    name = table.take("name", label, "printable text", _text)
+    name = table.take("name", label, "printable text", as_text)
     own = _options(table, options)
     planets = _injections(table.table("injections"), injections)
     edge = own.size * _PIXEL / 2
@@ -286,9 +247,11 @@ def _sequence(table: _Table, options: Options, injections: Injections) -> Sequen
     return SequenceConfig(name, files, opd, target, filter_, own, planets)
 
 
-def _options(table: _Table, default: Options) -> Options:
-    size = table.take("size", default.size, "a number of pixels, 8 or more", _size)
-    threshold = table.take("threshold", default.threshold, "a positive number", _positive)
+def _options(table: CheckedTable, default: Options) -> Options:
+    size = table.take(
+        "size", default.size, "a number of pixels, 8 or more", only(as_count, lambda n: n >= 8)
+    )
+    threshold = table.take("threshold", default.threshold, "a positive number", as_positive)
 
     def systematics(value: Any) -> str:
         known = value in ("auto", "references", "off")
@@ -299,19 +262,22 @@ def _options(table: _Table, default: Options) -> Options:
         "'auto', 'references', 'off', or an existing file or folder with patterns", systematics,
     )  # fmt: skip
     wide, disk, completeness = (
-        table.take(key, getattr(default, key), "true or false", _flag)
+        table.take(key, getattr(default, key), "true or false", as_flag)
         for key in ("wide", "disk", "completeness")
     )
     if wide and disk:
         table.complain("", "wide = true and disk = true", "one of them")
         disk = False
     star = table.take(
-        "star_flux", default.star_flux, "a flux density in Jy, such as 0.45", _positive
+        "star_flux", default.star_flux, "a flux density in Jy, such as 0.45", as_positive
     )
     star_error = table.take(
-        "star_flux_error", default.star_flux_error, "a relative error, such as 0.05", _fraction
+        "star_flux_error",
+        default.star_flux_error,
+        "a relative error, such as 0.05",
+        only(as_positive, lambda error: error <= 1),
     )
-    own = table.take("settings", {}, "a table with arguments of GaussNewton", _mapping)
+    own = table.take("settings", {}, "a table with arguments of GaussNewton", as_table)
     # Those of a sequence come on top of the survey's.
     settings = {**default.settings, **own}
     wrong = _wrong_settings(settings) if own else []
@@ -326,7 +292,7 @@ def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
     unknown = sorted(set(settings) - set(_SETTINGS))
     if unknown:
         known = ", ".join(_SETTINGS)
-        return [f"got the key {_short(key)}, expected one of {known}" for key in unknown]
+        return [f"got the key {short(key)}, expected one of {known}" for key in unknown]
     if not _is_plain(settings):
         return ["got a date or nan, expected numbers, text, lists and tables"]
     # Late, as everything that waits for PyTorch: workers import this module to unpickle a job.
@@ -341,90 +307,18 @@ def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
     return []
 
 
-def _injections(table: _Table, default: Injections) -> Injections:
+def _injections(table: CheckedTable, default: Injections) -> Injections:
     own = bool(table.content)
     numbers = "a list of positive numbers, such as [1e-5]"
-    contrasts = table.take("contrasts", default.contrasts, numbers, _positives)
-    separations = table.take("separations", default.separations, numbers, _positives)
-    angles = table.take("angles", default.angles, "a list of degrees east of north", _numbers)
+    contrasts = table.take("contrasts", default.contrasts, numbers, list_of(as_positive))
+    separations = table.take("separations", default.separations, numbers, list_of(as_positive))
+    angles = table.take(
+        "angles", default.angles, "a list of degrees east of north", only(list_of(as_number), bool)
+    )
     if own and bool(contrasts) != bool(separations):
         table.complain("", "one of contrasts and separations", "both, or neither")
     table.finish()
     return Injections(contrasts, separations, tuple(map(full_circle, angles)))
-
-
-# -- values ----------------------------------------------------------------------------------------
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str) or not value.strip() or not value.isprintable():
-        raise ValueError
-    return value.strip()
-
-
-def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError
-    return float(value)
-
-
-def _positive(value: Any) -> float:
-    if _number(value) <= 0:
-        raise ValueError
-    return float(value)
-
-
-def _fraction(value: Any) -> float:
-    if not 0 < _number(value) <= 1:
-        raise ValueError
-    return float(value)
-
-
-def _flag(value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise ValueError
-    return value
-
-
-def _count(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 1_000_000:
-        raise ValueError
-    return value
-
-
-def _size(value: Any) -> int:
-    if _count(value) < 8:
-        raise ValueError
-    return int(value)
-
-
-def _numbers(value: Any) -> tuple[float, ...]:
-    if not isinstance(value, list) or not value:
-        raise ValueError
-    return tuple(map(_number, value))
-
-
-def _positives(value: Any) -> tuple[float, ...]:
-    if not isinstance(value, list):
-        raise ValueError
-    return tuple(map(_positive, value))
-
-
-def _memory(value: Any) -> str:
-    if not _MEMORY.fullmatch(_text(value)):
-        raise ValueError
-    return _text(value)
-
-
-def _mapping(value: Any) -> dict[str, Any]:
-    if not isinstance(value, Mapping):
-        raise ValueError
-    return dict(value)
 
 
 def _is_plain(value: Any) -> bool:
@@ -434,9 +328,3 @@ def _is_plain(value: Any) -> bool:
     if isinstance(value, list):
         return all(map(_is_plain, value))
     return isinstance(value, str | int | float) and value == value
-
-
-def _tables(value: Any) -> list[Any]:
-    if not isinstance(value, list):
-        raise ValueError
-    return value
