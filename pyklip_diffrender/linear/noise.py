@@ -131,11 +131,6 @@ class Noise:
         total = sum(float(((self.weight[k] * x) ** 2).sum()) for k, x in by_frame.items())
         return total - float((self._summed(by_frame) ** 2).sum()) if self.shares_pattern else total
 
-    def precision(self, frame: int, window: tuple[slice, slice]) -> Tensor:
-        """The block of M^-1 of a window of pixels of a frame, (pixels, pixels)."""
-        weight, common = self.weight[frame][window], self.common[frame][window]
-        return torch.diag((1 - (weight * common) ** 2).flatten())
-
 
 def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Tensor:
     """W c summed over frames with the derivative by every unknown, (unknowns, pixels), float32."""
