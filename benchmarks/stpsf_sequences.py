@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 from astropy.io import fits
+from scipy.ndimage import map_coordinates
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
@@ -54,6 +55,9 @@ FLAGGED, UNFLAGGED = 0.005, 4
 """Fraction of the pixels with a flag, and number of bad ones without one near the star."""
 
 SIDE = 96
+OVERSAMPLE = 4
+"""Samples per pixel of stpsf's images."""
+
 MATCHED = 0.08
 """arcsec from a planet within which a candidate is that planet."""
 
@@ -83,21 +87,21 @@ def _planets(*places: tuple[float, float, float]) -> tuple[Planet, ...]:
 
 
 WIDE = (7, 3)
-SHORT = _planets((3e-5, 0.42, 40.0), (2e-5, 0.50, 210.0))
+SHORT = _planets((1.5e-4, 0.45, 40.0), (4e-5, 0.75, 210.0))
 CASES = {
     case.name: case
     for case in (
-        Case("F210M", "MASK335R", "NRCA2_FULL_MASK335R", 36, SHORT),
+        Case("F210M", "MASK335R", "NRCA2_FULL_MASK335R", 56, SHORT),
         Case("F460M", "MASKLWB", "NRCA5_FULL_MASKLWB_F460M", 32,
              _planets((1e-4, 0.65, 80.0), (5e-5, 0.85, 240.0))),
-        Case("F210M", "MASK210R", "NRCA2_FULL_MASK210R", 36, SHORT),
+        Case("F210M", "MASK210R", "NRCA2_FULL_MASK210R", 56, SHORT),
         Case("F444W", "MASK335R", "NRCA5_FULL_MASK335R", 32,
              _planets((5e-5, 0.65, 40.0), (2e-5, 0.85, 210.0)), WIDE),
         Case("F356W", "MASK430R", "NRCA5_FULL_MASK430R", 32,
              _planets((5e-5, 0.70, 40.0), (2e-5, 0.85, 210.0)), WIDE),
-        Case("F200W", "MASK335R", "NRCA2_FULL_MASK335R", 36, SHORT, WIDE),
-        Case("F210M", "MASKSWB", "NRCA4_FULL_MASKSWB_F210M", 36,
-             _planets((5e-5, 0.40, 80.0), (3e-5, 0.50, 240.0))),
+        Case("F200W", "MASK335R", "NRCA2_FULL_MASK335R", 56, SHORT, WIDE),
+        Case("F210M", "MASKSWB", "NRCA4_FULL_MASKSWB_F210M", 56,
+             _planets((1.5e-4, 0.45, 80.0), (4e-5, 0.75, 240.0))),
     )
 }  # fmt: skip
 
@@ -128,11 +132,32 @@ def image(
     nircam: Any, case: Case, opd: np.ndarray, header: fits.Header, place: tuple[float, float],
     nlambda: int,
 ) -> np.ndarray:  # fmt: skip
-    """The image of a point source of unit flux at a place behind the mask, arcsec."""
+    """The image of a point source of unit flux at a place behind the mask, arcsec.
+
+    stpsf's distorted images have square pixels of its mean scale. Those of the detector do not, by
+    1 %, which would displace planets by several mas: the oversampled image is sampled again there.
+    """
+    import stpsf.detectors
+    import stpsf.stpsf_core
+
     header["BUNIT"] = "meter"
     nircam.pupilopd = fits.HDUList([fits.PrimaryHDU(opd, header)])
     nircam.options["source_offset_x"], nircam.options["source_offset_y"] = place
-    psf = nircam.calc_psf(nlambda=nlambda, fft_oversample=2, detector_oversample=2, fov_pixels=SIDE)
+    psf = nircam.calc_psf(
+        nlambda=nlambda, fft_oversample=OVERSAMPLE, detector_oversample=OVERSAMPLE, fov_pixels=SIDE
+    )
+    aperture = stpsf.stpsf_core.get_siaf_with_caching("NIRCam")[case.aperture]
+    fine = psf["OVERDIST"].data
+    scales = np.array([aperture.YSciScale, aperture.XSciScale]) / nircam.pixelscale
+    middle = (np.array(fine.shape) - 1) / 2
+    places = np.indices(fine.shape) - middle[:, None, None]
+    samples = scales[:, None, None] * places + middle[:, None, None]
+    shape = (SIDE, OVERSAMPLE, SIDE, OVERSAMPLE)
+    pixels = scales.prod() * map_coordinates(fine, samples).reshape(shape).sum(axis=(1, 3))
+    # stpsf couples neighbouring pixels in place, once.
+    del psf["DET_DIST"].header["IPCINST"]
+    psf["DET_DIST"].data = pixels
+    stpsf.detectors.apply_detector_ipc(psf)
     return np.array(psf["DET_DIST"].data, dtype=float)
 
 

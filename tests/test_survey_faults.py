@@ -20,7 +20,9 @@ WITH_DASK = (
 )  # fmt: skip
 
 
-BY_HAND = ("out_of_memory", "two_surveys", "read_only", "file_limit")
+BY_HAND = (
+    "out_of_memory", "two_surveys", "read_only", "file_limit", "scheduler_killed", "blind_worker",
+)  # fmt: skip
 """Where importing the libraries alone needs more than the limit, the workers of the first are
 restarted without end. The others take long, and break the same code as those that remain."""
 
