@@ -28,7 +28,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
 from pyklip_diffrender.linear.frames import LinearFrame, Unknown
-from pyklip_diffrender.linear.noise import Noise, weighted_rows
+from pyklip_diffrender.linear.noise import Noise
 
 __all__ = ["LinearModel", "TemplateProducts"]
 
@@ -108,11 +108,6 @@ class LinearModel:
             tuple(frame.weight for frame in self.frames),
             tuple(frame.common for frame in self.frames),
         )
-
-    @cached_property
-    def _weighted_rows(self) -> tuple[Tensor, ...]:
-        """J C^-1 over w of every frame, (unknowns, pixels), float32."""
-        return weighted_rows(self.frames, self.noise, len(self.vector))
 
     @cached_property
     def _scale(self) -> Tensor:
