@@ -509,13 +509,49 @@ def test_images_have_north_up() -> None:
     assert np.hypot(*(circled - PLANET.offset)) < 0.05
 
 
+@pytest.mark.parametrize("place", [(-0.4, 0.2), (0.5, 0.5)])
+def test_throughput_is_what_the_fit_of_the_star_leaves_of_a_faint_source(
+    place: tuple[float, float],
+) -> None:
+    """A frame with and without a source of S/N 3, fitted as if there were none.
+
+    The scales of the prior are fixed: where they follow the evidence, they change a little, too.
+    """
+    whole = reduction(planet=False)
+    images, before = SkyImages(whole), whole.detection.fits[0].frames[0]
+    light = before.flux * before.model(before.opd, place).detach().numpy()
+    weight = before.observation.error[0] ** -2.0
+    light *= 3 / np.sqrt((weight * light**2).sum())
+    prior = dr.WavefrontPrior(whole.fit.scales, fit_scales=False)
+    settings = dr.GaussNewton(cycles=6, max_companions=0, prior=prior)
+    without, star = (
+        dr.refine(
+            before.model,
+            replace(before.observation, data=before.observation.data + part * light),
+            whole.fit.initial,
+            settings=settings,
+        )
+        .frames[0]
+        .star
+        for part in (0, 1)
+    )
+    left = light - (star - without)
+    kept = (weight * left * light).sum() / (weight * light**2).sum()
+    distance = np.hypot(*np.moveaxis(images.grid - images.to_sky @ place, -1, 0))
+    nearest = np.unravel_index(distance.argmin(), distance.shape)
+    # Linear theory, and the nearest pixel of an image that was turned.
+    assert kept == pytest.approx(images.throughput[nearest], abs=0.06)
+    assert 0.1 < kept < 0.95
+
+
 def test_images_of_the_sky_are_written_with_coordinates(tmp_path: Path) -> None:
     whole = reduction()
     images = SkyImages(whole)
     with fits.open(images.write(tmp_path / "images.fits")) as hdus:
         names = [hdu.name for hdu in hdus[1:]]
         assert names == [
-            "COMBINED", "COMBINED_ERROR", "POSTERIOR_MEAN", "CONTRAST", "CONTRAST_ERROR", "SNR",
+            "COMBINED", "COMBINED_ERROR", "THROUGHPUT", "POSTERIOR_MEAN", "CONTRAST",
+            "CONTRAST_ERROR", "SNR",
         ]  # fmt: skip
         (row,) = whole.detection.candidates
         image, wcs = np.nan_to_num(hdus["SNR"].data), WCS(hdus["POSTERIOR_MEAN"].header)

@@ -75,6 +75,18 @@ class SkyImages:
         middle = slice(model.center - self._half, model.center + self._half + 1)
         return model.estimate()[0][middle, middle]
 
+    @cached_property
+    def throughput(self) -> Image:
+        """Fraction of the light of a faint source that `combined` has, by a matched filter.
+
+        The fit of the star takes the rest. By linear theory it is the ratio of what the frames say
+        of the source's flux with the star marginalised, and with the star known; the light of a
+        candidate, which is fitted with the star, is in the image as a whole.
+        """
+        detection = self.detection
+        error = detection.error / detection.error_factor.of(detection.grid)
+        return self.turned((detection.photon_error / error) ** 2)
+
     @property
     def image(self) -> Image:
         """The image to show: the posterior mean, or with a disk in the model the mean of frames."""
@@ -102,6 +114,7 @@ class SkyImages:
         images = {
             "COMBINED": (mean, unit),
             "COMBINED_ERROR": (error, unit),
+            "THROUGHPUT": (self.throughput, ""),
             "POSTERIOR_MEAN": (self.posterior_mean, unit),
             "CONTRAST": (self.turned(detection.contrast), ""),
             "CONTRAST_ERROR": (self.turned(detection.error), ""),
