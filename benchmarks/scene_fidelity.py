@@ -40,7 +40,6 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.linear.frames import LinearFrame
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.linear.noise import weighted_rows
 from pyklip_diffrender.linear.response import downsample
 
 FAR = 6.0
@@ -122,11 +121,10 @@ def cut(linear: LinearModel, size: int) -> LinearModel:
     )
     smaller = replace(linear, frames=frames)
     count = len(linear.vector)
-    curvature = torch.zeros(count, count, dtype=torch.float64)
-    for f, inverse in zip(frames, weighted_rows(frames, smaller.noise, count), strict=True):
-        whitened = f.weight.flatten() * f.onto_unknowns(f.jacobian, count).flatten(1)
-        curvature += inverse.double() @ whitened.T
-    return replace(smaller, curvature=curvature)
+    white = smaller.noise.whitened(
+        {k: f.onto_unknowns(f.jacobian, count) for k, f in enumerate(frames)}
+    ).double()
+    return replace(smaller, curvature=white @ white.T)
 
 
 def with_fewer_modes(linear: LinearModel, frequencies: Tensor, share: float) -> LinearModel:

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.linear import ResponseCache, parameter_jacobian
+from pyklip_diffrender.linear import ResponseCache, field_derivatives, image_derivatives
 from pyklip_diffrender.optics import OpticalSystem, PointSources, PupilGrid
 from pyklip_diffrender.refinement import GaussNewton, Refinement
 from pyklip_diffrender.refinement.problem import Problem
@@ -24,7 +24,8 @@ from pyklip_diffrender.wavefront import FourierModes, WavefrontPrior
 
 __all__ = [
     "PLANET", "QUICK", "SIZE", "fit_gradient", "fitted", "frame", "gradient", "image",
-    "model_on", "opd", "parameter_derivatives", "point_sources", "reached", "response", "rolls",
+    "model_on", "opd", "parameter_derivatives", "parameter_jacobian", "point_sources", "reached",
+    "response", "rolls",
     "search", "settings", "tensors",
 ]  # fmt: skip
 
@@ -123,6 +124,19 @@ def gradient(device: Any, **changes: object) -> list[Array]:
     values = {name: value.requires_grad_() for name, value in tensors(model).items()}
     model(phase, **values).square().sum().backward()
     return [each.grad.cpu().numpy().ravel() for each in (phase, *values.values())]  # type: ignore[union-attr]
+
+
+def parameter_jacobian(
+    model: OpticalSystem,
+    opd: torch.Tensor,
+    values: dict[str, torch.Tensor],
+    names: tuple[str, ...],
+    fields: Sequence[torch.Tensor] | None = None,
+) -> torch.Tensor:
+    """Derivatives of the image, (components, ny, nx); the fields may be those of a finer model."""
+    slopes = field_derivatives(model, opd, values, names)
+    fields = model.fields(opd, **values) if fields is None else fields
+    return image_derivatives(model, fields, values, names, slopes)
 
 
 def parameter_derivatives(device: Any, **changes: object) -> list[Array]:

@@ -721,7 +721,6 @@ def test_products_can_be_read_by_others(one: Detection, tmp_path: Path) -> None:
         assert hdus["OFFSET_X"].header["BUNIT"] == "arcsec"
         np.testing.assert_allclose(hdus["SUBTRACTED", 1].data, one.subtracted[0], rtol=1e-6)
         assert Unit(hdus["SUBTRACTED"].header["BUNIT"]) == Unit("photon")
-        assert Unit(hdus["LEFT_OUT"].header["BUNIT"]) == Unit("photon")
         assert hdus[0].header["DRSTAT"] == "CONVERGED"
         assert "pyklip_diffrender" in hdus[0].header["DRVERS"]
         # astropy warns of checksums that do not hold, and warnings are errors.
@@ -756,7 +755,7 @@ def test_the_images_are_on_the_sky_where_the_table_says(one: Detection, tmp_path
     pixel = np.array([column, row]) + step
     maps, fit = found.write(tmp_path)[0], found.fits[0].write(tmp_path / "fit.fits", linear=False)
     images = {
-        maps: ("SNR", "LEFT_OUT", "SUBTRACTED", "DATA"),
+        maps: ("SNR", "SUBTRACTED", "DATA"),
         fit: ("DATA", "ERROR", "VALID", "STAR", "COMPANIONS", "GAIN"),
     }
     for path, names in images.items():
@@ -787,9 +786,7 @@ def test_a_detection_survives_the_file(one: Detection, tmp_path: Path) -> None:
     again = Detection.read(first.write(tmp_path / "first")[0].parent)
     for name in ("snr", "residual_snr", "contrast", "error", "photon_error", "grid"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
-    for ours, theirs in zip(
-        (*again.subtracted, *again.left_out), (*first.subtracted, *first.left_out), strict=True
-    ):
+    for ours, theirs in zip(again.subtracted, first.subtracted, strict=True):
         np.testing.assert_array_equal(ours, theirs)
     assert [repr(again), str(again), again.scatter] == [repr(first), str(first), first.scatter]
     for ours, theirs in (
@@ -979,13 +976,6 @@ def test_every_frame_is_subtracted_as_it_was_taken(large: World) -> None:
     assert np.abs(found.subtracted[2] / frames[2].error[0]).std() < 1.1
     apart = dr.detect([large.refined(frame) for frame in (frames[0], frames[2])])
     np.testing.assert_allclose(apart.subtracted[1], apart.fits[1].frames[0].residual[0], atol=1e-9)
-
-
-def test_left_out_patches_are_larger_than_the_fits_own_residual(empty: list[Detection]) -> None:
-    left, deviation = empty[0].left_out
-    pull = (left / deviation)[radius(empty[0]) > 0.25]
-    assert np.nanstd(left) > 1.03 * np.nanstd(empty[0].fits[0].frames[0].residual[0])
-    assert np.nanstd(pull) == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_fit_without_a_linear_model_is_refused(world: World) -> None:

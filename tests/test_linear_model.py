@@ -238,27 +238,6 @@ def test_where_the_model_is_linearised_does_not_matter(single: LinearModel) -> N
     )
 
 
-@pytest.mark.parametrize("name", ["single", "patterned"])
-def test_a_left_out_patch_is_predicted_by_all_other_pixels(
-    name: str, request: pytest.FixtureRequest
-) -> None:
-    single: LinearModel = request.getfixturevalue(name)
-    sigma, data = covariance(single)
-    residual, deviation = single.left_out(size=3)
-    weight = single.frames[0].weight
-    assert bool(torch.isnan(residual[1, 2]))
-    patch = torch.zeros(NY, NX, dtype=torch.bool)
-    patch[0:3, 3:6] = True
-    inside = torch.cat([patch.flatten(), torch.zeros(len(data) - NY * NX, dtype=torch.bool)])
-    outside = ~inside
-    across = sigma[inside][:, outside]
-    solved = torch.linalg.solve(sigma[outside][:, outside], across.T)
-    expected = (data[inside] - solved.T @ data[outside]) / weight[patch]
-    spread = (sigma[inside][:, inside] - across @ solved).diagonal().sqrt() / weight[patch]
-    torch.testing.assert_close(residual[patch], expected, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(deviation[patch], spread, rtol=1e-5, atol=0)
-
-
 def test_unknowns_can_be_taken_out_and_their_light_put_back(pair: LinearModel) -> None:
     light = {0: random(NY, NX, seed=70).numpy()}
     less = pair.without("companions", light)

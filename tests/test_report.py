@@ -158,12 +158,6 @@ def test_position_angles_are_from_0_to_360_wherever_they_are_stated() -> None:
     assert half_circle(10.0 - 350.0) == 20
 
 
-def test_the_earlier_name_of_the_candidates_is_deprecated() -> None:
-    detection = reduction().detection
-    with pytest.warns(DeprecationWarning, match=r"Detection\.candidates"):
-        assert detection.table is detection.candidates
-
-
 class Tags(HTMLParser):
     """All start tags of a page with their attributes, and its text outside the style sheet."""
 

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from device_work import parameter_jacobian
 from scipy.stats import multivariate_normal
 
 from pyklip_diffrender.errors import ShapeError
@@ -20,7 +21,6 @@ from pyklip_diffrender.linear import (
     coarse_copy,
     downsample,
     jacobian,
-    parameter_jacobian,
 )
 from pyklip_diffrender.optics import OpticalSystem, PupilGrid
 from pyklip_diffrender.parameters import parameter

@@ -277,8 +277,11 @@ def _fits() -> list[Breakage]:
         ),
         Breakage(
             "own-pattern", "the target's own frames are not in its pattern",
-            'each for each in known if not any(same_name(each.star, star) for star in stars)',
-            'each for each in known',
+            """
+            and not (pattern.catalogue.is_same(star) or same_name(pattern.star, observation.target))
+            and not any(same_name(pattern.star, each) for each in star.names)
+            """, """
+            """,
             "systematics sequence",
         ),
         Breakage(
@@ -337,7 +340,7 @@ def _around() -> list[Breakage]:
         ),
         Breakage(
             "pointings", "only frames of one orientation are averaged",
-            "                and abs(angle - angles[other]) <= _SAME_ANGLE\n", "",
+            "                and abs(half_circle(angle - angles[other])) <= _SAME_ANGLE\n", "",
             "backend backend_refine",
         ),
         Breakage(

@@ -193,8 +193,6 @@ def map_for(sequence: Sequence, opd: str, rule: Rule | None) -> OPDMap:
 
 def _age(opd: OPDMap, sequence: Sequence) -> str:
     """When a map was sensed, as an apposition."""
-    days = None if sequence.date is None else opd.days_after(sequence.date)
-    if opd.date is None or days is None:
+    if opd.date is None or sequence.date is None:
         return ""
-    side = "after" if days > 0 else "before"
-    return f", sensed {opd.date.isot[:16]}, {abs(days):.1f} days {side} the frames"
+    return f", sensed {opd.date.isot[:16]}, {opd.age(sequence.date)} the frames"

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.linear.frames import LinearFrame
@@ -14,10 +18,19 @@ from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.refinement import star_flux_error
 
-__all__ = ["calibration_errors"]
+__all__ = ["calibration_errors", "candidate_errors"]
 
 _CLEAR = 25.0
 """S/N above which the error of a source's own image matters."""
+
+
+def candidate_errors(
+    groups: Sequence[Group], candidates: Candidates, factor: ErrorFactor
+) -> NDArray[np.float64]:
+    """Relative calibration errors of candidates, (2, k), see `calibration_errors`."""
+    factors = torch.from_numpy(factor.of(candidates.offsets))
+    snr = candidates.contrasts / (factors * candidates.errors[:, 0])
+    return calibration_errors(groups, candidates.offsets, snr, factors).numpy()
 
 
 def calibration_errors(

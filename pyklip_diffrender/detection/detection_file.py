@@ -1,4 +1,4 @@
-"""Convert the parts of a detection to FITS extensions, and back."""
+"""Write a detection to files, and read it again."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import torch
 from astropy.io import fits
 from astropy.table import QTable
 
+from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import described
 from pyklip_diffrender.detection.error_factor import ErrorFactor
@@ -20,23 +21,24 @@ from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group, groups_of
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.files import replacing, require_new, write_fits
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.fit_file import (
     image,
     observation_hdus,
     observation_of,
+    reading,
     text_hdu,
 )
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
 __all__ = [
-    "computed_of",
     "digest",
-    "fit_beside",
-    "groups_of_searched",
-    "hdus_of",
     "image_hdu",
-    "searched_of",
+    "provenance_of",
+    "read_detection",
+    "searched_fits",
+    "write_detection",
 ]
 
 _WCS = re.compile(r"WCSAXES|RADESYS|(CTYPE|CUNIT|CRPIX|CRVAL)[12]|CD[12]_[12]")
@@ -68,7 +70,7 @@ def _wcs_of(hdus: fits.HDUList, name: str, frame: int) -> fits.Header:
     return fits.Header(cards)
 
 
-def hdus_of(detection: Any) -> fits.HDUList:
+def _hdus_of(detection: Any) -> fits.HDUList:
     """The FITS extensions of a `Detection`, which it reads again."""
     unit = detection.observation.unit.to_string("fits")
     about, data = observation_hdus(detection.observation, 0)
@@ -102,8 +104,6 @@ def hdus_of(detection: Any) -> fits.HDUList:
                     ("FREEDOM", detection.error_factor.freedom),
                 )
             ),
-            image_hdu(detection.left_out[0], "LEFT_OUT", unit, wcs),
-            image_hdu(detection.left_out[1], "LEFT_OUT_ERROR", unit, wcs),
             image_hdu(detection.grid[..., 0], "OFFSET_X", "arcsec", wcs),
             image_hdu(detection.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
             *(
@@ -138,7 +138,7 @@ def _maps_of(hdus: fits.HDUList) -> dict[str, Any]:
     return {**maps, "error_factor": factor}
 
 
-def searched_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
+def _searched_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a detection that do not need its fits.
 
     Raises
@@ -156,14 +156,13 @@ def searched_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def computed_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
+def _computed_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
     """Return the cached properties that a new detection computes from its fits, by name."""
     stars = sum(hdu.name == "SUBTRACTED" for hdu in hdus)
     return {
         "observation": observation_of(hdus, facts["observation"], 0),
         "subtracted": tuple(image(hdus, "SUBTRACTED", k) for k in range(stars)),
         "_wcs": tuple(_wcs_of(hdus, "SUBTRACTED", k) for k in range(stars)),
-        "left_out": (image(hdus, "LEFT_OUT", 0), image(hdus, "LEFT_OUT_ERROR", 0)),
         "_calibration_errors": np.array(facts["calibration_errors"], dtype=float),
         "sky": Sky(**facts["sky"]),
         "provenance": {
@@ -205,7 +204,83 @@ def digest(fit: Refinement) -> str:
     return hashlib.sha256(fit.star_only.vector.numpy().tobytes()).hexdigest()
 
 
-def fit_beside(path: Path) -> Refinement:
+def provenance_of(detection: Any) -> dict[str, object]:
+    """Facts about the fits and the search of a `Detection`, by name."""
+    return {
+        "software": f"pyklip_diffrender {__version__}",
+        "observations": [f.observation.name for fit in detection.fits for f in fit.frames],
+        **detection.fits[0].summary(),
+        "scatter": detection.scatter,
+        "threshold": detection.threshold,
+        **detection.sky.facts,
+        "orientation": (
+            "position angles counter-clockwise from +y of the first frame"
+            if detection.observation.position_angles is None
+            else "position angles east of north"
+        ),
+    }
+
+
+def write_detection(detection: Any, folder: Path, *, overwrite: bool) -> list[Path]:
+    """Write a `Detection`; see its method `write`."""
+    maps, positions = folder / "detection.fits", folder / "astrometry.csv"
+    tables = {
+        folder / "candidates.ecsv": detection.candidates,
+        folder / "contrast.ecsv": detection.contrast_curve,
+    }
+    require_new([maps, *tables, positions], overwrite)
+    write_fits(_hdus_of(detection), maps)
+    for path, table in tables.items():
+        with replacing(path) as temporary:
+            table.write(temporary, format="ascii.ecsv", overwrite=True)
+    if detection.sky.north is None or detection.sky.mjd is None:
+        positions.unlink(missing_ok=True)
+        return [maps, *tables]
+    return [maps, *tables, detection.write_astrometry(positions, overwrite=overwrite)]
+
+
+def read_detection(
+    path: Path, fit: Refinement | Sequence[Refinement] | None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read a file of `write_detection`; see `Detection.read`.
+
+    Returns
+    -------
+    fields : dict
+        Those of the class.
+    computed : dict
+        Cached properties that a new detection computes from its fits, by name.
+    """
+    path = path / "detection.fits" if path.is_dir() else path
+    searched = (fit,) if isinstance(fit, Refinement) else tuple(fit or ())
+    with reading(path, "Detection") as (hdus, facts):
+        groups = _groups_of(searched, facts["fits"], path) if searched else ()
+        fields = {"fits": searched, "groups": groups, "path": path, **_searched_of(hdus, facts)}
+        return fields, _computed_of(hdus, facts)
+
+
+def searched_fits(
+    path: Path, digests: Sequence[str]
+) -> tuple[tuple[Refinement, ...], tuple[Group, ...]]:
+    """Fits in the folder of a detection, with their linear models and templates.
+
+    Parameters
+    ----------
+    path : Path
+        File of the detection.
+    digests : sequence of str
+        See `digest`.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If there is no fit with a linear model, or another one.
+    """
+    fits = (_fit_beside(path),)
+    return fits, _groups_of(fits, digests, path)
+
+
+def _fit_beside(path: Path) -> Refinement:
     """Read the fit that was written to the folder of a detection.
 
     Raises
@@ -229,23 +304,10 @@ def fit_beside(path: Path) -> Refinement:
     return fit
 
 
-def groups_of_searched(
+def _groups_of(
     searched: Sequence[Refinement], digests: Sequence[str], path: Path
 ) -> tuple[Group, ...]:
-    """Linear models and templates of fits, if they are those in which a detection was made.
-
-    Parameters
-    ----------
-    searched : sequence of Refinement
-    digests : sequence of str
-        See `digest`.
-    path : Path
-        File of the detection, for messages.
-
-    Raises
-    ------
-    IncompatibleSetupError
-    """
+    """Linear models and templates of fits, if they are those of the detection in a file."""
     if [digest(fit) for fit in searched] != list(digests):
         raise IncompatibleSetupError(
             f"{path}: the fit is not the one that was searched for this detection"

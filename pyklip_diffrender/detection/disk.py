@@ -124,13 +124,12 @@ class Disk:
         """
         axes = drawing.axes_for(ax, 2)
         observation = self.fit.frames[0].observation
+        bar, north = drawing.unit_label(observation.unit), observation.north
         limit = float(np.nanpercentile(self.light[0], 99)) or float(np.nanmax(self.error))
-        north = None if observation.position_angles is None else observation.position_angle
         for each, image, title in (
             (axes[0], self.image, "frames without the star"),
             (axes[1], self.light[0], "extended light"),
         ):
-            bar = drawing.unit_label(observation.unit)
             drawing.signed_image(each, image, self.grid, limit, bar=bar, title=title, north=north)
         return np.array(axes)
 

@@ -32,7 +32,7 @@ from pyklip_diffrender.detection.relinearise import without_light
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.progress import ProgressBar
-from pyklip_diffrender.io.units import to_arcsec
+from pyklip_diffrender.io.units import require_positive, to_arcsec
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
 
@@ -96,8 +96,7 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
     0.0
     """
     inner = float(to_arcsec(inner, "inner"))
-    if not inner > 0:
-        raise IncompatibleSetupError(f"inner: got {inner}, expected a positive number")
+    require_positive(inner=inner)
     if not fit.status.usable:
         raise IncompatibleSetupError(f"fit_disk: the fit {fit.status.message}")
     if has_only_reference_stars(fit):

@@ -33,8 +33,6 @@ class _Search(Protocol):
     def error_factor(self) -> ErrorFactor: ...
     @property
     def observation(self) -> Observation: ...
-    @property
-    def north(self) -> float: ...
 
 
 def draw_search(axes: Sequence[Any], search: _Search) -> None:
@@ -49,7 +47,7 @@ def draw_search(axes: Sequence[Any], search: _Search) -> None:
     drawing.snr_map(
         axes[0], search.snr, search.grid,
         np.stack([table["x"].value, table["y"].value], axis=1),
-        None if search.observation.position_angles is None else search.north,
+        search.observation.north,
         title=f"{len(table)} candidate{'' if len(table) == 1 else 's'} above "
         f"S/N {search.threshold:g}",
         labels=[f"S/N {each:.1f}" for each in table["snr"]],

@@ -71,18 +71,22 @@ def contrasts_at(
 def measured_shape(
     fits: Sequence[Refinement],
     groups: Sequence[Group],
-    image: Image,
+    image: ArrayLike,
     scatter: float,
     relinearise: float,
 ) -> tuple[float, float]:
     """Amplitude of an extended source and its error; see `Detection.measure_shape`."""
-    shape = torch.from_numpy(np.ascontiguousarray(image))
+    light = np.ascontiguousarray(image, dtype=float)
+    expected = groups[0][1].grid.shape[:2]
+    if light.shape != expected:
+        raise ShapeError(f"image: got {light.shape}, expected {expected}")
+    shape = torch.from_numpy(light)
     amplitude, error = _amplitude(groups[0][0], shape)
     total, bright = amplitude, amplitude > relinearise * error
     single_frame = len(fits) == 1 and len(fits[0].frames) == 1
     factor = scatter
     for _ in range(_ROUNDS if bright and single_frame else 0):
-        fit = without_light(fits[0], {0: total * image})
+        fit = without_light(fits[0], {0: total * light})
         amplitude, error = _amplitude(fit.star_only, shape)
         total += amplitude
         factor = 1.0 if fit.status.calibrated else scatter

@@ -40,7 +40,7 @@ from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import to_arcsec
+from pyklip_diffrender.io.units import require_positive, to_arcsec
 from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["contrast_curve", "detect", "measure"]
@@ -121,7 +121,7 @@ def detect(
     """
     fits = _checked(fits)
     inner = float(to_arcsec(inner, "inner"))
-    _require_positive(threshold=threshold, inner=inner, scatter=scatter)
+    require_positive(threshold=threshold, inner=inner, scatter=scatter)
     maps = Maps(groups_of(fits), progress)
     known = Candidates.of_fit(fits[0])
     candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
@@ -236,7 +236,7 @@ def measure(
     1.0e-04
     """
     fits = _checked(fits)
-    _require_positive(scatter=scatter, sigmas=sigmas)
+    require_positive(scatter=scatter, sigmas=sigmas)
     if scatter is None and follows_scatter(fits):
         return detect(fits, relinearise=relinearise).measure(offsets, sigmas=sigmas)
     table, calibration, factor = _measured(fits, offsets, scatter)
@@ -310,7 +310,7 @@ def contrast_curve(
     True
     """
     fits = _checked(fits)
-    _require_positive(scatter=scatter)
+    require_positive(scatter=scatter)
     groups = groups_of(fits)
     grid = groups[0][1].grid
     separations = curve_separations(grid, separations)
@@ -348,13 +348,6 @@ def _checked(fits: Fits) -> list[Refinement]:
         if not fit.status.usable:
             raise IncompatibleSetupError(f"detect: the fit {fit.status.message}")
     return refinements
-
-
-def _require_positive(**values: float | None) -> None:
-    """Raise an exception for numbers that are not positive; None stands for a default."""
-    for name, value in values.items():
-        if value is not None and not value > 0:
-            raise IncompatibleSetupError(f"{name}: got {value}, expected a positive number")
 
 
 def _search(

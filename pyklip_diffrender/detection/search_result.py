@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import os
 import textwrap
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,23 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from astropy.io.fits import Header
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender._version import __version__
-from pyklip_diffrender.detection.calibration import calibration_errors
+from pyklip_diffrender.detection.calibration import candidate_errors
 from pyklip_diffrender.detection.candidate_tables import candidate_table, in_words, measured_table
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.caveats import caveats, count_rolls
 from pyklip_diffrender.detection.detection_file import (
-    computed_of,
     digest,
-    fit_beside,
-    groups_of_searched,
-    hdus_of,
-    searched_of,
+    provenance_of,
+    read_detection,
+    searched_fits,
+    write_detection,
 )
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
@@ -41,18 +37,12 @@ from pyklip_diffrender.detection.measurement import (
     subtracted_frames,
 )
 from pyklip_diffrender.detection.orbits import write_astrometry
-from pyklip_diffrender.detection.relinearise import unconfirmed_companions
 from pyklip_diffrender.detection.sky import Sky
-from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.io.files import replacing, require_new, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement import Refinement
-from pyklip_diffrender.refinement.fit_file import reading
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["RENAMED", "Detection"]
-
-RENAMED = "{0}.table is deprecated and will be removed in version 1.0; use {0}.candidates"
+__all__ = ["Detection"]
 
 
 @dataclass(frozen=True)
@@ -143,49 +133,14 @@ class Detection:
         return f"{words}\n{textwrap.fill(self.remark, 80)}".rstrip()
 
     @property
-    def table(self) -> QTable:
-        """Earlier name of `candidates`, deprecated."""
-        warnings.warn(RENAMED.format("Detection"), DeprecationWarning, stacklevel=2)
-        return self.candidates
-
-    @property
     def remark(self) -> str:
         """Caveats about sources that only the fit has, and about real frames of a single roll."""
-        return " ".join(filter(None, [self._unconfirmed, self._single_roll]))
-
-    @property
-    def _unconfirmed(self) -> str:
-        if not self.fits:
-            return ""
-        sources = unconfirmed_companions(self.fits, self.sources)
-        return " ".join(
-            f"A possible source of contrast {contrast:.1e} at {math.hypot(x, y):.2f} arcsec was "
-            "fitted with the star; the search does not confirm it."
-            for contrast, x, y in sources
-        )
-
-    @property
-    def _single_roll(self) -> str:
-        if self.rolls > 1 or not self.observation.is_nircam:
-            return ""
-        step = np.rad2deg(self.contrast_curve.meta["resolution_arcsec"])
-        return (
-            "One roll: structure that is fixed on the detector cannot be told from a planet. A "
-            f"second roll by 10 degrees would tell them apart beyond {step / 10:.1f} arcsec, where "
-            "it moves a planet by more than lambda/D."
-        )
+        return caveats(self)
 
     @cached_property
     def rolls(self) -> int:
         """Number of orientations of the target's frames that differ by more than a degree."""
-        angles = sorted(
-            each.observation.position_angle
-            for fit in self.fits
-            for each in fit.frames
-            if not each.observation.reference
-        )
-        steps = np.diff(angles, append=angles[0] + 360)
-        return max(1, int((steps > 1).sum()))
+        return count_rolls(self.fits)
 
     @property
     def _count(self) -> str:
@@ -255,10 +210,7 @@ class Detection:
     @cached_property
     def _calibration_errors(self) -> Image:
         """Relative calibration errors of the candidates' contrasts and fluxes, (2, k)."""
-        candidates = self.sources
-        factors = torch.from_numpy(self.error_factor.of(candidates.offsets))
-        snr = candidates.contrasts / (factors * candidates.errors[:, 0])
-        return calibration_errors(self.groups, candidates.offsets, snr, factors).numpy()
+        return candidate_errors(self.groups, self.sources, self.error_factor)
 
     def measure(self, offsets: ArrayLike, *, sigmas: float = 5.0) -> QTable:
         """Contrast of a point source at given positions, one at a time.
@@ -304,10 +256,7 @@ class Detection:
         -------
         amplitude, error : float
         """
-        shape = np.asarray(image, dtype=float)
-        if shape.shape != self.snr.shape:
-            raise ShapeError(f"image: got {shape.shape}, expected {self.snr.shape}")
-        return measured_shape(*self._searched, shape, self.scatter, relinearise)
+        return measured_shape(*self._searched, image, self.scatter, relinearise)
 
     @cached_property
     def subtracted(self) -> tuple[Image, ...]:
@@ -327,22 +276,11 @@ class Detection:
         return tuple(f.wcs for fit in self.fits for f in fit.frames)
 
     @cached_property
-    def left_out(self) -> tuple[Image, Image]:
-        """Residual of every 5 x 5 patch of the first frame for a fit without the patch.
-
-        The second image is its standard deviation, without `scatter`. Both are (ny, nx) in the
-        data's unit.
-        """
-        residual, deviation = self.groups[0][0].left_out(5, 0)
-        return residual.numpy(), deviation.numpy()
-
-    @cached_property
     def _searched(self) -> tuple[tuple[Refinement, ...], tuple[Group, ...]]:
         """Fits and groups; if the detection was read without them, from the same folder."""
         if self.path is None or self.groups:
             return self.fits, self.groups
-        fits = (fit_beside(self.path),)
-        return fits, groups_of_searched(fits, self._digests, self.path)
+        return searched_fits(self.path, self._digests)
 
     @cached_property
     def _digests(self) -> tuple[str, ...]:
@@ -351,19 +289,7 @@ class Detection:
     @cached_property
     def provenance(self) -> dict[str, object]:
         """Facts about the fits and the search, by name."""
-        return {
-            "software": f"pyklip_diffrender {__version__}",
-            "observations": [f.observation.name for fit in self.fits for f in fit.frames],
-            **self.fits[0].summary(),
-            "scatter": self.scatter,
-            "threshold": self.threshold,
-            **self.sky.facts,
-            "orientation": (
-                "position angles counter-clockwise from +y of the first frame"
-                if self.observation.position_angles is None
-                else "position angles east of north"
-            ),
-        }
+        return provenance_of(self)
 
     def plot(self, ax: Any = None) -> NDArray[Any]:
         """Draw the S/N map with the candidates, and the contrast curve.
@@ -402,21 +328,7 @@ class Detection:
         ExistingFileError
             If one of the files exists, and `overwrite` is False; it is also an `OSError`.
         """
-        folder = Path(folder)
-        maps, positions = folder / "detection.fits", folder / "astrometry.csv"
-        tables = {
-            folder / "candidates.ecsv": self.candidates,
-            folder / "contrast.ecsv": self.contrast_curve,
-        }
-        require_new([maps, *tables, positions], overwrite)
-        write_fits(hdus_of(self), maps)
-        for path, table in tables.items():
-            with replacing(path) as temporary:
-                table.write(temporary, format="ascii.ecsv", overwrite=True)
-        if self.sky.north is None or self.sky.mjd is None:
-            positions.unlink(missing_ok=True)
-            return [maps, *tables]
-        return [maps, *tables, self.write_astrometry(positions, overwrite=overwrite)]
+        return write_detection(self, Path(folder), overwrite=overwrite)
 
     def write_astrometry(
         self,
@@ -474,12 +386,7 @@ class Detection:
         IncompatibleSetupError
             For a fit other than the one that was searched.
         """
-        path = Path(path)
-        path = path / "detection.fits" if path.is_dir() else path
-        fits = (fit,) if isinstance(fit, Refinement) else tuple(fit or ())
-        with reading(path, "Detection") as (hdus, facts):
-            groups = groups_of_searched(fits, facts["fits"], path) if fits else ()
-            detection = cls(fits=fits, groups=groups, path=path, **searched_of(hdus, facts))
-            computed = computed_of(hdus, facts)
+        searched, computed = read_detection(Path(path), fit)
+        detection = cls(**searched)
         vars(detection).update(computed)
         return detection

@@ -56,7 +56,7 @@ class Sky:
             untied = np.mean([star_flux_error(fit) for fit in fits])
             star = (float(flux), float(np.hypot(error, untied * flux)))
         return cls(
-            None if first.position_angles is None else first.position_angle,
+            first.north,
             float(np.mean(known)) if known else None,
             star,
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from pyklip_diffrender.detection.detection_file import image_hdu
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.figure import draw_search
-from pyklip_diffrender.detection.search_result import RENAMED, Detection
+from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.io.files import replacing, require_new, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.observation import Observation
@@ -91,12 +90,6 @@ class WideField:
         title = f"WideField: {len(self.candidates)} candidates above {self.threshold:g} sigma"
         columns = ("separation", "position_angle", "contrast", "contrast_error", "snr", "fit_chi2")
         return html_summary(title, facts, self.candidates, columns)
-
-    @property
-    def table(self) -> QTable:
-        """Earlier name of `candidates`, deprecated."""
-        warnings.warn(RENAMED.format("WideField"), DeprecationWarning, stacklevel=2)
-        return self.candidates
 
     @property
     def observation(self) -> Observation:

@@ -73,8 +73,6 @@ class SkyModel:
     Parameters
     ----------
     fits : sequence of Refinement
-    strength : float
-        Standard deviation of the prior over the noise of the frames.
 
     Attributes
     ----------
@@ -89,7 +87,7 @@ class SkyModel:
         orientation of the frames is known, else along the axes of the first frame.
     """
 
-    def __init__(self, fits: Sequence[Refinement], strength: float = _STRENGTH) -> None:
+    def __init__(self, fits: Sequence[Refinement]) -> None:
         self.groups = groups_of(fits)
         first = fits[0].frames[0]
         self.pixelscale = math.sqrt(math.prod(first.observation.pixelscale))
@@ -112,7 +110,7 @@ class SkyModel:
         frequency = np.fft.fftfreq(side)[:, None] ** 2 + np.fft.rfftfreq(side) ** 2
         core = np.exp(-2 * (math.pi * width) ** 2 * frequency)
         self._core = core / np.linalg.norm(np.fft.irfft2(core, s=self.shape))
-        self._prior = strength * self._noise()
+        self._prior = _STRENGTH * self._noise()
 
     def places(self, offsets: Image, angle: float) -> Image:
         """Place in the sky, (n, 2), of x, y in arcsec from the star in a frame.

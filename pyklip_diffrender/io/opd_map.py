@@ -72,3 +72,8 @@ class OPDMap:
     def days_after(self, date: str | Time) -> float | None:
         """Days from `date` (UTC) to the sensing of the map; None if its date is not known."""
         return None if self.date is None else float((self.date - Time(date)).jd)
+
+    def age(self, date: str | Time) -> str:
+        """`days_after` in words, such as "3.2 days before"; empty if its date is not known."""
+        days = self.days_after(date)
+        return "" if days is None else f"{abs(days):.1f} days {'after' if days > 0 else 'before'}"

@@ -28,6 +28,7 @@ __all__ = [
     "native_float64",
     "require_bound",
     "require_finite",
+    "require_positive",
     "require_shape",
     "set_numbers",
     "to_arcsec",
@@ -166,6 +167,13 @@ def require_bound(
         raise IncompatibleSetupError(
             f"{name}: got {f'{number:g} {u.Unit(unit)}'.strip()}, expected {expected}"
         )
+
+
+def require_positive(**values: float | None) -> None:
+    """Raise `IncompatibleSetupError` for values that are not positive; None and inf pass."""
+    for name, value in values.items():
+        if value is not None and not value > 0:
+            raise IncompatibleSetupError(f"{name}: got {value}, expected a positive number")
 
 
 def set_numbers(instance: Any, **fields: tuple[str | u.UnitBase, Bound]) -> None:

@@ -7,7 +7,7 @@ from pyklip_diffrender.linear.jacobian import jacobian
 from pyklip_diffrender.linear.last_pupil import LastPupil
 from pyklip_diffrender.linear.mode_fields import NANOMETRE, ModeFields
 from pyklip_diffrender.linear.model import LinearModel
-from pyklip_diffrender.linear.parameter_derivatives import parameter_jacobian
+from pyklip_diffrender.linear.parameter_derivatives import field_derivatives, image_derivatives
 from pyklip_diffrender.linear.response import (
     WavefrontResponse,
     coarse_copy,
@@ -28,6 +28,7 @@ __all__ = [
     "coarse_copy",
     "coarse_npix",
     "downsample",
+    "field_derivatives",
+    "image_derivatives",
     "jacobian",
-    "parameter_jacobian",
 ]

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.errors import ShapeError
-from pyklip_diffrender.linear.frames import LinearFrame, Unknown, pixel_pieces
-from pyklip_diffrender.linear.noise import Noise, weighted_rows
+from pyklip_diffrender.linear.frames import LinearFrame, Unknown
+from pyklip_diffrender.linear.noise import Noise
 
 __all__ = ["LinearModel", "TemplateProducts"]
 
@@ -108,11 +108,6 @@ class LinearModel:
             tuple(frame.weight for frame in self.frames),
             tuple(frame.common for frame in self.frames),
         )
-
-    @cached_property
-    def _weighted_rows(self) -> tuple[Tensor, ...]:
-        """J C^-1 over w of every frame, (unknowns, pixels), float32."""
-        return weighted_rows(self.frames, self.noise, len(self.vector))
 
     @cached_property
     def _scale(self) -> Tensor:
@@ -287,51 +282,3 @@ class LinearModel:
             self.deviation[remaining],
             self.curvature[remaining][:, remaining],
         )
-
-    def _predictors(self, frame: int) -> Tensor:
-        """L^-1 J C^-1 over w of a frame with P + G G^T = L L^T, (unknowns, pixels), float64."""
-        basis = torch.empty(self._weighted_rows[frame].shape, dtype=torch.float64)
-        for pixels in pixel_pieces(basis.shape[1]):
-            weighted = self._weighted_rows[frame][:, pixels].double()
-            basis[:, pixels] = torch.linalg.solve_triangular(
-                self._factor, weighted * self._scale[:, None], upper=False
-            )
-        return basis
-
-    def left_out(self, size: int = 5, frame: int = 0) -> tuple[Tensor, Tensor]:
-        """Residual of every patch of pixels, predicted from all pixels outside the patch.
-
-        Parameters
-        ----------
-        size : int
-            Side of a patch, pixels.
-        frame : int
-
-        Returns
-        -------
-        residual, deviation : Tensor, (ny, nx)
-            Data minus the prediction of a fit without the patch, in the data's unit, and its
-            standard deviation, noise and prediction included; NaN for masked pixels.
-        """
-        part = self.frames[frame]
-        ny, nx = part.residual.shape
-        basis = self._predictors(frame).reshape(-1, ny, nx)
-        residual = torch.full((ny, nx), torch.nan, dtype=torch.float64)
-        deviation = residual.clone()
-        for y in range(0, ny, size):
-            for x in range(0, nx, size):
-                window = (slice(y, y + size), slice(x, x + size))
-                counts = part.weight[window] > 0
-                if not bool(counts.any()):
-                    continue
-                inside = basis[:, window[0], window[1]][:, counts]
-                inverse = self.noise.precision(frame, window)[counts.flatten()][:, counts.flatten()]
-                inverse = inverse - inside.T @ inside
-                covariance = torch.linalg.inv(inverse)
-                weight = part.weight[window][counts]
-                prediction_error = covariance @ self.cleaned[frame][window][counts] / weight
-                residual[window] = residual[window].masked_scatter(counts, prediction_error)
-                deviation[window] = deviation[window].masked_scatter(
-                    counts, covariance.diagonal().sqrt() / weight
-                )
-        return residual, deviation

@@ -32,11 +32,7 @@ from pyklip_diffrender.linear.frames import LinearFrame, pixel_pieces
 __all__ = [
     "Noise",
     "summed_rows",
-    "weighted_rows",
 ]
-
-_ROWS = 64
-"""Number of unknowns whose derivatives are whitened at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +127,6 @@ class Noise:
         total = sum(float(((self.weight[k] * x) ** 2).sum()) for k, x in by_frame.items())
         return total - float((self._summed(by_frame) ** 2).sum()) if self.shares_pattern else total
 
-    def precision(self, frame: int, window: tuple[slice, slice]) -> Tensor:
-        """The block of M^-1 of a window of pixels of a frame, (pixels, pixels)."""
-        weight, common = self.weight[frame][window], self.common[frame][window]
-        return torch.diag((1 - (weight * common) ** 2).flatten())
-
 
 def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Tensor:
     """W c summed over frames with the derivative by every unknown, (unknowns, pixels), float32."""
@@ -146,20 +137,3 @@ def summed_rows(frames: Sequence[LinearFrame], unknowns: int) -> Tensor:
             on_rows = frame.jacobian.flatten(1)[:, pixels] * scale[pixels]
             total[:, pixels] += frame.onto_unknowns(on_rows, unknowns)
     return total
-
-
-def weighted_rows(frames: Sequence[LinearFrame], noise: Noise, unknowns: int) -> tuple[Tensor, ...]:
-    """J C^-1 over w of every frame, with the derivatives J, (unknowns, pixels), float32."""
-    rows = _rows_by_unknown(frames, unknowns)
-    total = tuple(torch.empty_like(each.flatten(1)) for each in rows.values())
-    for start in range(0, unknowns, _ROWS):
-        some = slice(start, start + _ROWS)
-        inverse = noise.inverse({k: each[some].double() for k, each in rows.items()})
-        for k, each in inverse.items():
-            total[k][some] = each.flatten(1)
-    return total
-
-
-def _rows_by_unknown(frames: Sequence[LinearFrame], unknowns: int) -> dict[int, Tensor]:
-    """Derivatives of the pixels by all unknowns, (unknowns, ny, nx) by frame."""
-    return {k: frame.onto_unknowns(frame.jacobian, unknowns) for k, frame in enumerate(frames)}

@@ -13,7 +13,7 @@ from torch import Tensor
 from pyklip_diffrender.linear.jacobian import jacobian
 from pyklip_diffrender.optics.system import OpticalSystem
 
-__all__ = ["field_derivatives", "image_derivatives", "parameter_jacobian"]
+__all__ = ["field_derivatives", "image_derivatives"]
 
 _IMAGE_PARAMETERS = ("blur",)
 """Parameters that act on the image; all others act on the field."""
@@ -103,32 +103,3 @@ def image_derivatives(
             total = total + 2 * weight * (field.conj() * slope).real
         rows.append(model.detector.image(total, values))
     return torch.cat([row.double() for row in rows])
-
-
-def parameter_jacobian(
-    model: OpticalSystem,
-    opd: Tensor,
-    values: dict[str, Tensor],
-    names: tuple[str, ...],
-    fields: Sequence[Tensor] | None = None,
-) -> Tensor:
-    """Derivative of the image with respect to the components of named parameters.
-
-    Parameters
-    ----------
-    model, opd, values, names
-        See `field_derivatives`.
-    fields : sequence of Tensor, optional
-        The finer model's field at each wavelength. Only the derivatives of the field are then
-        those of `model`.
-
-    Returns
-    -------
-    Tensor, (components, ny, nx), float64
-        Light per pixel per unit of the parameter table.
-    """
-    slopes = field_derivatives(model, opd, values, names)
-    if fields is None:
-        with torch.no_grad():
-            fields = model.fields(opd, **values)
-    return image_derivatives(model, fields, values, names, slopes)

@@ -246,7 +246,6 @@ class OpticalSystem(Propagation):
         fft_oversample: int | None = None,
         overwrite: bool = True,
         display: bool = False,
-        return_intermediates: bool = False,
         normalize: str = "first",
         opd: Value | None = None,
         **parameters: Value,
@@ -263,8 +262,6 @@ class OpticalSystem(Propagation):
             Write the result there.
         display : bool
             Accepted for compatibility with poppy; nothing is drawn.
-        return_intermediates : bool
-            Return (HDUList, `debug` of the first wavelength).
         normalize : str
             "first", "last", "exit_pupil" or "none", as in poppy.
         opd, **parameters
@@ -288,8 +285,6 @@ class OpticalSystem(Propagation):
         sampling = system.recipe.get("occulter_sampling")
         hdus = instrument_psf(system, system.setup, sampling, normalize, opd, **parameters)
         save(hdus, outfile, overwrite)
-        if return_intermediates:
-            return hdus, system.debug(opd, None, **parameters)
         return hdus
 
     def plot(self, ax: Any = None, *, opd: Value | None = None) -> NDArray[Any]:

@@ -228,7 +228,7 @@ def _star(detection: Detection, frame: int) -> list[Any]:
     part, observation = fit.frames[frame], fit.frames[frame].observation.combined()
     valid, noise = observation.valid[0], observation.error[0]
     data = np.where(valid, observation.data[0], np.nan)
-    north = None if observation.position_angles is None else observation.position_angle
+    north = observation.north
     norm, unit = drawing.light_norm(data, noise[valid]), drawing.unit_label(observation.unit)
     figures, axes = _panels(3)
     for ax, image, title in ((axes[0], data, "Data"), (axes[1], part.star, "Model of the star")):

@@ -24,7 +24,6 @@ from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.refinement.fit_file import (
     linear_hdus,
     linear_of,
@@ -33,7 +32,7 @@ from pyklip_diffrender.refinement.fit_file import (
     reading,
     text_hdu,
 )
-from pyklip_diffrender.refinement.frame_fit import FrameFit
+from pyklip_diffrender.refinement.frame_fit import FrameFit, parameter_table
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.scene.objects import Planet
@@ -48,19 +47,9 @@ Image = NDArray[np.float64]
 
 _ARRAYS = ("companions", "companion_errors")
 _PLAIN = (
-    "settings",
-    "basis",
-    "chi2_per_pixel",
-    "model_error",
-    *_ARRAYS,
-    "scales",
-    "prior_ratios",
-    "effective_parameters",
-    "log_evidence",
-    "history",
-    "seconds",
-    "seed",
-)
+    "settings", "basis", "chi2_per_pixel", "model_error", *_ARRAYS, "scales", "prior_ratios",
+    "effective_parameters", "log_evidence", "history", "seconds", "seed",
+)  # fmt: skip
 """Attributes of a refinement that are written as text."""
 
 
@@ -250,24 +239,7 @@ class Refinement:
 
         The unit of flux, background and pedestal is that of the frame.
         """
-        rows = []
-        for k, frame in enumerate(self.frames):
-            for name, value in frame.values.items():
-                entry = parameter(name)
-                unit = frame.observation.unit.to_string() if entry in LEVELS else entry.unit
-                labels = entry.labels()[: len(value)]
-                parts = zip(value, frame.errors[name], labels, strict=True)
-                for j, (number, error, label) in enumerate(parts):
-                    component = name if len(value) == 1 else f"{name}[{j}]"
-                    rows.append((k, component, number, error, unit, label))
-        table = QTable(
-            rows=rows,
-            names=("frame", "name", "value", "error", "unit", "description"),
-            dtype=(int, str, float, float, str, str),
-        )
-        for name in ("value", "error"):
-            table[name].info.format = ".5g"
-        return table
+        return parameter_table(self.frames)
 
     def write(
         self, path: str | os.PathLike[str], *, linear: bool = True, overwrite: bool = False
@@ -388,10 +360,12 @@ class Refinement:
         observation = part.observation.combined()
         valid, noise = observation.valid[0], observation.error[0]
         data = np.where(valid, observation.data[0], np.nan)
+        north = observation.north
         norm, unit = drawing.light_norm(data, noise[valid]), drawing.unit_label(observation.unit)
-        north = None if observation.position_angles is None else observation.position_angle
         for each, image, title in ((axes[0], data, "data"), (axes[1], part.star, "star model")):
-            drawing.star_image(each, image, part.grid, norm, bar=unit, title=title, north=north)
+            drawing.star_image(
+                each, image, part.grid, norm, bar=unit, title=title, north=observation.north
+            )
         places = observation.turned(self.companions[:, 1:], self.frames[0].observation)
         drawing.signed_image(
             axes[2],

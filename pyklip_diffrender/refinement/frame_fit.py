@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from astropy.io import fits
+from astropy.table import QTable
 from numpy.typing import NDArray
 from torch import Tensor
 
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.refinement.fit_file import image, observation_hdus, observation_of
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import world_coordinates
 
-__all__ = ["FrameFit", "pixel_grid"]
+__all__ = ["FrameFit", "parameter_table", "pixel_grid"]
 
 Image = NDArray[np.float64]
 
@@ -221,3 +223,25 @@ def pixel_grid(model: OpticalSystem, values: Mapping[str, Tensor]) -> NDArray[np
     star = values.get("star_offset", torch.zeros(2, dtype=torch.float64)).cpu().numpy()
     across, up = np.meshgrid(x, y)
     return np.stack([across - star[0], up + detector.shear * across - star[1]], axis=-1)
+
+
+def parameter_table(frames: Sequence[FrameFit]) -> QTable:
+    """Table of all parameters but the wavefront; see `Refinement.parameters`."""
+    rows = []
+    for k, frame in enumerate(frames):
+        for name, value in frame.values.items():
+            entry = parameter(name)
+            unit = frame.observation.unit.to_string() if entry in LEVELS else entry.unit
+            labels = entry.labels()[: len(value)]
+            parts = zip(value, frame.errors[name], labels, strict=True)
+            for j, (number, error, label) in enumerate(parts):
+                component = name if len(value) == 1 else f"{name}[{j}]"
+                rows.append((k, component, number, error, unit, label))
+    table = QTable(
+        rows=rows,
+        names=("frame", "name", "value", "error", "unit", "description"),
+        dtype=(int, str, float, float, str, str),
+    )
+    for name in ("value", "error"):
+        table[name].info.format = ".5g"
+    return table

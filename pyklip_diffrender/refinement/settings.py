@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.units import ARCSEC, to_bytes, to_unit
+from pyklip_diffrender.io.units import ARCSEC, require_positive, to_bytes, to_unit
 from pyklip_diffrender.optics.grid import JWST_DIAMETER
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
 from pyklip_diffrender.scene.objects import Planet
@@ -199,17 +199,11 @@ class GaussNewton:
                 raise IncompatibleSetupError(
                     f"{name}: got {getattr(self, name)!r}, expected True or False"
                 )
-        _require_positive(
-            self,
-            "max_iterations",
-            "tolerance",
-            "robust",
-            "relinearise",
-            "response_npix",
-            "response_wavelengths",
-            "companion_threshold",
-            "drift_cycles",
-        )
+        positive = (
+            "max_iterations", "tolerance", "robust", "relinearise", "response_npix",
+            "response_wavelengths", "companion_threshold", "drift_cycles",
+        )  # fmt: skip
+        require_positive(**{name: getattr(self, name) for name in positive})
         for name in ("min_model_error", "max_companions", "star_flux_error"):
             value = getattr(self, name)
             if value is not None and not value >= 0:
@@ -342,15 +336,6 @@ class GaussNewton:
         free = changes.get("free", preset.free)
         deviations = {name: value for name, value in preset.deviations.items() if name in free}
         return replace(preset, **{"deviations": deviations, **changes})
-
-
-def _require_positive(settings: GaussNewton, *names: str) -> None:
-    """Refuse fields that are not positive numbers."""
-    for name in names:
-        if not getattr(settings, name) > 0:
-            raise IncompatibleSetupError(
-                f"{name}: got {getattr(settings, name)}, expected a positive number"
-            )
 
 
 def settings_for(observation: Observation) -> GaussNewton:

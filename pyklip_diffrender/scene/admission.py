@@ -22,17 +22,14 @@ from pyklip_diffrender.scene.pixel_checks import (
     copies,
     why_no_star,
     why_odd_unit,
-    why_other_brightness,
-    why_turned,
 )
 
 __all__ = [
     "EPOCH",
     "choose_filter",
     "choose_target",
-    "compare_brightness",
-    "compare_orientation",
     "epochs_of",
+    "exclude_contradicting",
     "exclude_copies",
     "exclude_other_setups",
     "exclude_unoriented",
@@ -258,36 +255,28 @@ def judge_frames(files: Iterable[FrameFile], frames: Mapping[int, Observation | 
             )
 
 
-def compare_brightness(
-    files: Iterable[FrameFile], frames: Mapping[int, Observation | None]
+def exclude_contradicting(
+    files: Iterable[FrameFile],
+    frames: Mapping[int, Observation | None],
+    why: Callable[[Sequence[Observation]], Mapping[int, str]],
 ) -> None:
-    """Exclude frames that are much brighter or fainter than the others of their star.
+    """Exclude frames that contradict the others.
+
+    Parameters
+    ----------
+    files : iterable of FrameFile
+    frames : mapping of int to Observation
+        By the `id` of the file.
+    why : callable
+        Reasons by index, such as `pixel_checks.why_turned`.
 
     Raises
     ------
     IncompatibleSetupError
-        If half of the frames or more are, and nothing says which are right.
+        If half of the target's frames or more are, and nothing says which are right.
     """
     usable = admissible(files)
-    _exclude(usable, why_other_brightness([_known(frames[id(each)]) for each in usable]))
-
-
-def compare_orientation(
-    files: Iterable[FrameFile], frames: Mapping[int, Observation | None]
-) -> None:
-    """Exclude frames whose pixels are mirrored or turned, unlike those of most others.
-
-    Raises
-    ------
-    IncompatibleSetupError
-        If half of the frames or more are, and nothing says which are right.
-    """
-    usable = admissible(files)
-    _exclude(usable, why_turned([_known(frames[id(each)]) for each in usable]))
-
-
-def _exclude(usable: Sequence[FrameFile], odd: Mapping[int, str]) -> None:
-    """Exclude frames with a reason, by index, if those without one can be right."""
+    odd = why([_known(frames[id(each)]) for each in usable])
     if 2 * len(odd) >= len(usable) and odd and not usable[0].exposure.reference:
         names = ", ".join(each.name for each in usable)
         raise IncompatibleSetupError(

@@ -58,8 +58,8 @@ class Row:
         offset: tuple[float, float] | None = None
         date, count = exposure.date, exposure.integrations
         if frames is not None:
-            angle = None if frames.position_angles is None else frames.position_angle
-            offset, date, count = frames.star_offset, frames.date, len(frames)
+            angle, offset = frames.north, frames.star_offset
+            date, count = frames.date, len(frames)
         elif any(exposure.offset):
             offset = exposure.offset
         place = exposure.star.coordinates

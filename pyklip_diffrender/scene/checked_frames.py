@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -23,17 +24,17 @@ from pyklip_diffrender.io.units import (
     to_unit,
 )
 
-__all__ = ["checked_frames"]
+__all__ = ["checked_frames", "selected"]
 
 
 def checked_frames(
     data: Any,
     error: Any,
     *,
-    valid: Any,
-    unit: str | u.UnitBase,
+    valid: Any = None,
+    unit: str | u.UnitBase = "photon",
     pixelscale: float | tuple[float, float],
-    center: Any,
+    center: Any = None,
     **details: Any,
 ) -> dict[str, Any]:
     """Return the attributes of an `Observation`, checked, in its units, and copied.
@@ -88,6 +89,16 @@ def checked_frames(
         "pixelscale": (float(scale[0]), float(scale[1])),
         "center": _spread(position, (frames, 2), f"{name}: center"),
         **details,
+    }
+
+
+def selected(frames: Mapping[str, Any], which: NDArray[np.intp]) -> dict[str, Any]:
+    """The attributes of an `Observation` that change if frames are selected by their indices."""
+    names = ("data", "error", "valid", "center", "position_angles")
+    ratios = frames.get("noise_ratios", ())
+    return {
+        **{name: frames[name][which] for name in names if frames[name] is not None},
+        "noise_ratios": tuple(ratios[k] for k in which) if ratios else (),
     }
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,23 +13,18 @@ from astropy.time import Time
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.errors import (
-    NoValidPixelsError,
-    ShapeError,
-)
+from pyklip_diffrender.errors import NoValidPixelsError, ShapeError
 from pyklip_diffrender.io.geometry import full_circle, half_circle, rotation_matrix
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.catalogue_star import star_of
-from pyklip_diffrender.scene.checked_frames import checked_frames
+from pyklip_diffrender.scene.checked_frames import checked_frames, selected
 from pyklip_diffrender.scene.exposure import instrument_of
-from pyklip_diffrender.scene.integrations import judge_pointings, pointings
-from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints, without_empty
-from pyklip_diffrender.scene.measured_noise import calibrated_errors, weighted_mean
+from pyklip_diffrender.scene.file_frames import frames_of_file
+from pyklip_diffrender.scene.integrations import pointings
+from pyklip_diffrender.scene.measured_noise import weighted_mean
 from pyklip_diffrender.scene.window import Window
 
 __all__ = ["Observation"]
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -151,17 +144,9 @@ class Observation:
         NoValidPixelsError
             A frame without valid pixels.
         """
-        return cls(
-            **checked_frames(
-                data,
-                error,
-                valid=valid,
-                unit=unit,
-                pixelscale=pixelscale,
-                center=center,
-                **details,
-            )
-        )
+        return cls(**checked_frames(
+            data, error, valid=valid, unit=unit, pixelscale=pixelscale, center=center, **details
+        ))  # fmt: skip
 
     @classmethod
     def from_fits(
@@ -196,72 +181,11 @@ class Observation:
         ShapeError, NoValidPixelsError
             As `from_arrays`.
         """
-        arguments, shifts = read_calints(path)
-        arguments, shifts, empty = without_empty(arguments, shifts)
-        observation = cls.from_arrays(**arguments)
-        if shifts is not None:
-            changes = on_detector_pixels(arguments, observation.center, shifts)
-            observation = replace(observation, **changes)
-        if observation.is_nircam:
-            error, ratios = calibrated_errors(
-                observation.data,
-                observation.error,
-                observation.valid,
-                observation.center,
-                observation.pixelscale,
-                observation.name,
-            )
-            observation = replace(observation, error=error, noise_ratios=ratios)
-        observation = replace(observation, remarks=() if empty is None else empty.remarks)
-        original = np.ones(len(observation), dtype=bool) if empty is None else empty.kept
-        observation, kept = observation._judged(
-            [f"integration {k + 1} of {len(original)}" for k in np.flatnonzero(original)]
-        )
-        if not every_integration:
-            return observation if kept.all() else observation.part(np.flatnonzero(kept))
-        if empty is not None:
-            observation = observation.part(np.maximum(np.cumsum(empty.kept) - 1, 0))
-            every = empty.kept.copy()
-            every[empty.kept] = kept
-            kept = every
-        return observation._with_valid(observation.valid & kept[:, None, None])
-
-    def _judged(self, names: Sequence[str]) -> tuple[Observation, NDArray[np.bool_]]:
-        """Mask what deviates from the median of the integrations of one pointing.
-
-        The second value says which integrations are kept.
-        """
-        judgement = judge_pointings(
-            self.data, self.error, self.valid, self.center, self.position_angles, self.pixelscale,
-            names,
-        )  # fmt: skip
-        for remark in judgement.remarks:
-            _log.warning("%s: %s", self.name, remark)
-        cleaned = replace(self, remarks=(*self.remarks, *judgement.remarks))
-        return cleaned._with_valid(judgement.valid), judgement.kept
-
-    def _with_valid(self, valid: NDArray[np.bool_]) -> Observation:
-        if (valid == self.valid).all():
-            return self
-        return replace(
-            self,
-            data=np.where(valid, self.data, 0.0),
-            error=np.where(valid, self.error, 1.0),
-            valid=valid,
-        )
+        return cls(**frames_of_file(path, every_integration=every_integration))
 
     def part(self, which: NDArray[np.intp]) -> Observation:
         """Select frames by their indices."""
-        angles, ratios = self.position_angles, self.noise_ratios
-        return replace(
-            self,
-            data=self.data[which],
-            error=self.error[which],
-            valid=self.valid[which],
-            center=self.center[which],
-            position_angles=None if angles is None else angles[which],
-            noise_ratios=tuple(ratios[k] for k in which) if ratios else (),
-        )
+        return replace(self, **selected(vars(self), which))
 
     def pointings(self) -> tuple[Observation, ...]:
         """Split frames that show the star at different places or orientations.
@@ -299,9 +223,7 @@ class Observation:
                 "Date (UTC)": None if self.date is None else self.date.isot[:19],
                 "Frames": f"{len(self)} of {nx} x {ny} pixels, {self.unit}",
                 "Pixels used": f"{100 * self.valid.mean():.1f} %",
-                "Position angle of +y": (
-                    None if self.position_angles is None else f"{self.position_angle:.2f} deg"
-                ),
+                "Position angle of +y": None if self.north is None else f"{self.north:.2f} deg",
             },
         )
 
@@ -322,9 +244,14 @@ class Observation:
         return instrument_of(self.header, self.name) == "NIRCAM"
 
     @property
+    def north(self) -> float | None:
+        """Position angle of the first frame's +y axis, degrees east of north; None if not known."""
+        return None if self.position_angles is None else float(self.position_angles[0])
+
+    @property
     def position_angle(self) -> float:
-        """Position angle of the first frame's +y axis, degrees east of north; 0 if not known."""
-        return 0.0 if self.position_angles is None else float(self.position_angles[0])
+        """As `north`, but 0 if it is not known."""
+        return self.north or 0.0
 
     def roll_from(self, other: Observation) -> float:
         """Angle by which the sky is rotated with respect to another observation.

@@ -17,9 +17,8 @@ from pyklip_diffrender.scene.admission import (
     EPOCH,
     choose_filter,
     choose_target,
-    compare_brightness,
-    compare_orientation,
     epochs_of,
+    exclude_contradicting,
     exclude_copies,
     exclude_other_setups,
     exclude_unoriented,
@@ -34,6 +33,7 @@ from pyklip_diffrender.scene.frame_files import (
     require_some,
 )
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.pixel_checks import why_other_brightness, why_turned
 
 __all__ = ["Sequence"]
 
@@ -230,9 +230,9 @@ class Sequence:
         frames = {id(each): each.read() for each in together if not each.reason}
         judge_frames([each for each in together if not each.reason], frames)
         exclude_copies(together, frames)
-        compare_orientation(together, frames)
+        exclude_contradicting(together, frames, why_turned)
         for group in (science, *_by_star(others)):
-            compare_brightness(group, frames)
+            exclude_contradicting(group, frames, why_other_brightness)
         exclude_unoriented(science)
         if all(each.reason for each in science):
             reasons = "; ".join(f"{each.name}: {each.reason}" for each in science)

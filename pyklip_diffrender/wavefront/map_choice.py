@@ -105,7 +105,7 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
         )
     # Once if a map is of exactly that date.
     chosen = [read_opd(path) for _, path in sorted(set(filter(None, wanted)))]
-    notes = [_age(opd, when) for opd in chosen]
+    notes = [f"{opd.name}, {opd.age(when)}" for opd in chosen]
     for opd in chosen:
         _warn_if_outdated(opd, when)
     opd = chosen[0] if len(chosen) == 1 else _interpolated(chosen[0], chosen[1], when)
@@ -204,11 +204,6 @@ def _interpolated(before: OPDMap, after: OPDMap, when: Time) -> OPDMap:
     npix = max(before.shape[0], after.shape[0])
     before, after = (replace(opd, data=resample(opd.data, npix)) for opd in (before, after))
     return interpolate_wss(before, after, when)
-
-
-def _age(opd: OPDMap, when: Time) -> str:
-    days = opd.days_after(when) or 0.0
-    return f"{opd.name}, {abs(days):.1f} days {'after' if days > 0 else 'before'}"
 
 
 def _warn_if_outdated(opd: OPDMap, when: Time) -> None:

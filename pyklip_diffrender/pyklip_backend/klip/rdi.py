@@ -17,10 +17,6 @@ def klip_rdi(
     references: NDArray[np.float64],
     *,
     numbasis: int = 9,
-    annuli: int = 5,
-    subsections: int = 4,
-    inner: float = 1.0,
-    wavelength: float = 4.5e-6,
 ) -> NDArray[np.float64]:
     """Subtract the star with pyKLIP's reference differential imaging.
 
@@ -32,17 +28,11 @@ def klip_rdi(
         Frames of a reference star.
     numbasis : int
         Karhunen-Loeve modes.
-    annuli, subsections : int
-        See `pyklip.parallelized.klip_dataset`.
-    inner : float
-        Inner working angle, pixels.
-    wavelength : float
-        m.
 
     Returns
     -------
     ndarray, (ny, nx)
-        The subtracted frame; NaN inside `inner` and outside the largest annulus.
+        The subtracted frame; NaN in the innermost pixel and outside the largest annulus.
     """
     from pyklip import rdi
     from pyklip.instruments.Instrument import GenericData
@@ -56,8 +46,8 @@ def klip_rdi(
         target[None].copy(),
         center[None],
         parangs=np.zeros(1),
-        wvs=np.array([wavelength]),
-        IWA=inner,
+        wvs=np.array([4.5e-6]),
+        IWA=1.0,
         filenames=names[:1],
     )
     # pyKLIP prints messages and a progress bar.
@@ -73,8 +63,8 @@ def klip_rdi(
             mode="RDI",
             outputdir=folder,
             fileprefix="klip",
-            annuli=annuli,
-            subsections=subsections,
+            annuli=5,
+            subsections=4,
             numbasis=[numbasis],
             movement=0,
             psf_library=library,
