@@ -104,12 +104,12 @@ def test_options_of_a_sequence_come_before_those_of_all(tmp_path: Path) -> None:
     assert set(run_survey(config, tmp_path / "out", stub)["status"]) == {"finished"}
 
 
-def test_whole_frames_and_disks_are_asked_for_by_sequence(tmp_path: Path) -> None:
+def test_whole_frames_disks_and_completeness_are_asked_for_by_sequence(tmp_path: Path) -> None:
     config = inputs(tmp_path, 1)
     plain = config["sequence"][0]
-    config["sequence"] += [{**plain, "name": n, n: True} for n in ("wide", "disk")]
+    config["sequence"] += [{**plain, "name": n, n: True} for n in ("wide", "disk", "completeness")]
     keys = {job.key for job in planned(config)}
-    assert len(keys) == 3
+    assert len(keys) == 4
     assert planned({**config, "sequence": [plain]})[0].key in keys
     star = planned({**config, "sequence": [{**plain, "star_flux": 0.4}]})[0]
     assert (star.options.star_flux, star.options.star_flux_error) == (0.4, 0.05)

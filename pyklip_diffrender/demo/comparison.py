@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pyklip_diffrender.detection import Detection, detect
 from pyklip_diffrender.detection.metrics import annulus_snr, star_model_error, throughput
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
-from pyklip_diffrender.io.files import replacing, write_fits
+from pyklip_diffrender.io.files import write_fits, write_table
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pyklip_backend.klip import klip_rdi
 from pyklip_diffrender.refinement import Refinement, refine
@@ -204,6 +204,5 @@ def write_demo(result: DemoResult, folder: Path) -> list[Path]:
     write_fits(hdus, images)
     tables = {"demo.ecsv": result.table, "candidates.ecsv": result.detection.candidates}
     for name, table in tables.items():
-        with replacing(folder / name) as temporary:
-            table.write(temporary, format="ascii.ecsv", overwrite=True)
+        write_table(table, folder / name)
     return [images, *(folder / name for name in tables)]

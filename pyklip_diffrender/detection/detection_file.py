@@ -21,7 +21,7 @@ from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group, groups_of
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.files import replacing, require_new, write_fits
+from pyklip_diffrender.io.files import require_new, write_fits, write_table
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.fit_file import (
     image,
@@ -231,8 +231,7 @@ def write_detection(detection: Any, folder: Path, *, overwrite: bool) -> list[Pa
     require_new([maps, *tables, positions], overwrite)
     write_fits(_hdus_of(detection), maps)
     for path, table in tables.items():
-        with replacing(path) as temporary:
-            table.write(temporary, format="ascii.ecsv", overwrite=True)
+        write_table(table, path)
     if detection.sky.north is None or detection.sky.mjd is None:
         positions.unlink(missing_ok=True)
         return [maps, *tables]

@@ -20,7 +20,7 @@ from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.figure import draw_search
 from pyklip_diffrender.detection.search_result import Detection
-from pyklip_diffrender.io.files import replacing, require_new, write_fits
+from pyklip_diffrender.io.files import require_new, write_fits, write_table
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
@@ -162,6 +162,5 @@ class WideField:
         )
         write_fits(hdus, written[0])
         for path, table in tables.items():
-            with replacing(path) as temporary:
-                table.write(temporary, format="ascii.ecsv", overwrite=True)
+            write_table(table, path)
         return written

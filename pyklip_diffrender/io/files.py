@@ -27,7 +27,15 @@ from pyklip_diffrender.errors import (
     MissingFileError,
 )
 
-__all__ = ["embedded_table", "open_fits", "replacing", "require_new", "sha256", "write_fits"]
+__all__ = [
+    "embedded_table",
+    "open_fits",
+    "replacing",
+    "require_new",
+    "sha256",
+    "write_fits",
+    "write_table",
+]
 
 _GZIP = b"\x1f\x8b"
 
@@ -163,6 +171,12 @@ def write_fits(hdus: fits.HDUList, path: str | os.PathLike[str]) -> None:
 def sha256(path: str | os.PathLike[str]) -> str:
     """Hash of a file's bytes, for provenance."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def write_table(table: Table, path: Path) -> None:
+    """Write a table as ECSV, whole or not at all; an existing file is replaced."""
+    with replacing(path) as temporary:
+        table.write(temporary, format="ascii.ecsv", overwrite=True)
 
 
 def embedded_table(name: str) -> Table:

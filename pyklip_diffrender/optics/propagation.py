@@ -211,12 +211,15 @@ class Propagation:
 
     def propagate(self, wavefront: Wavefront, values: Values) -> Tensor:
         """Field on the detector's samples from the field behind the entrance pupil; linear."""
-        windows = self.windows(values)
         if self._lattice is not None:
-            return self._lattice.field(wavefront, values, windows)
-        for plane, onto in zip(self.planes, windows, strict=True):
+            return self._lattice.field(wavefront, values, self.windows(values))
+        return self.detector.field(self.behind_planes(wavefront, values), values)
+
+    def behind_planes(self, wavefront: Wavefront, values: Values) -> Wavefront:
+        """The wavefront behind the last plane, one plane after the other."""
+        for plane, onto in zip(self.planes, self.windows(values), strict=True):
             wavefront = plane.apply(wavefront, values, onto)
-        return self.detector.field(wavefront, values)
+        return wavefront
 
     def plane_waves(self, wavefront: Wavefront, values: Values, reach: int) -> PlaneWaves | None:
         """Prepare the propagation of a field behind the entrance pupil times plane waves.
@@ -285,8 +288,7 @@ class Propagation:
         values = self.values(parameters)
         with torch.no_grad():
             wavefront = self.pupil_field(self.opd(opd), self.bandpass.mean_wavelength, values)
-            for plane, onto in zip(open_path.planes, open_path.windows(values), strict=True):
-                wavefront = plane.apply(wavefront, values, onto)
+            wavefront = open_path.behind_planes(wavefront, values)
         power = wavefront.field.abs().double().square().sum(dim=(-2, -1))
         return float(power * wavefront.grid.spacing**2)
 

@@ -63,9 +63,7 @@ def _exit_light(
 ) -> Tensor:
     """Share of the light that reaches the last pupil."""
     values = system.values(parameters)
-    wavefront = system.pupil_field(opd, wavelength, values)
-    for plane, onto in zip(system.planes, system.windows(values), strict=True):
-        wavefront = plane.apply(wavefront, values, onto)
+    wavefront = system.behind_planes(system.pupil_field(opd, wavelength, values), values)
     light: Tensor = (wavefront.field.abs() ** 2).sum() * wavefront.grid.spacing**2
     return light
 

@@ -311,9 +311,8 @@ class OpticalSystem(Propagation):
             checked, values = self.opd(opd), self.values({})
             wavefront = self.pupil_field(checked, wavelength, values)
             first = self._amplitude(wavefront)
-            for plane, onto in zip(self.planes, self.windows(values), strict=True):
-                wavefront = plane.apply(wavefront, values, onto)
-            behind = (self._amplitude(wavefront) / first.max()) ** 2
+            last_pupil = self.behind_planes(wavefront, values)
+            behind = (self._amplitude(last_pupil) / first.max()) ** 2
             light = self(checked).double().cpu().numpy()
             map_ = 1e9 * checked.real.double().cpu().numpy()
             x, y = (

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.io.files import replacing
+from pyklip_diffrender.io.files import replacing, write_table
 from pyklip_diffrender.reduction.overview import Klip, Overview
 from pyklip_diffrender.reduction.page import page
 from pyklip_diffrender.reduction.pictures import (
@@ -86,8 +86,7 @@ def write_products(
     for name, table in tables.items():
         if table is not None:
             written.append(folder / f"{name}.ecsv")
-            with replacing(written[-1]) as temporary:
-                table.write(temporary, format="ascii.ecsv", overwrite=True)
+            write_table(table, written[-1])
     overview = Overview(SkyImages(reduction), Klip.of(reduction))
     written.append(overview.images.write(folder / "images.fits"))
     written.append(folder / "detection.png")

@@ -20,6 +20,9 @@ from pyklip_diffrender.wavefront.map_choice import wavefront_for
 
 __all__ = ["Injection", "Job", "jobs_of"]
 
+_SWITCHES = ("wide", "disk", "completeness")
+"""Options that are named in the key of a job where they are on."""
+
 _SUFFIXES = (".fits", ".fits.gz")
 
 
@@ -178,7 +181,7 @@ def _job(
         ),
         "settings": dict(sequence.options.settings),
         # Only where they are used, so that jobs of configurations without them keep their names.
-        **{name: True for name in ("wide", "disk") if getattr(sequence.options, name)},
+        **{name: True for name in _SWITCHES if getattr(sequence.options, name)},
         **({} if star is None else {"star_flux": [star, sequence.options.star_flux_error]}),
         **({} if epoch is None else {"epoch": epoch}),
     }
