@@ -125,6 +125,10 @@ def _write_tables(app):
         (folder / f"{name}.txt").write_text(text + "\n", encoding="utf-8")
 
 
+_NUMBER = re.compile(r"(\(?[+-]?(?<![\w.])\d[\d.]*(?:e-?\d+)?(?: \+- [\d.e-]+)?(?: %)?\)?)(?!\w)")
+"""Numbers in tables, with error, percent sign and brackets, which a line must not break."""
+
+
 def _mark_short_cells(app, doctree):
     """Tell the style sheet which cells and numbers of tables are not broken."""
     for cell in doctree.findall(entry):
@@ -132,7 +136,7 @@ def _mark_short_cells(app, doctree):
             cell["classes"].append("short")
             continue
         for text in list(cell.findall(Text)):
-            pieces = re.split(r"(\(?\d[\d.]*e-\d+\)?)", text)
+            pieces = _NUMBER.split(text)
             if len(pieces) > 1:
                 whole = [
                     inline("", piece, classes=["number"]) if k % 2 else Text(piece)
