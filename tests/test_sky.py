@@ -292,9 +292,7 @@ def test_the_epoch_is_the_middle_of_the_exposures(tmp_path: Path) -> None:
     assert first.mid_date is not None
     assert first.mid_date.mjd == REAL["EXPMID"]
     frames = [fitted(first), fitted(later)]
-    fit = SimpleNamespace(
-        frames=frames, settings=dr.GaussNewton(), initial=dr.random_opd(1, npix=128)
-    )
+    fit = SimpleNamespace(frames=frames, catalogue_error=None, initial=dr.random_opd(1, npix=128))
     fits_ = cast("Any", [fit])
     sky = Sky.of(fits_)
     assert sky.mjd == pytest.approx((REAL["EXPMID"] + 59855 + 16 / 24) / 2, abs=1e-8)
