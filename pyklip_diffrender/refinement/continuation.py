@@ -137,4 +137,5 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
         for frame in fit.frames
     ]
     with breakdown_explained(problems[0].observation.name):
-        return fit_in_stages(problems, settings, warm, seed=fit.seed, progress=progress)
+        again = fit_in_stages(problems, settings, warm, seed=fit.seed, progress=progress)
+    return replace(again, catalogue_error=fit.catalogue_error)
