@@ -3,11 +3,12 @@
 import csv
 import hashlib
 import os
+import re
 from pathlib import Path
 
 import click
 import latex2mathml.converter
-from docutils.nodes import SkipNode, entry
+from docutils.nodes import SkipNode, Text, entry, inline
 from numpydoc.xref import DEFAULT_LINKS
 
 import pyklip_diffrender
@@ -125,10 +126,19 @@ def _write_tables(app):
 
 
 def _mark_short_cells(app, doctree):
-    """Tell the style sheet which cells of tables are too short to be broken."""
+    """Tell the style sheet which cells and numbers of tables are not broken."""
     for cell in doctree.findall(entry):
         if len(cell.astext()) < 10:
             cell["classes"].append("short")
+            continue
+        for text in list(cell.findall(Text)):
+            pieces = re.split(r"(\(?\d[\d.]*e-\d+\)?)", text)
+            if len(pieces) > 1:
+                whole = [
+                    inline("", piece, classes=["number"]) if k % 2 else Text(piece)
+                    for k, piece in enumerate(pieces)
+                ]
+                text.parent.replace(text, whole)
 
 
 def setup(app):

@@ -83,7 +83,7 @@ def run_obs(
     Parameters
     ----------
     database : spaceKLIP.database.Database
-        With stage-2 frames (calints) of a round NIRCam coronagraph in which the star is at
+        With stage-2 frames (calints) of a NIRCam coronagraph in which the star is at
         STARCENX, STARCENY: aligned ones, usually. Other concatenations are skipped.
     opd : path, OPDMap, Quantity or array
         The wavefront to start from; see `DiffrenderSettings`. Of a folder of maps, the one nearest
