@@ -9,10 +9,10 @@ from typing import Any
 
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.annealing import Annealing
-from pyklip_diffrender.refinement.breakdown import breakdown_explained
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.settings import GaussNewton
+from pyklip_diffrender.refinement.status import breakdown_explained
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
