@@ -93,7 +93,6 @@ def fitted(
 
 def reached(fit: Refinement) -> list[float]:
     assert fit.status.usable
-    assert fit.frames[0].coefficients is not None
     assert np.any(fit.frames[0].coefficients != 0)
     return [fit.chi2_per_pixel, *fit.frames[0].values["star_offset"], fit.frames[0].flux]
 

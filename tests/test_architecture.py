@@ -218,25 +218,14 @@ GUARDED = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from {}"
 @pytest.mark.parametrize(
     ("path", "text", "complaint"),
     [
-        ("io/units.py", "from pyklip_diffrender.wavefront.opd import drift", "wavefront comes"),
-        ("optics/a.py", "import pyklip_diffrender.cli", "cli comes after optics"),
-        ("reduction.py", "from pyklip_diffrender.bridges import from_poppy", "bridges comes after"),
-        ("wavefront/a.py", "import stpsf", "only bridges and wavefront.sensing may import stpsf"),
-        ("optics/a.py", "from ..instrument import nircam", "instrument comes after optics"),
         ("optics/a.py", "from .. import errors, instrument", "instrument comes after optics"),
         ("optics/a.py", "def f():\n    from pyklip_diffrender import cli", "a.py:2: cli comes"),
-        ("optics/fast/a.py", "from ...detection import metrics", "detection comes after optics"),
-        ("optics/a.py", "import pyklip_diffrender as dr", "instead of the module it is in"),
         ("optics/a.py", "from pyklip_diffrender import Scene", "instead of the module it is in"),
-        ("io/a.py", "from pyklip_diffrender import __version__", "instead of the module it is in"),
-        ("demo.py", "import pyklip.parallelized as p", "only pyklip_backend may import pyklip"),
+        ("wavefront/a.py", "import stpsf", "only bridges and wavefront.sensing may import stpsf"),
         ("demo.py", "from importlib import import_module\nimport_module('pyklip.fm')", "demo.py:2"),
-        ("io/a.py", "try:\n    import stpsf\nexcept ImportError:\n    pass", "only bridges"),
         ("cli.py", "import os, matplotlib.pyplot as plt", "only drawing may import matplotlib"),
         ("novelty.py", "", "not in PACKAGES"),
-        ("io/a.py", METHOD.format("from pyklip_diffrender import drawing"), "drawing comes after"),
         ("io/a.py", GUARDED.format("pyklip_diffrender.demo import Demo"), "demo comes after io"),
-        ("io/a.py", METHOD.format("from matplotlib import pyplot"), "only drawing may import"),
         (
             "reduction/reduction_result.py",
             METHOD.format("from ..cli import main"),
@@ -248,22 +237,6 @@ def test_a_planted_violation_is_found(path: str, text: str, complaint: str) -> N
     found = violations({Path(path): text})
     assert len(found) == 1
     assert complaint in found[0]
-
-
-@pytest.mark.parametrize(
-    ("path", "text"),
-    [
-        ("optics/a.py", "import torch\nfrom pyklip_diffrender.errors import ShapeError"),
-        ("optics/a.py", "from .stops import Stop\nfrom ..optics import lyot"),
-        ("pyklip_backend/a.py", "import pyklip.fm\nfrom ..errors import ShapeError"),
-        ("drawing/a.py", "def f():\n    from matplotlib import pyplot"),
-        ("optics/a.py", "from pyklip_diffrender import drawing"),
-        ("bridges/a.py", "import poppy\nimport stpsf"),
-        ("wavefront/sensing.py", "import stpsf"),
-    ],
-)
-def test_what_is_allowed_is_not_reported(path: str, text: str) -> None:
-    assert violations({Path(path): text}) == []
 
 
 def test_one_circle_is_allowed_and_only_inside_a_method() -> None:

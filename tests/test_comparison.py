@@ -142,6 +142,16 @@ def test_the_page_has_a_table_of_candidates_over_filters(tmp_path: Path) -> None
     assert len(json.loads(data.read_text(encoding="utf-8"))["sources"]) == 2
 
 
+def dry_run(folder: Path) -> list[str]:
+    """Arguments of a dry run on frames in a folder, with a wavefront map that is made here."""
+    opd = folder / "opd.fits"
+    hdu = fits.PrimaryHDU(np.random.default_rng(1).normal(0, 30, (64, 64)))
+    hdu.header["BUNIT"] = "nm"
+    hdu.writeto(opd)
+    frames, output = str(folder / "frames"), str(folder / "out")
+    return ["reduce", frames, "--opd", str(opd), "-o", output, "--dry-run"]
+
+
 def test_the_command_shows_every_epoch_and_every_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -149,11 +159,7 @@ def test_the_command_shows_every_epoch_and_every_file(
     calints(frames / "a.fits")
     calints(frames / "b.fits", observation=2, date="2023-12-01T06:00:00", roll=90.0)
     calints(frames / "ta.fits", observation=3, cards={"EXP_TYPE": "NRC_TACQ"})
-    opd = tmp_path / "opd.fits"
-    hdu = fits.PrimaryHDU(np.random.default_rng(1).normal(0, 30, (64, 64)))
-    hdu.header["BUNIT"] = "nm"
-    hdu.writeto(opd)
-    options = ["reduce", str(frames), "--opd", str(opd), "-o", str(tmp_path / "out"), "--dry-run"]
+    options = dry_run(tmp_path)
     assert main(options) == 0
     shown = capsys.readouterr().out
     assert "2022-10-03, one of 2 reductions" in shown
@@ -173,11 +179,7 @@ def test_the_command_takes_every_filter_of_the_target(
     # A filter of a reference star alone.
     alone = {"FILTER": "F300M", "IS_PSF": True, "ACT_ID": "08"}
     calints(frames / "c.fits", "HD 2", observation=2, cards=alone)
-    opd = tmp_path / "opd.fits"
-    hdu = fits.PrimaryHDU(np.random.default_rng(1).normal(0, 30, (64, 64)))
-    hdu.header["BUNIT"] = "nm"
-    hdu.writeto(opd)
-    options = ["reduce", str(frames), "--opd", str(opd), "-o", str(tmp_path / "out"), "--dry-run"]
+    options = dry_run(tmp_path)
     assert main(options) == 0
     shown = capsys.readouterr().out
     assert "\nF444W, one of 2 reductions:" in shown

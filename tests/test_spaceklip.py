@@ -321,7 +321,7 @@ def test_a_catalogues_star_is_that_of_the_search(
 
     def with_star_flux(fit: Refinement, jansky: float, error: float) -> Refinement:
         tied.append((jansky, error))
-        return replace(fit, settings=replace(fit.settings, star_flux_error=error))
+        return replace(fit, catalogue_error=error)
 
     monkeypatch.setattr(run, "with_star_flux", with_star_flux)
     detections = spaceklip.run_obs(

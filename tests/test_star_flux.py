@@ -59,8 +59,7 @@ def test_without_a_map_the_star_is_less_certain(
 ) -> None:
     flat = as_opd_map("flat")
     assert star_flux_error(replace(fit, initial=flat)) == 0.4
-    known = replace(SETTINGS, star_flux_error=0.05)
-    assert star_flux_error(replace(fit, initial=flat, settings=known)) == 0.05
+    assert star_flux_error(replace(fit, initial=flat, catalogue_error=0.05)) == 0.05
     # A reduction says so, unless the flux is given.
     observation = fit.frames[0].observation
     header = observation.header.copy()

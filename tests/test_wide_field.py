@@ -98,7 +98,7 @@ def test_contrasts_outside_have_the_error_of_the_stars_flux_as_well(
 ) -> None:
     detection, frames = searched
     (fit,) = detection.fits
-    uncertain = replace(fit, settings=replace(fit.settings, star_flux_error=0.1))
+    uncertain = replace(fit, catalogue_error=0.1)
     again = wide_field(replace(detection, fits=(uncertain,)), frames).candidates
     outside = np.isfinite(again["fit_chi2"])
     assert outside.any()

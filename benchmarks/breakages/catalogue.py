@@ -167,7 +167,7 @@ def _frames_and_files() -> list[Breakage]:
         Breakage(
             "roll-sign", "the sky turns on the detector against the telescope's roll",
             "return half_circle(other.position_angle - self.position_angle)",
-            "return half_circle(self.position_angle - other.position_angle)", "observation",
+            "return half_circle(self.position_angle - other.position_angle)", "sequence",
         ),
         Breakage(
             "header-roll", "the position angle of +y follows from ROLL_REF and V3I_YANG",

@@ -22,8 +22,12 @@ from pyklip_diffrender.bridges.image_masks import (
     SeparablePart,
     padded_pupil,
 )
-from pyklip_diffrender.bridges.orientation import Orientation
-from pyklip_diffrender.bridges.plane_turns import free_turn, is_quarter_turn, turns_behind
+from pyklip_diffrender.bridges.orientation import (
+    Orientation,
+    free_turn,
+    is_quarter_turn,
+    turns_behind,
+)
 from pyklip_diffrender.bridges.rotation import FreeRotation
 from pyklip_diffrender.bridges.sampled_planes import (
     Gain,

@@ -294,7 +294,7 @@ def _fit_beside(path: Path) -> Refinement:
             "the same folder. Pass the fit that was searched: Detection.read(path, fit=fit)"
         )
     fit = Refinement.read(file)
-    if fit.linear is None:
+    if fit.stored_linear is None:
         raise IncompatibleSetupError(
             f"{file}: measurements need the linear model of the fit, and this file has none. Write "
             "the reduction with derivatives=True (--derivatives), or pass the fit that was "

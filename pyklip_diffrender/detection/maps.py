@@ -13,7 +13,6 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.io.progress import ProgressBar
-from pyklip_diffrender.refinement import GaussNewton
 
 __all__ = ["Maps"]
 
@@ -104,11 +103,7 @@ class Maps:
         models = sum(
             4.0 * frame.jacobian.numel() for linear, _ in self.groups for frame in linear.frames
         )
-        return min(
-            templates.fit.settings.memory_beside(models)
-            for _, templates in self.groups
-            if isinstance(templates.fit.settings, GaussNewton)
-        )
+        return min(each.fit.settings.memory_beside(models) for _, each in self.groups)
 
     def _batches(self, name: str) -> Iterator[tuple[int, slice, dict[int, Tensor]]]:
         """Index of the group, flat indices of pixels, and their templates by frame."""

@@ -190,9 +190,8 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
 def _fitted(subtraction: Subtraction) -> Iterator[str]:
     """The settings of the fits, their companions, and the star of every pointing, in words."""
     for result in dict.fromkeys(part.result for part in subtraction.pointings):
-        settings = result.settings
-        numbers = (f"{name} {getattr(settings, name, None)}" for name in ("cycles", "tolerance"))
-        yield f"fit: free {', '.join(getattr(settings, 'free', ()))}, {', '.join(numbers)}"
+        free, settings = ", ".join(result.settings.free), result.settings
+        yield f"fit: free {free}, cycles {settings.cycles}, tolerance {settings.tolerance}"
         for contrast, x, y in result.companions:
             yield f"companion: contrast {contrast:.3g} at x {x:.4f}, y {y:.4f} arcsec from the star"
     for part in subtraction.pointings:

@@ -40,7 +40,7 @@ def require_plausible(name: str, result: Refinement, limit: float | None) -> Non
     ------
     RefinementError
     """
-    from pyklip_diffrender.refinement.breakdown import WHAT_TO_CHECK
+    from pyklip_diffrender.refinement.status import WHAT_TO_CHECK
 
     if not result.status.usable:
         raise RefinementError(f"{name}: {result.status.message}", result)

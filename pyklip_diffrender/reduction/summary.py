@@ -20,7 +20,7 @@ from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.pattern import pattern_size
 from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.words import advice, sentence
-from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement
+from pyklip_diffrender.refinement import FrameFit, Refinement
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["summarise", "wavefronts"]
@@ -160,8 +160,7 @@ def _star(detection: Detection) -> dict[str, Any] | None:
     if detection.sky.star is None:
         return None
     value, error = detection.sky.star
-    settings = detection.fits[0].settings
-    known = isinstance(settings, GaussNewton) and "flux" in settings.deviations
+    known = "flux" in detection.fits[0].settings.deviations
     return {
         "flux_density_Jy": value,
         "flux_density_error_Jy": error,

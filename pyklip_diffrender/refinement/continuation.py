@@ -9,10 +9,10 @@ from typing import Any
 
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.annealing import Annealing
-from pyklip_diffrender.refinement.breakdown import breakdown_explained
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.settings import GaussNewton
+from pyklip_diffrender.refinement.status import breakdown_explained
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
@@ -137,4 +137,5 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
         for frame in fit.frames
     ]
     with breakdown_explained(problems[0].observation.name):
-        return fit_in_stages(problems, settings, warm, seed=fit.seed, progress=progress)
+        again = fit_in_stages(problems, settings, warm, seed=fit.seed, progress=progress)
+    return replace(again, catalogue_error=fit.catalogue_error)

@@ -48,7 +48,7 @@ Image = NDArray[np.float64]
 _ARRAYS = ("companions", "companion_errors")
 _PLAIN = (
     "settings", "basis", "chi2_per_pixel", "model_error", *_ARRAYS, "scales", "prior_ratios",
-    "effective_parameters", "log_evidence", "history", "seconds", "seed",
+    "effective_parameters", "log_evidence", "history", "seconds", "seed", "catalogue_error",
 )  # fmt: skip
 """Attributes of a refinement that are written as text."""
 
@@ -94,6 +94,8 @@ class Refinement:
         One entry for each iteration.
     seconds : float
     seed : int
+    catalogue_error : float or None
+        Relative error of the star's flux if a catalogue has stated it, see `star_flux_error`.
 
     Examples
     --------
@@ -131,6 +133,7 @@ class Refinement:
     history: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = math.nan
     seed: int = 0
+    catalogue_error: float | None = None
 
     def __repr__(self) -> str:
         count = len(self.frames)

@@ -15,11 +15,11 @@ from pyklip_diffrender.errors import (
     ShapeError,
 )
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.refinement.breakdown import breakdown_explained
 from pyklip_diffrender.refinement.continuation import fit_in_stages
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
+from pyklip_diffrender.refinement.status import breakdown_explained
 from pyklip_diffrender.scene.agreement import require_agreement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics

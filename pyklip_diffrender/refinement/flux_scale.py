@@ -143,19 +143,19 @@ def with_star_flux(
         scale = jansky_per_unit(frame)
         assert scale is not None
         frames.append(replace(frame, start={**frame.start, "flux": star_flux / scale}))
-    changes = {"deviations": {**fit.settings.deviations, "flux": held}, "star_flux_error": error}
-    return refine_again(replace(fit, frames=tuple(frames)), progress=progress, **changes)
+    deviations = {**fit.settings.deviations, "flux": held}
+    known = replace(fit, frames=tuple(frames), catalogue_error=error)
+    return refine_again(known, progress=progress, deviations=deviations)
 
 
 def star_flux_error(fit: Refinement) -> float:
     """Relative error of the star's flux that is not in the fit's own covariance.
 
-    The error in the settings; by default 10 % for real frames (40 % without a wavefront map), and 0
-    for others.
+    That of the catalogue, if there is one. Otherwise 10 % for real frames, where only diffracted
+    light tells how bright the star is (40 % without a wavefront map), and 0 for others.
     """
-    known = fit.settings.star_flux_error
-    if known is not None:
-        return known
+    if fit.catalogue_error is not None:
+        return fit.catalogue_error
     if not fit.frames[0].observation.is_nircam:
         return 0.0
     return _UNTIED if fit.initial.data.any() else _WITHOUT_MAP

@@ -49,7 +49,7 @@ class FrameFit:
         fitted), in the units of the parameter table.
     gain : ndarray, (ny, nx)
         Known flat-field pattern, which multiplies the star; 1 without systematics.
-    coefficients : ndarray or None
+    coefficients : ndarray, (modes,)
         Coefficients of the wavefront modes, nm.
     """
 
@@ -62,7 +62,7 @@ class FrameFit:
     values: dict[str, Image]
     errors: dict[str, Image]
     gain: Image
-    coefficients: NDArray[np.float64] | None = None
+    coefficients: NDArray[np.float64]
 
     def __repr__(self) -> str:
         return f"<FrameFit: {self.observation.name}, flux {self.flux:.4g}>"
@@ -198,7 +198,6 @@ class FrameFit:
             {name: np.atleast_1d(value).astype(float) for name, value in facts[key].items()}
             for key in ("values", "errors")
         )
-        has_coefficients = ("COEFFICIENTS", k + 1) in hdus
         return cls(
             model=model,
             observation=observation_of(hdus, facts["observation"], k),
@@ -209,7 +208,7 @@ class FrameFit:
             values=values,
             errors=errors,
             gain=image(hdus, "GAIN", k),
-            coefficients=image(hdus, "COEFFICIENTS", k) if has_coefficients else None,
+            coefficients=image(hdus, "COEFFICIENTS", k),
         )
 
 

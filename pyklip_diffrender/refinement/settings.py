@@ -117,10 +117,6 @@ class GaussNewton:
     robust : float
         Residuals of this many standard deviations get half weight (Cauchy's loss); inf for plain
         least squares.
-    star_flux_error : float, optional
-        Relative error of the star's flux that errors of contrasts include besides that of the fit.
-        Default 0.1 for real frames, where only diffracted light tells how bright the star is
-        (0.4 if they are fitted without a wavefront map), and 0 for others.
     memory : float, str or Quantity, optional
         Memory that the process should take, bytes or such as "2 GB", of which it needs 1.3 GB
         for itself. Derivatives that do not fit are computed in parts whenever they are needed,
@@ -163,7 +159,6 @@ class GaussNewton:
     relinearise: float = 0.05
     accurate_steps: bool = False
     robust: float = math.inf
-    star_flux_error: float | None = None
     memory: float | None = None
 
     def __post_init__(self) -> None:
@@ -204,7 +199,7 @@ class GaussNewton:
             "response_wavelengths", "companion_threshold", "drift_cycles",
         )  # fmt: skip
         require_positive(**{name: getattr(self, name) for name in positive})
-        for name in ("min_model_error", "max_companions", "star_flux_error"):
+        for name in ("min_model_error", "max_companions"):
             value = getattr(self, name)
             if value is not None and not value >= 0:
                 raise IncompatibleSetupError(
