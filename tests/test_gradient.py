@@ -76,28 +76,38 @@ def gradient(solver: Solver, state: State, *, exact: bool) -> Tensor:
     return equations.gradient - equations.curvature @ equations.current
 
 
+def slope_along(solver: Solver, state: State, direction: Tensor, step: float = 1e-4) -> float:
+    """Minus half the derivative of chi-squared along a direction, by differences."""
+    weights = solver.objective.errors(state, 0.01, 4.0)
+    ahead, behind = (
+        solver.objective.chi2(
+            solver.objective.at(state.unknowns, state.vector + sign * step * direction), weights
+        )
+        for sign in (1, -1)
+    )
+    return -(ahead - behind) / (4 * step)
+
+
+def units(solver: Solver, state: State) -> Tensor:
+    """Prior deviations of the unknowns, and values of those without one."""
+    unit = solver.prior_deviation(state.unknowns)
+    return torch.where(torch.isfinite(unit), unit, state.vector.abs()).clamp(max=1e6)
+
+
 @pytest.mark.parametrize("frames", [1, 2])
 def test_the_gradient_is_that_of_chi_squared(frames: int) -> None:
     """Against differences of chi-squared, which have an error of 1e-7 of it in these steps."""
     solver, state = solver_of(frames)
     assert solver.objective.shares_pattern == (frames > 1)
-    objective, unknowns = solver.objective, state.unknowns
-    weights = objective.errors(state, 0.01, 4.0)
     exact, coarse = (gradient(solver, state, exact=value) for value in (True, False))
-    names = [unknown.name for unknown in unknowns.labels()]
+    names = [unknown.name for unknown in state.unknowns.labels()]
     assert {*FREE, "amplitude", "modes"} <= set(names)
     rng = np.random.default_rng(5)
-    unit = solver.prior_deviation(unknowns)
-    unit = torch.where(torch.isfinite(unit), unit, state.vector.abs()).clamp(max=1e6)
+    unit = units(solver, state)
     for name in (*FREE, "amplitude", "modes"):
         which = torch.tensor([each == name for each in names])
         direction = unit * torch.from_numpy(rng.normal(size=len(names))) * which
-        step = 1e-4
-        ahead, behind = (
-            objective.chi2(objective.at(unknowns, state.vector + sign * step * direction), weights)
-            for sign in (1, -1)
-        )
-        slope = -(ahead - behind) / (4 * step)
+        slope = slope_along(solver, state, direction)
         np.testing.assert_allclose(float(exact @ direction), slope, rtol=1e-4, err_msg=name)
         if name == "modes":
             # The coarse one does not pass this test, or there would be no need of the other.
@@ -114,25 +124,40 @@ def of_the_model_itself(solver: Solver) -> Solver:
     )
 
 
-def test_the_gradient_by_companions_is_that_of_chi_squared() -> None:
+@pytest.mark.parametrize("contrast", [3e-4, 0.05])
+def test_the_gradient_by_companions_is_that_of_chi_squared(contrast: float) -> None:
     """Their images are those of the coarse copy, which is the model in this test."""
     solver, state = solver_of(2)
     solver = of_the_model_itself(solver)
-    objective = solver.objective
-    state = objective.at(
-        *state.unknowns.with_companions([dr.Planet(3e-3, 0.4, 20.0)], state.vector)
-    )
-    weights = objective.errors(state, 0.01, 4.0)
+    companion = dr.Planet(contrast, 0.4, 20.0)
+    state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
     exact = gradient(solver, state, exact=True)
     where = state.unknowns.where("companions")
     for place, step in zip(range(where.start, where.stop), (1e-6, 1e-4, 1e-4), strict=True):
         moved = torch.zeros(state.unknowns.size, dtype=torch.float64)
-        moved[place] = step
-        ahead, behind = (
-            objective.chi2(objective.at(state.unknowns, state.vector + sign * moved), weights)
-            for sign in (1, -1)
-        )
-        np.testing.assert_allclose(float(exact[place]), -(ahead - behind) / (4 * step), rtol=1e-3)
+        moved[place] = 1.0
+        slope = slope_along(solver, state, moved, step)
+        np.testing.assert_allclose(float(exact[place]), slope, rtol=1e-3)
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames: int) -> None:
+    """It outshines the star. Neglected, the gradient would be wrong by more than its size."""
+    solver, state = solver_of(frames)
+    solver = of_the_model_itself(solver)
+    companion = dr.Planet(0.05, 0.5, 20.0)
+    state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
+    assert (state.points[0].total - state.points[0].star).sum() > state.points[0].light.sum()
+    exact, copied = (gradient(solver, state, exact=value) for value in (True, False))
+    names = [unknown.name for unknown in state.unknowns.labels()]
+    rng = np.random.default_rng(5)
+    unit = units(solver, state)
+    for name in (*FREE, "amplitude", "modes"):
+        which = torch.tensor([each == name for each in names])
+        direction = unit * torch.from_numpy(rng.normal(size=len(names))) * which
+        slope = slope_along(solver, state, direction)
+        for each in (exact, copied):
+            np.testing.assert_allclose(float(each @ direction), slope, rtol=2e-3, err_msg=name)
 
 
 def test_where_the_copy_is_the_model_both_gradients_are_the_same() -> None:
@@ -152,8 +177,7 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> No
     assert solver.objective.shares_pattern == (frames > 1)
     same = of_the_model_itself(solver)
     rng = np.random.default_rng(6)
-    unit = solver.prior_deviation(state.unknowns)
-    unit = torch.where(torch.isfinite(unit), unit, state.vector.abs()).clamp(max=1e6)
+    unit = units(solver, state)
     step = 0.01 * unit * torch.from_numpy(rng.normal(size=len(unit)))
     curved, products = [], []
     for each in (solver, same):

@@ -25,7 +25,7 @@ from typing import Any
 
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.linear.frames import Unknown
-from pyklip_diffrender.refinement.companions import bright_companions
+from pyklip_diffrender.refinement.companions import bright_companions, with_dominant
 from pyklip_diffrender.refinement.conclusion import conclude
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.mode_priors import ModePriors, count_modes_below
@@ -71,6 +71,9 @@ _MOST_BRIGHT = 8
 
 _ALIGNED = 0.05
 """Gain in chi-squared per pixel below which the wavefront is fitted as well."""
+
+_OUTSHONE = 1.0
+"""Model error, as a fraction of the star, from which something may outshine the star."""
 
 _ANNEALING = 0.6
 """Largest ratio of kappa in successive steps."""
@@ -192,7 +195,7 @@ class Annealing:
 
     def _beginning(self) -> _Course:
         """Where the schedule begins: a fit that continues another one has all its unknowns."""
-        settings, state = self.settings, self._begin
+        settings, state = self.settings, self._with_dominant(self._begin)
         kappa = max(self.objective.model_error(state), settings.min_model_error)
         if self._is_warm and settings.min_model_error:
             # A larger one would lead away from the solution, and back.
@@ -372,6 +375,24 @@ class Annealing:
         return bright_companions(
             self.objective, course.state, course.kappa, most=most, threshold=threshold
         )
+
+    def _with_dominant(self, state: State) -> State:
+        """Add a companion that outshines what the mask leaves of the star, if there is one.
+
+        Without it the star's flux would follow the companion's light.
+        """
+        error = self.objective.model_error(state)
+        is_fixed = self._is_warm or not self.settings.companions_if_stalled
+        if error < _OUTSHONE or is_fixed:
+            return state
+        trial = with_dominant(self.objective, state, error)
+        if trial is not state:
+            trial = self._settled(trial, _COMPANION_STEPS, modes=0)
+            self.solver.damping = 0.0
+        if self.objective.model_error(trial) > error / 2:
+            return state
+        _log.info("a source outshines the star, and is fitted with it")
+        return trial
 
     def _stalling(self, course: _Course) -> list[Planet]:
         """A companion in the residual of a fit of the wavefront that stalled.

@@ -18,7 +18,7 @@ from scipy.signal import fftconvolve
 from pyklip_diffrender.refinement.objective import Objective, State
 from pyklip_diffrender.scene.objects import Planet
 
-__all__ = ["bright_companions", "local_maxima"]
+__all__ = ["bright_companions", "local_maxima", "with_dominant"]
 
 _INNER = 0.35
 """arcsec; closer to the star, the occulter distorts images and the star's errors dominate."""
@@ -94,6 +94,50 @@ def bright_companions(
         ).rotated(-unknowns.roll)
         for peak in local_maxima(snr, allowed, threshold * scatter, size=7)[:most]
     ]
+
+
+def with_dominant(objective: Objective, state: State, kappa: float) -> State:
+    """Add the most significant companion, with levels that follow from star and companion together.
+
+    Parameters
+    ----------
+    objective : Objective
+    state : State
+        Whose companion may outshine what the mask leaves of the star, so that its levels are wrong.
+    kappa : float
+        See `bright_companions`.
+    """
+    added = bright_companions(objective, state, kappa, most=1, threshold=0.0)
+    if not added or state.flux <= 0:
+        return state
+    unknowns, vector = state.unknowns.with_companions(added, state.vector)
+    points = objective.at(unknowns, vector).points
+    problems = [forward.problem for forward in objective.forwards]
+    stars = [problem.gain * point.image for problem, point in zip(problems, points, strict=True)]
+    companions = [
+        (point.total - before.total)
+        / (before.unknowns.level("flux", before.vector) * added[0].contrast)
+        for point, before in zip(points, state.points, strict=True)
+    ]
+    k = [each.shows_companions for each in unknowns.frames].index(True)
+    valid = problems[k].valid
+    columns = torch.stack([stars[k], companions[k], torch.ones_like(stars[k])])[:, valid]
+    flux, light, _ = torch.linalg.lstsq(columns.T, problems[k].data[valid]).solution.tolist()
+    if min(flux, light) <= 0:
+        return state
+    vector = vector.clone()
+    vector[unknowns.where("companions")][-3] = light / flux
+    for frame, part, problem, star, companion in zip(
+        unknowns.frames, unknowns.rows, problems, stars, companions, strict=True
+    ):
+        free = set(frame.linear) - set(frame.deviations)
+        names = tuple(name for name in ("flux", "background") if name in free)
+        flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
+        levels = problem.flux_and_background(star + light / flux * companion, flat, names)
+        for name, level in zip(("flux", "background"), levels, strict=True):
+            if name in names:
+                vector[part.rows[frame.where(name)]] = level
+    return objective.at(unknowns, vector)
 
 
 def local_maxima(

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement.forward import Forward
 from pyklip_diffrender.refinement.mode_priors import ModePriors
+from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.unknowns import FrameUnknowns, Unknowns
 from pyklip_diffrender.wavefront.bases import Basis
@@ -18,6 +20,9 @@ __all__ = ["first_unknowns"]
 
 _PEDESTAL = 0.5
 """Relative prior deviation of the pedestal of a known pattern."""
+
+_BRIGHT = 0.3
+"""Brightness of pixels where the star is bright, relative to its brightest one."""
 
 
 def first_unknowns(
@@ -76,8 +81,19 @@ def _frame_unknowns(
         )
     names = tuple(n for n in settings.free if not (is_known and n == "flux"))
     flux, level = problem.flux_and_background(problem.gain * image, flat, names)
+    if flux <= 0 and "flux" in names:
+        flux = _median_flux(problem, problem.gain * image)
     if is_known:
         deviations["flux"] *= flux
     levels["flux"] = torch.tensor([flux], dtype=torch.float64)
     levels["background"] = torch.tensor([level], dtype=torch.float64)
     return replace(unknowns, start={**unknowns.start, **levels}, deviations=deviations)
+
+
+def _median_flux(problem: Problem, image: Tensor) -> float:
+    """Median of the flux by the pixels where the star is bright.
+
+    Least squares give a negative flux where a companion outshines what the mask leaves of the star.
+    """
+    bright = problem.valid & (image > _BRIGHT * image[problem.valid].max())
+    return float((problem.data[bright] / image[bright]).median())

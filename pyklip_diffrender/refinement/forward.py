@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -108,10 +109,16 @@ class Forward:
         total = star
         if unknowns.shows_companions and len(unknowns.companions):
             for source in unknowns.sources(vector):
-                source_values = self._towards(values, unknowns.turn @ source[1:])
-                with torch.no_grad():
-                    total = total + flux * source[0] * self.model(opd, **source_values).double()
+                total = total + flux * self._companion(unknowns, values, source, opd)
         return Point(unknowns, vector, opd, fields, image, light, star, total)
+
+    def _companion(
+        self, unknowns: FrameUnknowns, values: dict[str, Tensor], source: Tensor, opd: Tensor
+    ) -> Tensor:
+        """Image of a companion, beside a star of flux 1."""
+        towards = self._towards(values, unknowns.turn @ source[1:])
+        with torch.no_grad():
+            return source[0] * self.model(opd, **towards).double()
 
     def sources(self, point: Point, offsets: Tensor) -> Tensor:
         """Images of point sources of contrast 1, (k, ny, nx), in the data's unit.
@@ -135,30 +142,54 @@ class Forward:
     def jacobian(self, point: Point, modes: int) -> Tensor:
         """Derivative of `total`, (unknowns, ny, nx), float32, on the CPU.
 
-        Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront.
+        Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront. The
+        light of faint companions counts as independent of optics and wavefront.
         """
-        unknowns, vector = point.unknowns, point.vector
-        values = unknowns.values(vector)
-        flux, gain = unknowns.level("flux", vector), self.problem.gain
-        levels = self.levels(point)
+        unknowns, levels = point.unknowns, self.levels(point)
         count = unknowns.where("companions").stop
         if modes:
             count = unknowns.where("modes").start + modes
         # One array, filled in place: it is the largest of the fit.
         rows = torch.empty(count, *point.image.shape, dtype=torch.float32)
-        response = self.responses.near(point.opd, values) if modes else None
         first = unknowns.where("companions").stop - len(levels)
         rows[first : first + len(levels)] = levels
+        rows[:first], rows[unknowns.where("companions").stop :] = 0.0, 0.0
+        for fields, values, level in self._lights(point):
+            self._add_slopes(rows, point, fields, values, level, modes)
+        return rows
+
+    def _lights(self, point: Point) -> Iterator[tuple[list[Tensor], dict[str, Tensor], Tensor]]:
+        """Fields, parameters, and level of the star and of bright companions."""
+        unknowns, vector = point.unknowns, point.vector
+        values, flux = unknowns.values(vector), unknowns.level("flux", vector)
+        yield point.fields, values, flux * self.problem.gain
+        for source in unknowns.bright_sources(vector):
+            towards = self._towards(values, unknowns.turn @ source[1:])
+            with torch.no_grad():
+                fields = self.model.fields(point.opd, **towards)
+            yield fields, towards, flux * source[0] * torch.ones_like(self.problem.gain)
+
+    def _add_slopes(
+        self,
+        rows: Tensor,
+        point: Point,
+        fields: list[Tensor],
+        values: dict[str, Tensor],
+        level: Tensor,
+        modes: int,
+    ) -> None:
+        """Add the derivatives of one source by optical parameters, amplitude and wavefront."""
+        unknowns = point.unknowns
+        response = self.responses.near(point.opd, values) if modes else None
         if unknowns.optical:
-            slopes = self.responses.parameters(point.opd, values, unknowns.optical, point.fields)
-            rows[:first] = (flux * gain * slopes).cpu()
+            slopes = self.responses.parameters(point.opd, values, unknowns.optical, fields)
+            rows[: len(slopes)] += (level * slopes).cpu()
         if response is not None:
             amplitude = unknowns.where("amplitude")
-            slopes = response.image(point.fields, values, unknowns.amplitude_modes, modes)
-            slopes *= flux * gain.float()
-            rows[amplitude] = slopes[modes:].cpu()
-            rows[amplitude.stop :] = slopes[:modes].cpu()
-        return rows
+            slopes = response.image(fields, values, unknowns.amplitude_modes, modes)
+            slopes *= level.float()
+            rows[amplitude] += slopes[modes:].cpu()
+            rows[amplitude.stop :] += slopes[:modes].cpu()
 
     def levels(self, point: Point) -> Tensor:
         """Derivative of `total` by levels and companions, (unknowns, ny, nx), float32, on the CPU.
@@ -172,6 +203,9 @@ class Forward:
             "background": torch.ones_like(point.image),
             "pedestal": gain - 1,
         }
+        for source in unknowns.bright_sources(vector):
+            light = self._companion(unknowns, unknowns.values(vector), source, point.opd)
+            by_level["flux"] = by_level["flux"] + light
         rows = [by_level[name].float().cpu() for name in unknowns.linear]
         for source in unknowns.sources(vector):
             if not unknowns.shows_companions:
@@ -191,8 +225,8 @@ class Forward:
 
         They take as long as two or three images, by reverse mode at one wavelength after the other.
         `jacobian` has those of a coarse copy at fewer wavelengths, with an error that exceeds a
-        gradient near its zero. The dependence of companions on the wavefront is neglected in both,
-        and `levels` has the derivatives by the other unknowns.
+        gradient near its zero. The light of faint companions counts as independent of optics and
+        wavefront in both, and `levels` has the derivatives by the other unknowns.
 
         Parameters
         ----------
@@ -205,9 +239,29 @@ class Forward:
             float64, on the CPU: by the optical parameters, the modes, and the amplitude if it is
             free.
         """
-        unknowns, vector, model = point.unknowns, point.vector, self.model
-        names, spectrum = unknowns.optical, self.model.bandpass
-        values = model.values(unknowns.values(vector))
+        unknowns = point.unknowns
+        names = unknowns.optical
+        totals = [
+            torch.stack(parts).sum(dim=0)
+            for parts in zip(
+                *(self._source_slopes(point, *light, pixels) for light in self._lights(point)),
+                strict=True,
+            )
+        ]
+        by_name = dict(zip(names, totals[1:], strict=True))
+        result = {name: slope.double().cpu().flatten() for name, slope in by_name.items()}
+        result["modes"] = self._by_modes(totals[0].real)
+        if totals[0].is_complex():
+            result["amplitude"] = -self._by_modes(totals[0].imag)[: unknowns.amplitude_modes]
+        return result
+
+    def _source_slopes(
+        self, point: Point, fields: list[Tensor], values: dict[str, Tensor], level: Tensor,
+        pixels: Tensor,
+    ) -> list[Tensor]:  # fmt: skip
+        """Derivatives of ``(pixels * image).sum()`` of one source by OPD and optical parameters."""
+        model, names, spectrum = self.model, point.unknowns.optical, self.model.bandpass
+        values = model.values(values)
         inputs = [each.detach().clone() for each in (point.opd, *(values[n] for n in names))]
         for each in inputs:
             each.requires_grad_()
@@ -215,25 +269,21 @@ class Forward:
         grad = partial(torch.autograd.grad, allow_unused=True, materialize_grads=True)
         # The detector's part is linear in the light, and the same at all wavelengths.
         light = torch.zeros((), dtype=model.dtype, device=model.device)
-        for field, weight in zip(point.fields, spectrum.weights, strict=True):
+        for field, weight in zip(fields, spectrum.weights, strict=True):
             light = light + weight * field.abs().square()
         light.requires_grad_()
-        scale = unknowns.level("flux", vector) * self.problem.gain * pixels
-        number = (model.detector.image(light, values) * scale.to(model.dtype)).sum()
-        by_light, *totals = grad(number, [light, *inputs])
+        scale = (level * pixels).to(model.dtype)
+        by_light, *totals = grad(
+            (model.detector.image(light, values) * scale).sum(), [light, *inputs]
+        )
         for wavelength, weight, field in zip(
-            spectrum.wavelengths, spectrum.weights, point.fields, strict=True
+            spectrum.wavelengths, spectrum.weights, fields, strict=True
         ):
             again = model.field(inputs[0], wavelength, values)
             by_field = 2 * weight * by_light * field
             parts = grad(again, inputs, by_field)
             totals = [total + part for total, part in zip(totals, parts, strict=True)]
-        by_name = dict(zip(names, totals[1:], strict=True))
-        result = {name: slope.double().cpu().flatten() for name, slope in by_name.items()}
-        result["modes"] = self._by_modes(totals[0].real)
-        if totals[0].is_complex():
-            result["amplitude"] = -self._by_modes(totals[0].imag)[: unknowns.amplitude_modes]
-        return result
+        return totals
 
     def _by_modes(self, by_opd: Tensor) -> Tensor:
         """Derivatives by the modes, from those by the OPD."""

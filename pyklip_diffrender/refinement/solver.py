@@ -252,6 +252,9 @@ class Solver:
             jacobians = [frame.jacobian for frame in equations.frames]
         else:
             self._responses.relinearise, self._responses.farthest = allowed, 0.0
+            self._responses.keep = sum(
+                1 + len(point.unknowns.bright_sources(point.vector)) for point in state.points
+            )
         equations = self._equations = None  # The next ones are as large.
         self._equations = linearise(self.objective, state, kappa, modes, robust, jacobians)
         self._has_poor_equations = False

@@ -25,6 +25,10 @@ __all__ = ["COMPANION_PRIOR", "FrameUnknowns", "Unknowns"]
 
 _LINEAR = tuple(p.name for p in LEVELS)
 
+_BRIGHT = 1e-3
+"""Contrast of a companion whose image tells about the wavefront. A change of the wavefront by 10 nm
+moves 1 % of its light, which is noise for fainter ones."""
+
 COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 """Prior standard deviations of a companion's contrast, x and y (arcsec) about its start."""
 
@@ -119,6 +123,15 @@ class FrameUnknowns:
     def sources(self, vector: Tensor) -> Tensor:
         """Contrast, x and y of companions in the first frame, (companions, 3)."""
         return vector[self.where("companions")].reshape(-1, 3)
+
+    def bright_sources(self, vector: Tensor) -> Tensor:
+        """The brightest of `sources`, if its light depends noticeably on the wavefront, (k, 3).
+
+        One, because its derivatives take as long as those of the star.
+        """
+        sources = self.sources(vector)
+        brightest = sources[sources[:, 0].argsort(descending=True)[:1]]
+        return brightest[(brightest[:, 0] > _BRIGHT) & self.shows_companions]
 
     @property
     def turn(self) -> Tensor:
