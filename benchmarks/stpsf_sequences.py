@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 from astropy.io import fits
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
@@ -134,9 +134,11 @@ def image(
 ) -> np.ndarray:  # fmt: skip
     """The image of a point source of unit flux at a place behind the mask, arcsec.
 
-    stpsf's distorted images have square pixels of its mean scale. Those of the detector do not, by
-    1 %, which would displace planets by several mas: the oversampled image is sampled again there.
+    With stpsf's charge diffusion and interpixel capacitance. Its distorted images have square
+    pixels of the mean scale, which would displace planets by several mas, and are turned by the
+    angle between aperture and telescope; these are on the detector's pixels by the SIAF.
     """
+    import stpsf.constants
     import stpsf.detectors
     import stpsf.stpsf_core
 
@@ -146,19 +148,21 @@ def image(
     psf = nircam.calc_psf(
         nlambda=nlambda, fft_oversample=OVERSAMPLE, detector_oversample=OVERSAMPLE, fov_pixels=SIDE
     )
+    fine, scale = psf["OVERSAMP"].data, psf["OVERSAMP"].header["PIXELSCL"]
+    middle = (SIDE * OVERSAMPLE - 1) / 2
+    y, x = (np.indices(fine.shape) - middle) / OVERSAMPLE
     aperture = stpsf.stpsf_core.get_siaf_with_caching("NIRCam")[case.aperture]
-    fine = psf["OVERDIST"].data
-    scales = np.array([aperture.YSciScale, aperture.XSciScale]) / nircam.pixelscale
-    middle = (np.array(fine.shape) - 1) / 2
-    places = np.indices(fine.shape) - middle[:, None, None]
-    samples = scales[:, None, None] * places + middle[:, None, None]
-    shape = (SIDE, OVERSAMPLE, SIDE, OVERSAMPLE)
-    pixels = scales.prod() * map_coordinates(fine, samples).reshape(shape).sum(axis=(1, 3))
-    # stpsf couples neighbouring pixels in place, once.
-    del psf["DET_DIST"].header["IPCINST"]
-    psf["DET_DIST"].data = pixels
+    sky = np.stack(aperture.sci_to_idl(x + aperture.XSciRef, y + aperture.YSciRef)[::-1])
+    area = aperture.XSciScale * aperture.YSciScale / (OVERSAMPLE * scale) ** 2
+    light = area * map_coordinates(fine, sky / scale + middle)
+    channel = "NIRCAM_SW" if nircam.channel == "short" else "NIRCAM_LW"
+    diffusion = stpsf.constants.INSTRUMENT_DETECTOR_CHARGE_DIFFUSION_DEFAULT_PARAMETERS[channel]
+    light = gaussian_filter(light, diffusion / scale)
+    detected = psf["DET_DIST"]
+    detected.data = light.reshape(SIDE, OVERSAMPLE, SIDE, OVERSAMPLE).sum(axis=(1, 3))
+    del detected.header["IPCINST"]  # With it stpsf would take the pixels as coupled already.
     stpsf.detectors.apply_detector_ipc(psf)
-    return np.array(psf["DET_DIST"].data, dtype=float)
+    return np.array(detected.data, dtype=float)
 
 
 def write_frames(case: Case, folder: Path, references: int = 0) -> Path:

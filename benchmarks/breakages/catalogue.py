@@ -188,7 +188,7 @@ def _frames_and_files() -> list[Breakage]:
             "dither", "dithers off the mask are no dithers behind it",
             'if 0 < np.hypot(x, y) < BEHIND_THE_MASK else None',
             'if 0 < np.hypot(x, y) else None',
-            "observation admission",
+            "sequence",
         ),
         Breakage(
             "read-noise", "simulated errors include the read noise",
