@@ -20,13 +20,13 @@ import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.companions import bright_companions, with_dominant
 from pyklip_diffrender.refinement.conclusion import conclude
+from pyklip_diffrender.refinement.course import NOTHING, Course
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.mode_priors import ModePriors, count_modes_below
 from pyklip_diffrender.refinement.objective import State
@@ -92,42 +92,8 @@ to a fit with robust weights."""
 _COMPANION_STEPS = 4
 """Largest number of steps that fit a new companion alone."""
 
-_NOTHING = (math.inf, math.inf)
-"""Model error and chi-squared of no state."""
-
 _WIDENINGS = 3
 """Largest number of times that a prior is widened. Two rolls of HIP 17695 in F444W needed two."""
-
-
-@dataclass
-class _Course:
-    """Where a fit is in its schedule.
-
-    Attributes
-    ----------
-    state, best, aligned : State
-        The present one, the one of the least model error, and the one that ended the alignment.
-    kappa : float
-        Assumed error of the star model, as a fraction of the star.
-    modes : int
-        Number of leading wavefront modes that are free; 0 for the alignment.
-    remaining : int
-        Number of steps that may follow.
-    error, chi2 : float
-        Model error and chi-squared per pixel of `state`.
-    least : (float, float)
-        Model error and chi-squared per pixel of `best`.
-    """
-
-    state: State
-    best: State
-    aligned: State
-    kappa: float
-    modes: int
-    remaining: int
-    error: float = math.inf
-    chi2: float = math.inf
-    least: tuple[float, float] = _NOTHING
 
 
 class Annealing:
@@ -193,7 +159,7 @@ class Annealing:
             seed=seed,
         )
 
-    def _beginning(self) -> _Course:
+    def _beginning(self) -> Course:
         """Where the schedule begins: a fit that continues another one has all its unknowns."""
         settings, state = self.settings, self._with_dominant(self._begin)
         kappa = max(self.objective.model_error(state), settings.min_model_error)
@@ -202,9 +168,9 @@ class Annealing:
             kappa = settings.min_model_error
         skips_alignment = settings.wavefront and (not settings.free or self._is_warm)
         modes = self._modes_for(kappa) if skips_alignment else 0
-        return _Course(state, state, state, kappa, modes, settings.max_iterations)
+        return Course(state, state, state, kappa, modes, settings.max_iterations)
 
-    def _step(self, course: _Course) -> float:
+    def _step(self, course: Course) -> float:
         """Take a step; return the decrease of the penalised chi-squared per pixel."""
         course.remaining -= 1
         course.state, gain = self.solver.step(course.state, course.kappa, course.modes)
@@ -215,7 +181,7 @@ class Annealing:
         self._record(course.kappa, course.modes, course.chi2, course.error, gain)
         return gain
 
-    def _align(self, course: _Course, gain: float) -> bool:
+    def _align(self, course: Course, gain: float) -> bool:
         """Choose what follows a step of the alignment; True if the fit has converged."""
         floor = self.settings.min_model_error
         course.kappa = max(floor, min(course.kappa, course.error))
@@ -230,7 +196,7 @@ class Annealing:
             return False
         return gain < self.settings.tolerance
 
-    def _anneal(self, course: _Course, gain: float) -> bool:
+    def _anneal(self, course: Course, gain: float) -> bool:
         """Choose what follows a step of the wavefront; True if the fit has converged."""
         floor = self.settings.min_model_error
         stalled = course.error > max(course.kappa, _NEGLIGIBLE)
@@ -247,7 +213,7 @@ class Annealing:
         course.modes = self._modes_for(course.kappa)
         return False
 
-    def _restart(self, course: _Course, added: Sequence[Planet]) -> None:
+    def _restart(self, course: Course, added: Sequence[Planet]) -> None:
         """Go on with more companions: from here near the solution, else from the alignment.
 
         Near the solution the model is linear, so that further steps remove the bias of the
@@ -255,7 +221,7 @@ class Annealing:
         """
         is_close = course.error < _NEAR
         course.state = self._with_companions(course.state if is_close else course.aligned, added)
-        course.least, course.remaining = _NOTHING, self.settings.max_iterations
+        course.least, course.remaining = NOTHING, self.settings.max_iterations
         self.solver.damping = 0.0
         if is_close:
             # Images are less linear in positions than in the wavefront, and steps of these few
@@ -362,11 +328,11 @@ class Annealing:
         fine = kappa <= max(_COARSE, self.settings.min_model_error)
         return self._few_modes if coarse and not fine else len(self.basis)
 
-    def _room(self, course: _Course) -> int:
+    def _room(self, course: Course) -> int:
         """Number of companions that may still be added."""
         return self.settings.max_companions - len(course.state.unknowns.frames[0].companions)
 
-    def _significant(self, course: _Course) -> list[Planet]:
+    def _significant(self, course: Course) -> list[Planet]:
         """Companions in the residual of the alignment."""
         most, threshold = self._room(course), self.settings.companion_threshold
         if most < 1 and self.settings.companions_if_stalled and self.settings.wavefront:
@@ -394,7 +360,7 @@ class Annealing:
         _log.info("a source outshines the star, and is fitted with it")
         return trial
 
-    def _stalling(self, course: _Course) -> list[Planet]:
+    def _stalling(self, course: Course) -> list[Planet]:
         """A companion in the residual of a fit of the wavefront that stalled.
 
         One at a time, because the side lobes of a bright companion are peaks as well.
