@@ -282,7 +282,7 @@ def _fits() -> list[Breakage]:
             and not any(same_name(pattern.star, each) for each in star.names)
             """, """
             """,
-            "systematics sequence",
+            "learn",
         ),
         Breakage(
             "pattern-size", "the size of a pattern is 1 where frames show it",
