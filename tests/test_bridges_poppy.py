@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import re
+from collections.abc import Callable
 from typing import Any
 
 import astropy.units as u
@@ -11,12 +13,14 @@ import poppy
 import poppy_reference as reference
 import pytest
 import random_poppy
+import torch
 from astropy.io import fits
 from numpy.typing import NDArray
 from poppy.poppy_core import PlaneType
 
-from pyklip_diffrender.bridges import from_poppy
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.bridges import from_poppy, opd_to_poppy
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
+from pyklip_diffrender.optics.grid import resample
 
 Array = NDArray[np.float64]
 Plane = tuple[str, Any]
@@ -279,6 +283,202 @@ def test_every_keyword_of_poppy_is_there() -> None:
     assert header["DRVERS"]
 
 
+def test_intermediate_wavefronts_are_those_of_poppy() -> None:
+    system = make(pupil(), ("rotate", 90), ("invert", "x"), zernikes(), bar(), stop(), zernikes())
+    _, theirs = system.calc_psf(WAVELENGTH, return_intermediates=True)
+    model = from_poppy(system, WAVELENGTH, propagation="fft")
+    _, ours = model.calc_psf(return_intermediates=True)
+    assert len(ours) == len(theirs) == len(system.planes)
+    for mine, wave in zip(ours, theirs, strict=True):
+        assert isinstance(mine, poppy.Wavefront)
+        size, whole = mine.shape[0], wave.shape[0]
+        first = whole // 2 - size // 2
+        part = wave.wavefront[first : first + size, first : first + size]
+        # Image planes of an FFT carry the phase of an origin in the corner.
+        assert relative(np.abs(mine.wavefront), np.abs(part)) < 1e-12
+        assert np.isclose(mine.pixelscale.value, wave.pixelscale.value)
+    # Without an FFT there is only that part of the image that the bar blocks.
+    _, compact = from_poppy(system, WAVELENGTH).calc_psf(return_intermediates=True)
+    rows, columns = compact[4].shape
+    middle = theirs[4].shape[0] // 2
+    part = theirs[4].intensity[
+        middle - rows // 2 : middle + rows // 2 + 1,
+        middle - columns // 2 : middle + columns // 2 + 1,
+    ]
+    assert columns < rows < theirs[4].shape[0]
+    assert np.abs(compact[4].intensity - part).max() < 1e-12 * part.max()
+    _, (last,) = model.calc_psf(return_final=True)
+    assert relative(last.intensity, theirs[-1].intensity) < 1e-12
+
+
+def test_planes_keep_names_and_order() -> None:
+    system = make(pupil(), ("invert", "y"), zernikes(), spot(), stop())
+    model = from_poppy(system, WAVELENGTH)
+    names = [p.name for p in (model.entrance, *model.planes, model.detector)]
+    assert names == [p.name for p in system.planes]
+    assert model.plane("spot").name == "spot"
+    with pytest.raises(KeyError, match="not a plane of this system"):
+        model.plane("spott")
+
+
+def test_later_changes_to_the_users_object_do_not_reach_the_model() -> None:
+    system = make(pupil(), zernikes(), spot(), stop())
+    before = copy.deepcopy(system)
+    model = from_poppy(system, WAVELENGTH)
+    image = model()
+    system.planes[2].radius_inner = 1 * u.arcsec
+    system.source_offset_r = 0.0
+    assert torch.equal(model(), image)
+    assert torch.equal(model.with_fidelity(wavelength=WAVELENGTH)(), image)
+    assert relative(image.numpy(), from_poppy(before, WAVELENGTH)().numpy()) == 0
+
+
+def test_star_offsets_add_to_the_systems_own_in_the_final_frame() -> None:
+    system = make(pupil(), ("invert", "x"), ("rotate", 20), spot(), stop())
+    model = from_poppy(system, WAVELENGTH)
+    x, y = 0.11, -0.07
+    r, theta = system.source_offset_r, np.deg2rad(system.source_offset_theta)
+    x_all, y_all = x - r * np.sin(theta), y + r * np.cos(theta)
+    system.source_offset_r = np.hypot(x_all, y_all)
+    system.source_offset_theta = np.rad2deg(np.arctan2(-x_all, y_all))
+    moved = from_poppy(system, WAVELENGTH)()
+    assert relative(model(star_offset=(x, y)).numpy(), moved.numpy()) < 1e-12
+    truth = system.calc_psf(WAVELENGTH)[0].data.reshape(40, 2, 40, 2).sum(axis=(1, 3))
+    assert relative(moved.numpy(), truth) < 1e-12
+
+
+@pytest.mark.parametrize("inversion", ["x", "y"])
+def test_there_and_back(inversion: str) -> None:
+    """An OPD fitted here gives the same image in poppy."""
+    system = make(pupil(), ("invert", inversion), zernikes(), spot(), stop())
+    model = from_poppy(system, WAVELENGTH)
+    opd = reference.lopsided_opd(NPIX)
+    truth = opd_to_poppy(opd, system).calc_psf(WAVELENGTH)[0].data
+    assert relative(model.calc_psf(opd=opd)[0].data, truth) < 1e-12
+    assert relative(model.calc_psf(opd=opd[::-1].copy())[0].data, truth) > 1e-3
+    own = opd_to_poppy(model.entrance.opd, system).calc_psf(WAVELENGTH)[0].data
+    assert relative(own, system.calc_psf(WAVELENGTH)[0].data) < 1e-12
+    coarse = resample(opd, NPIX // 2)
+    taken = opd_to_poppy(coarse, system).planes[0].opd
+    assert np.array_equal(taken, resample(coarse, NPIX))
+    with pytest.raises(ShapeError, match=r"\(95, 96\), expected square maps"):
+        opd_to_poppy(opd[:-1], system)
+
+
+def slope(function: Callable[[torch.Tensor], torch.Tensor], at: torch.Tensor, step: float) -> None:
+    """Directional derivative by autograd against finite differences of fourth order."""
+    direction = torch.randn(at.shape, generator=torch.manual_seed(1), dtype=at.dtype)
+    variable = at.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(function(variable), variable)
+    wanted = (gradient * direction).sum()
+    f = [function(at + k * step * direction).detach() for k in (-2, -1, 1, 2)]
+    found = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * step)
+    assert abs(found - wanted) <= 1e-7 * abs(wanted)
+
+
+@pytest.mark.parametrize("propagation", ["compact", "fft"])
+def test_gradients_with_respect_to_the_opd(propagation: str) -> None:
+    system = make(pupil(), ("rotate", 15), zernikes(), spot(), stop())
+    model = from_poppy(system, WAVELENGTH, propagation=propagation)
+    weight = torch.randn(40, 40, generator=torch.manual_seed(2), dtype=torch.float64)
+    opd = torch.from_numpy(reference.lopsided_opd(NPIX))
+    slope(lambda v: (model(v) * weight).sum(), opd, 1e-10)
+
+
+def test_planes_become_trainable_on_request() -> None:
+    system = make(pupil(), ("invert", "y"), zernikes(), spot(), stop())
+    model = from_poppy(system, WAVELENGTH, trainable=("aberrations",))
+    opd, transmission = model.trainable["aberrations"]
+    assert list(model.trainable) == ["aberrations"]
+    truth = from_poppy(system, WAVELENGTH)()
+    assert relative(model().detach().numpy(), truth.numpy()) < 1e-14
+    model().square().sum().backward()
+    assert opd.grad is not None
+    assert opd.grad.abs().max() > 0
+    assert transmission.grad is not None
+    # The tensors have the frame of their own plane: poppy agrees on a change of it.
+    change = reference.lopsided_opd(NPIX)
+    with torch.no_grad():
+        opd += torch.from_numpy(change)
+    extra = poppy.ArrayOpticalElement(
+        name="extra",
+        transmission=np.ones_like(change),
+        opd=change,
+        pixelscale=6.5 / NPIX * u.m / u.pix,
+        planetype=PlaneType.pupil,
+    )
+    system.add_pupil(extra, index=3)
+    truth_changed = from_poppy(system, WAVELENGTH)()
+    assert relative(model().detach().numpy(), truth_changed.numpy()) < 1e-12
+
+
+def test_single_precision() -> None:
+    system = make(pupil(), spot(), stop())
+    truth = from_poppy(system, WAVELENGTH)().numpy()
+    for propagation in ("compact", "fft"):
+        single = from_poppy(system, WAVELENGTH, propagation=propagation, dtype=torch.float32)
+        assert single().dtype == torch.float32
+        assert relative(single().numpy(), truth) < 1e-4
+
+
+def fresnel() -> Any:
+    system = poppy.FresnelOpticalSystem(pupil_diameter=2 * u.m, npix=64)
+    system.add_optic(poppy.CircularAperture(radius=1 * u.m))
+    return system
+
+
+def without_detector() -> Any:
+    system = make(pupil())
+    del system.planes[-1]
+    return system
+
+
+def starting_in_an_image() -> Any:
+    system = make(pupil(), spot())
+    del system.planes[0]
+    return system
+
+
+def with_unknown_plane() -> Any:
+    system = make(pupil(), zernikes())
+    system.planes[1].planetype = PlaneType.intermediate
+    return system
+
+
+def matrix_fourier() -> Any:
+    return poppy.MatrixFTCoronagraph(make(pupil(), spot(), stop()))
+
+
+def semi_analytic() -> Any:
+    return poppy.SemiAnalyticCoronagraph(make(pupil(), spot(), stop()), fpm_index=1)
+
+
+def with_a_mask_on_its_own_samples() -> Any:
+    system = make(pupil(), spot(), stop())
+    system.planes[1].propagation_hint = "MFT"
+    return system
+
+
+@pytest.mark.parametrize(
+    ("bad", "complaint"),
+    [
+        (fresnel, "Fresnel propagation is not supported"),
+        (without_detector, r"must be a Detector, got .*Add one"),
+        (starting_in_an_image, "first plane must be a pupil"),
+        (with_unknown_plane, r"'aberrations' \(ZernikeWFE.*not supported. Supported are"),
+        (matrix_fourier, "convert the poppy.OpticalSystem that it was made from"),
+        (semi_analytic, "SemiAnalyticCoronagraph propagates.*convert the poppy.OpticalSystem"),
+        (with_a_mask_on_its_own_samples, "'spot' asks for a matrix transform"),
+        (lambda: make(pupil(), stop(), spot()), "'spot'.*there must be a pupil plane"),
+        (lambda: poppy.Instrument(), "expected a poppy.OpticalSystem"),
+        (lambda: make(pupil(), spot(), ("invert", "y"), stop()), "moves it by one sample"),
+    ],
+)
+def test_what_is_not_supported_is_named(bad: Callable[[], Any], complaint: str) -> None:
+    with pytest.raises(IncompatibleSetupError, match=complaint):
+        from_poppy(bad(), WAVELENGTH)
+
+
 def test_a_mask_without_bounds_cannot_be_forced() -> None:
     system = make(pupil(), band_limited(), stop())
     with pytest.raises(IncompatibleSetupError, match=r"'circular mask'.*Use propagation='fft'"):
@@ -287,6 +487,8 @@ def test_a_mask_without_bounds_cannot_be_forced() -> None:
         from_poppy(system, WAVELENGTH, propagation={"circular mask": "mft"})
     with pytest.raises(IncompatibleSetupError, match="normalize"):
         from_poppy(system, WAVELENGTH).calc_psf(normalize="lats")
+    with pytest.raises(IncompatibleSetupError, match="return_intermediates=True"):
+        from_poppy(system, WAVELENGTH).calc_psf(save_intermediates=True)
 
 
 def test_a_users_own_mask_says_how_far_it_reaches() -> None:

@@ -136,6 +136,9 @@ def test_a_script_for_stpsf_runs_unchanged(nircam: Callable[..., Any], tmp_path:
     psf = model.calc_psf(**arcsec, **one)
     assert len(psf) == len(truth) == 2
     assert error(psf[1].data, truth[1].data) < 1e-10
+    psf, waves = model.calc_psf(**arcsec, detector_oversample=1, return_intermediates=True)
+    assert len(waves) == 6
+    assert waves[-1].shape == psf[0].data.shape
     with pytest.raises(IncompatibleSetupError, match="not all three"):
         model.calc_psf(oversample=2, fft_oversample=2, detector_oversample=2)
 

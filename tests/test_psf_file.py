@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from astropy.io import fits
 
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -72,3 +73,10 @@ def test_normalisations() -> None:
     assert totals["none"] == pytest.approx(float((jwst_pupil(64) ** 2).sum()))
     with pytest.raises(IncompatibleSetupError, match="expected one of first, last"):
         model().calc_psf(normalize="middle")
+
+
+def test_intermediate_fields_come_by_name() -> None:
+    psf, fields = model().calc_psf(opd=OPD, return_intermediates=True)
+    assert next(iter(fields)) == "JWST pupil"
+    final = fields["detector"].abs() ** 2
+    assert torch.allclose(final, torch.from_numpy(psf[0].data.astype(float)), rtol=1e-12)

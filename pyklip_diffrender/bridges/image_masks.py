@@ -104,11 +104,14 @@ class BoxPart:
 
         return self._transforms.kept((wavefront.wavelength, spacing, grid, dtype), make)
 
+    def focal_field(self, wavefront: Wavefront, spacing: float) -> Tensor:
+        """Field in front of the mask on the cells of the box."""
+        return self._transform(wavefront, spacing, wavefront.grid).forward(wavefront.field)
+
     def removed(self, wavefront: Wavefront, spacing: float, onto: PupilGrid) -> Tensor:
         """See `MaskPart`."""
         blocked = self.cells(wavefront, spacing)[2].to(wavefront.field)
-        transform = self._transform(wavefront, spacing, wavefront.grid)
-        removed = transform.forward(wavefront.field) * blocked
+        removed = self.focal_field(wavefront, spacing) * blocked
         return self._transform(wavefront, spacing, onto).inverse(removed, spacing**2)
 
 
@@ -218,6 +221,16 @@ class SampledOcculter(Plane):
     def _spacing(self, wavelength: float) -> float:
         return wavelength / self.diameter / self.sampling
 
+    def focal_sample(self, wavefront: Wavefront) -> tuple[Tensor, float]:
+        """The field behind the mask inside the first box, and the lattice's spacing (radians)."""
+        spacing = self._spacing(wavefront.wavelength)
+        for part in self.parts:
+            if isinstance(part, BoxPart):
+                field = part.focal_field(wavefront, spacing) * spacing
+                blocked = part.cells(wavefront, spacing)[2]
+                return field * (1 - blocked.to(field)), spacing
+        raise IncompatibleSetupError(f"{self.name} has no part in a box, so no sample of its focus")
+
     def compact(
         self, wavelength: float, dtype: torch.dtype, device: torch.device
     ) -> CompactOcculter | None:
@@ -290,6 +303,13 @@ class FourierMask(Plane):
         # One wavelength at a time: at eight points per lambda/D one is a gigabyte.
         position = (("wavelength", wavefront.wavelength),)
         return cached(self._latest, wavefront.field.dtype, position, make)
+
+    def focal_sample(self, wavefront: Wavefront) -> tuple[Tensor, float]:
+        """The field behind the mask on the whole lattice, and its spacing (radians)."""
+        field = wavefront.grid.crop(wavefront.field, self.grid) * wavefront.grid.spacing
+        image = torch.fft.ifft2(field, norm="ortho") * self._lattice_transmission(wavefront)
+        spacing = wavefront.wavelength / wavefront.grid.diameter / self.padding
+        return torch.fft.fftshift(image), spacing
 
     def apply(self, wavefront: Wavefront, values: Values, onto: PupilGrid) -> Wavefront:
         """Transform, multiply, transform back."""

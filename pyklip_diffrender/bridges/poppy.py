@@ -15,6 +15,7 @@ from poppy.sub_sampled_optics import Subapertures
 from torch import Tensor
 
 from pyklip_diffrender.bridges.convert import Conversion
+from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
 from pyklip_diffrender.bridges.sampled_planes import PupilOptic
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres
@@ -24,7 +25,7 @@ from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.optics.psf_file import poppy_psf
 from pyklip_diffrender.optics.system import OpticalSystem
 
-__all__ = ["PoppySystem", "check_supported", "from_poppy", "opd_to_poppy"]
+__all__ = ["PoppySystem", "check_supported", "from_poppy", "opd_to_poppy", "refuse_saving"]
 
 _POPPY_OPTIONS = ("display_intermediates", "progressbar")
 
@@ -146,7 +147,11 @@ class PoppySystem(OpticalSystem):
         self,
         wavelength: Any = None,
         weight: Any = None,
+        save_intermediates: bool = False,
+        save_intermediates_what: str = "all",
         display: bool = False,
+        return_intermediates: bool = False,
+        return_final: bool = False,
         source: dict[str, Any] | None = None,
         normalize: str = "first",
         opd: Any = None,
@@ -164,22 +169,41 @@ class PoppySystem(OpticalSystem):
             With "wavelengths" and "weights", in place of the two above.
         normalize : str
             "first", "last", "exit_pupil" or "none", as in poppy.
+        return_intermediates, return_final : bool
+            Also return a list of `poppy.Wavefront`: one for every pupil plane and the detector,
+            or the one on the detector. They are summed over wavelengths as poppy does.
         opd, **options
             As in a call of the system. Options of poppy's that have no meaning here are dropped.
-        display : bool
-            Accepted for compatibility with poppy; nothing is drawn.
+        save_intermediates, save_intermediates_what, display
+            Accepted for compatibility with poppy. Nothing is drawn, and saving is refused with a
+            pointer to `return_intermediates`.
 
         Returns
         -------
-        HDUList
+        HDUList, or (HDUList, list of Wavefront)
         """
+        refuse_saving(save_intermediates)
         if source is not None:
             wavelength, weight = source["wavelengths"], source["weights"]
         system: Any = self
         if wavelength is not None:
             system = self.with_fidelity(wavelength=wavelength, weights=weight)
         parameters = {k: v for k, v in options.items() if k not in _POPPY_OPTIONS}
-        return poppy_psf(system, normalize, opd, **parameters)
+        hdus = poppy_psf(system, normalize, opd, **parameters)
+        if not (return_intermediates or return_final):
+            return hdus
+        return hdus, intermediate_wavefronts(
+            system, system.frames, normalize, only_last=not return_intermediates
+        )
+
+
+def refuse_saving(save_intermediates: bool) -> None:
+    """Raise for poppy's option to write every intermediate plane to a file."""
+    if save_intermediates:
+        raise IncompatibleSetupError(
+            "save_intermediates: this system writes no files on its own; pass "
+            "return_intermediates=True and call .writeto() on the wavefronts"
+        )
 
 
 def from_poppy(

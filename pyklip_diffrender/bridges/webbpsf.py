@@ -12,7 +12,8 @@ from astropy import units as u
 from astropy.io import fits
 
 from pyklip_diffrender.bridges.convert import Conversion
-from pyklip_diffrender.bridges.poppy import PoppySystem, check_supported
+from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
+from pyklip_diffrender.bridges.poppy import PoppySystem, check_supported, refuse_saving
 from pyklip_diffrender.bridges.sampled_planes import AberrationOptic
 from pyklip_diffrender.bridges.stpsf_instrument import (
     band,
@@ -88,6 +89,8 @@ class WebbSystem(PoppySystem):
         fft_oversample: int | None = None,
         overwrite: bool = True,
         display: bool = False,
+        save_intermediates: bool = False,
+        return_intermediates: bool = False,
         normalize: str = "first",
         add_distortion: bool = True,
         crop_psf: bool = True,
@@ -103,14 +106,15 @@ class WebbSystem(PoppySystem):
         ----------
         opd, **parameters
             As in a call of the system, for the PSF of a refined wavefront.
-        display : bool
-            Accepted for compatibility with stpsf; nothing is drawn.
+        display, save_intermediates
+            Accepted for compatibility with stpsf; nothing is drawn, and saving is refused.
 
         Returns
         -------
-        HDUList
+        HDUList, or (HDUList, list of poppy.Wavefront)
             OVERSAMP, DET_SAMP, OVERDIST and DET_DIST, the last two with `add_distortion`.
         """
+        refuse_saving(save_intermediates)
         arguments = {
             "source": source,
             "nlambda": nlambda,
@@ -140,6 +144,10 @@ class WebbSystem(PoppySystem):
             for hdu in result:
                 hdu.header["DRSIFLIP"] = (system.si_wfe_flipped, "SI WFE map flipped vertically")
         save(result, outfile, overwrite)
+        if return_intermediates:
+            return result, intermediate_wavefronts(
+                system, system.frames, normalize, only_last=False
+            )
         return result
 
 

@@ -246,6 +246,7 @@ class OpticalSystem(Propagation):
         fft_oversample: int | None = None,
         overwrite: bool = True,
         display: bool = False,
+        return_intermediates: bool = False,
         normalize: str = "first",
         opd: Value | None = None,
         **parameters: Value,
@@ -262,6 +263,8 @@ class OpticalSystem(Propagation):
             Write the result there.
         display : bool
             Accepted for compatibility with poppy; nothing is drawn.
+        return_intermediates : bool
+            Return (HDUList, `debug` of the first wavelength).
         normalize : str
             "first", "last", "exit_pupil" or "none", as in poppy.
         opd, **parameters
@@ -285,6 +288,8 @@ class OpticalSystem(Propagation):
         sampling = system.recipe.get("occulter_sampling")
         hdus = instrument_psf(system, system.setup, sampling, normalize, opd, **parameters)
         save(hdus, outfile, overwrite)
+        if return_intermediates:
+            return hdus, system.debug(opd, None, **parameters)
         return hdus
 
     def plot(self, ax: Any = None, *, opd: Value | None = None) -> NDArray[Any]:
