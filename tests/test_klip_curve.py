@@ -71,7 +71,7 @@ def frame(
     values = {"flux": np.array([FLUX]), "detector_shift": np.array(shift)}
     return FrameFit(
         model(), observation, {}, wavefront, star, np.zeros_like(star), values, {},
-        np.ones_like(star),
+        np.ones_like(star), np.zeros(0),
     )  # fmt: skip
 
 

@@ -732,7 +732,7 @@ def test_a_planet_is_injected_where_and_as_bright_as_it_is_asked_for() -> None:
     frames = [
         FrameFit(
             model, replace(star, position_angles=np.array([roll])), {}, opd.data, nothing,
-            nothing, values, {}, nothing,
+            nothing, values, {}, nothing, np.zeros(0),
         )
         for roll in ROLLS
     ]  # fmt: skip
@@ -781,8 +781,9 @@ def test_a_planet_is_injected_into_the_frames_with_their_disk() -> None:
     ones = np.ones((30, 30))
     cut = dr.Observation.from_arrays(3 * ones, ones, pixelscale=0.063).cutout(8)
     frame = FrameFit(
-        cast(Any, None), replace(cut, data=cut.data - 2), {}, ones, ones, ones, {}, {}, ones
-    )
+        cast(Any, None), replace(cut, data=cut.data - 2), {}, ones, ones, ones, {}, {}, ones,
+        np.zeros(0),
+    )  # fmt: skip
     (with_disk,) = work._with_disk([frame], [cut])
     assert (with_disk.observation.data == 3).all()
 

@@ -5,13 +5,13 @@ undamped steps would diverge. Therefore the noise is taken as sqrt(sigma^2 + (ka
 model error kappa, a fraction of the star, begins at the value for which chi-squared per pixel is 1
 and decreases to 0, or to the value that the final residual requires:
 
-1. `Annealing._align` fits alignment and levels until a step gains little, and adds companions that
+1. `Annealing._with_dominant` adds a companion that outshines what the mask leaves of the star, and
+   `Annealing._align` fits alignment and levels until a step gains little, and adds companions that
    are significant in the residual.
 2. `Annealing._anneal` fits the wavefront as well, and lowers kappa from step to step. Where the fit
    stalls because of a bright companion, `Annealing._restart` adds that and goes back to the
    alignment.
-3. `Annealing._finish` leaves out bad pixels, widens a prior that is too narrow, and fits the size
-   of the error of the model that neighbouring pixels share.
+3. `Annealing._finish` leaves out bad pixels, and widens a prior that is too narrow.
 """
 
 from __future__ import annotations
