@@ -25,9 +25,10 @@ __all__ = ["COMPANION_PRIOR", "FrameUnknowns", "Unknowns"]
 
 _LINEAR = tuple(p.name for p in LEVELS)
 
-_BRIGHT = 1e-3
-"""Contrast of a companion whose image tells about the wavefront. A change of the wavefront by 10 nm
-moves 1 % of its light, which is noise for fainter ones."""
+_BRIGHT = 5e-3
+"""Contrast of a companion whose light counts in derivatives by optics, flux and wavefront. A change
+of the wavefront by 10 nm moves 1 % of it. Companions outshine what the mask leaves of the star from
+about 0.02."""
 
 COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 """Prior standard deviations of a companion's contrast, x and y (arcsec) about its start."""
