@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -94,20 +95,24 @@ def units(solver: Solver, state: State) -> Tensor:
     return torch.where(torch.isfinite(unit), unit, state.vector.abs()).clamp(max=1e6)
 
 
+def slopes_by_name(solver: Solver, state: State) -> Iterator[tuple[str, Tensor, float]]:
+    """A random direction within each group of unknowns, and the slope along it by differences."""
+    names = [unknown.name for unknown in state.unknowns.labels()]
+    assert {*FREE, "amplitude", "modes"} <= set(names)
+    rng = np.random.default_rng(5)
+    for name in (*FREE, "amplitude", "modes"):
+        which = torch.tensor([each == name for each in names])
+        direction = units(solver, state) * torch.from_numpy(rng.normal(size=len(names))) * which
+        yield name, direction, slope_along(solver, state, direction)
+
+
 @pytest.mark.parametrize("frames", [1, 2])
 def test_the_gradient_is_that_of_chi_squared(frames: int) -> None:
     """Against differences of chi-squared, which have an error of 1e-7 of it in these steps."""
     solver, state = solver_of(frames)
     assert solver.objective.shares_pattern == (frames > 1)
     exact, coarse = (gradient(solver, state, exact=value) for value in (True, False))
-    names = [unknown.name for unknown in state.unknowns.labels()]
-    assert {*FREE, "amplitude", "modes"} <= set(names)
-    rng = np.random.default_rng(5)
-    unit = units(solver, state)
-    for name in (*FREE, "amplitude", "modes"):
-        which = torch.tensor([each == name for each in names])
-        direction = unit * torch.from_numpy(rng.normal(size=len(names))) * which
-        slope = slope_along(solver, state, direction)
+    for name, direction, slope in slopes_by_name(solver, state):
         np.testing.assert_allclose(float(exact @ direction), slope, rtol=1e-4, err_msg=name)
         if name == "modes":
             # The coarse one does not pass this test, or there would be no need of the other.
@@ -149,13 +154,7 @@ def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames: int) ->
     state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
     assert (state.points[0].total - state.points[0].star).sum() > state.points[0].light.sum()
     exact, copied = (gradient(solver, state, exact=value) for value in (True, False))
-    names = [unknown.name for unknown in state.unknowns.labels()]
-    rng = np.random.default_rng(5)
-    unit = units(solver, state)
-    for name in (*FREE, "amplitude", "modes"):
-        which = torch.tensor([each == name for each in names])
-        direction = unit * torch.from_numpy(rng.normal(size=len(names))) * which
-        slope = slope_along(solver, state, direction)
+    for name, direction, slope in slopes_by_name(solver, state):
         for each in (exact, copied):
             np.testing.assert_allclose(float(each @ direction), slope, rtol=2e-3, err_msg=name)
 
