@@ -404,6 +404,17 @@ def test_a_planet_is_found_where_it_is(one: Detection) -> None:
     assert row["snr"] > 8
 
 
+def test_no_candidate_is_nearer_than_the_smallest_separation(world: World) -> None:
+    """The same S/N, by which the planet was found, counts for nothing inside it."""
+    found = world.detected(5, FAINT)
+    assert len(found.sources) == 1
+    assert len(found.fits[0].companions) == 0
+    beyond = dr.detect(found.fits, inner=0.8)
+    # Without the planet as a source the map keeps all of its light.
+    assert np.nanmax(beyond.snr[radius(beyond) < 0.8]) > 8
+    assert len(beyond.candidates) == 0
+
+
 def test_the_planet_is_gone_from_the_map_without_candidates(one: Detection) -> None:
     near = np.hypot(one.grid[..., 0] - WHERE.offset[0], one.grid[..., 1] - WHERE.offset[1]) < 0.15
     assert one.snr[near].max() > 8

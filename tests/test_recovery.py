@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -12,7 +13,7 @@ from astropy import units as u
 from astropy.table import QTable
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import measured_planet, recover_planets
+from pyklip_diffrender.detection import measured_planet, recover_planets, with_planets
 from pyklip_diffrender.detection.recovery import TOGETHER, _free_place
 from pyklip_diffrender.errors import IncompatibleSetupError
 
@@ -156,6 +157,19 @@ def test_planets_keep_away_from_candidates_and_from_pixels_without_a_value() -> 
     assert below[1] < 0
     # Without any such place, planets are not left out.
     assert _free_place(covered(lambda x, y: x > 9), 0.6, 0.0) == pytest.approx(first)
+
+
+def test_injected_planets_turn_with_the_sky() -> None:
+    """East of north is 30 degrees less from +y in a frame whose +y is 30 degrees further east."""
+    frames = [Frame(3.0), Frame(3.0)]
+    for frame, angle in zip(frames, (NORTH, NORTH + 30.0), strict=True):
+        frame.observation = replace(frame.observation, position_angles=np.array([angle]))
+    first, second = with_planets(frames, [dr.Planet(0.5, 0.6, 90.0)])
+    # To the left of the star, 10 pixels away; then 60 degrees from up, still on the left.
+    middle = SIZE // 2
+    np.testing.assert_array_equal(np.argwhere(first.data[0]), [[middle, middle - 10]])
+    np.testing.assert_array_equal(np.argwhere(second.data[0]), [[middle + 5, middle - 9]])
+    assert first.data.max() == second.data.max() == 1.5
 
 
 @pytest.mark.parametrize("count", [-1, 2.5])

@@ -63,6 +63,23 @@ def test_pixels_are_matched_by_the_star(shape: tuple[int, int], x: float, y: flo
             assert error[row, column] == 0.5
 
 
+@pytest.mark.parametrize("corner", [(600, 1600), (602, 1597), (597, 1604), (590, 1590)])
+def test_pixels_are_matched_on_the_detector_where_both_know_theirs(
+    corner: tuple[int, int],
+) -> None:
+    """A pixel keeps its flat field wherever in the frame the star is."""
+    rows, columns = np.mgrid[1600:1609, 600:612]
+    serial = 1.0 + 1000 * rows + columns
+    measured = Systematics(serial, 0.01 * serial, (6.0, 4.0), 0.5, first_pixel=(600, 1600))
+    got, error = measured.at(frame((10, 8), (1.0, 7.0), first_pixel=corner))
+    rows, columns = np.mgrid[corner[1] : corner[1] + 10, corner[0] : corner[0] + 8]
+    known = (rows >= 1600) & (rows < 1609) & (columns >= 600) & (columns < 612)
+    assert known.any() == (corner != (590, 1590))
+    serial = 1.0 + 1000 * rows + columns
+    np.testing.assert_array_equal(got, np.where(known, serial, 0.0))
+    np.testing.assert_array_equal(error, np.where(known, 0.01 * serial, 0.5))
+
+
 def test_another_filter_and_unequal_arrays_are_refused() -> None:
     zeros = np.zeros((9, 12))
     known = Systematics(zeros, zeros, (6.0, 4.0), 0.5, filter="F444W")
