@@ -259,9 +259,9 @@ class Refinement:
         - OPD, ABSORPTION: refined wavefront and, if the pupil's amplitude was free, absorption, m;
         - COEFFICIENTS: of the wavefront modes, nm.
 
-        UNKNOWNS, CURVATURE and ``LINEAR_*`` are the linear model, and FACTS has settings, status and
-        history as JSON text, one byte a pixel. Images of the sky have world coordinates. The file
-        is written atomically.
+        UNKNOWNS, CURVATURE and ``LINEAR_*`` are the linear model, and FACTS has settings, status
+        and history as JSON text, one byte a pixel. Images of the sky have world coordinates. The
+        file is written atomically.
 
         Parameters
         ----------

@@ -83,15 +83,15 @@ def run_obs(
     Files of each concatenation have the prefix ``<mode>_NANNU1_NSUBS1_<concatenation>``:
 
     - ``-KLmodes-all.fits``: the subtracted image, north up, with spaceKLIP's and pyKLIP's keywords;
-    - ``-throughput.fits``, ``-snr.fits``: throughput, and S/N of a point source, on the same pixels;
+    - ``-throughput.fits``, ``-snr.fits``: throughput, and S/N of a point source;
     - ``-results.ecsv``: candidates, in the columns of ``extract_companions``;
-    - ``-KLmodes-all_cal_seps.npy``, ``_cal_cons.npy``, ``_cal_maskcons.npy``: 5-sigma contrast curve
-      with the small-sample correction, as ``calibrate_contrast`` saves it;
+    - ``-KLmodes-all_cal_seps.npy``, ``_cal_cons.npy``, ``_cal_maskcons.npy``: 5-sigma contrast
+      curve with the small-sample correction, as ``calibrate_contrast`` saves it;
     - ``-frames.ecsv``: every file, its use and the reason;
     - a folder with the files of `pyklip_diffrender.Detection.write`, and ``fit.fits``.
 
-    ``<concatenation>.dat`` is its table, and ``<concatenation>_psfmask.fits`` the transmission of the
-    mask, if the table names the rolls' mask files.
+    ``<concatenation>.dat`` is its table, and ``<concatenation>_psfmask.fits`` the transmission of
+    the mask, if the table names the rolls' mask files.
 
     Parameters
     ----------
