@@ -10,14 +10,17 @@ most the edge of the frame), every fifth one of .01 to .1 at such separations. I
 a candidate is within half a lambda/D; one that is not found is explained if it is fainter than the
 curve at its separation, with the small-sample correction that the threshold has, or nearer to the
 star than the curve begins. The script prints a
-line for each that is not found, and the counts.
+line for each that is not found or has other candidates beside it, the counts, and how far the
+contrasts are from the truth in units of their errors.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -29,8 +32,29 @@ DRIFT = 0.15
 """Part of another random wavefront that is added to the map's."""
 
 
-def verdict(seed: int) -> tuple[str, str]:
-    """What the search says of one scene, and the scene in words."""
+@dataclass(frozen=True)
+class Outcome:
+    """Result of the search of one scene.
+
+    Attributes
+    ----------
+    verdict : str
+    scene : str
+        Planet, status of the fit and, where the planet is missing, limit and candidates.
+    false : tuple of float
+        S/N of candidates that are not the planet.
+    pull : float
+        Measured minus true contrast in units of its error; NaN for a planet that is missing.
+    """
+
+    verdict: str
+    scene: str
+    false: tuple[float, ...] = ()
+    pull: float = math.nan
+
+
+def searched(seed: int, **settings: Any) -> Outcome:
+    """Simulate, fit and search one scene, with fields of `GaussNewton` other than the defaults."""
     rng = np.random.default_rng(seed)
     low, high = (-2, -1) if seed % 5 == 4 else (-5, -2)
     contrast = 10 ** rng.uniform(low, high)
@@ -41,19 +65,25 @@ def verdict(seed: int) -> tuple[str, str]:
     before, change = (dr.random_opd(k, npix=NPIX) for k in (2 * seed, 2 * seed + 1))
     now = replace(before, data=before.data + DRIFT * change.data)
     frame = dr.simulate(model, dr.Scene(planets=(planet,)), now, seed=seed)
-    fit = dr.refine(model, frame, before, settings=dr.GaussNewton(cycles=12))
+    fit = dr.refine(model, frame, before, settings=dr.GaussNewton(**settings))
     words = f"{seed}: {contrast:.2g} at {separation:.3f} arcsec, {fit.status.name}"
     if not fit.status.usable:
-        return "the fit says that it failed", words
-    found = dr.detect(fit)
-    places = np.stack([found.candidates["x"].value, found.candidates["y"].value], axis=1)
-    away = np.hypot(*(places - planet.offset).T)
-    if (away < 0.5 * model.resolution).any():
-        return "found", words
-    curve = found.contrast_curve
+        return Outcome("the fit says that it failed", words)
+    result = dr.detect(fit)
+    table = result.candidates
+    away = np.hypot(
+        table["x"].value - planet.offset[0], table["y"].value - planet.offset[1]
+    )  # fmt: skip
+    near = away < 0.5 * model.resolution
+    false = tuple(table["snr"][~near].tolist())
+    if near.any():
+        row = table[int(away.argmin())]
+        pull = float((row["contrast"] - contrast) / row["contrast_error"])
+        return Outcome("found", words, false, pull)
+    curve = result.contrast_curve
     limit = np.interp(separation, curve["separation"].value, curve["small_sample"], left=np.inf)
-    words = f"{words}, limit {limit:.2g}, candidates {found.candidates['snr'].round(1).tolist()}"
-    return ("fainter than the curve" if contrast < limit else "lost"), words
+    verdict = "fainter than the curve" if contrast < limit else "lost"
+    return Outcome(verdict, f"{words}, limit {limit:.2g}", false)
 
 
 def main() -> None:
@@ -63,12 +93,19 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     options = parser.parse_args()
     counts: Counter[str] = Counter()
+    pulls = []
     for seed in range(options.first, options.first + options.scenes):
-        result, words = verdict(seed)
-        counts[result] += 1
-        if result != "found":
-            print(f"{words}: {result}", flush=True)
+        outcome = searched(seed)
+        counts[outcome.verdict] += 1
+        counts["false candidates"] += len(outcome.false)
+        pulls.append(outcome.pull)
+        if outcome.verdict != "found" or outcome.false:
+            others = f", others of S/N {np.round(outcome.false, 1).tolist()}" * bool(outcome.false)
+            print(f"{outcome.scene}: {outcome.verdict}{others}", flush=True)
     print(dict(counts))
+    print(f"pulls of contrast: median {np.nanmedian(pulls):+.2f}, "
+          f"rms {np.sqrt(np.nanmean(np.square(pulls))):.2f}, "
+          f"largest {np.nanmax(np.abs(pulls)):.1f}")  # fmt: skip
 
 
 if __name__ == "__main__":

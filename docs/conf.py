@@ -27,7 +27,6 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.intersphinx",
     "sphinx.ext.viewcode",
-    "sphinx_design",
 ]
 exclude_patterns = ["_build", "results"]
 templates_path = ["_templates"]

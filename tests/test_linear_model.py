@@ -238,6 +238,22 @@ def test_where_the_model_is_linearised_does_not_matter(single: LinearModel) -> N
     )
 
 
+def test_light_of_a_million_standard_deviations_leaves_no_rounding_errors(
+    single: LinearModel,
+) -> None:
+    """The light is a multiple of derivatives, so that nothing of it is left."""
+    (part,) = single.frames
+    light = 1e6 * part.jacobian.double().sum(dim=0) * (part.weight > 0)
+    bright = replace(
+        single,
+        frames=(replace(part, residual=light),),
+        deviation=torch.full_like(single.deviation, torch.inf),
+    )
+    # The normal equations in double precision keep 1e-16 times their condition number; single
+    # precision would leave 0.1.
+    assert bright.cleaned[0].abs().max() < 1e-4
+
+
 def test_unknowns_can_be_taken_out_and_their_light_put_back(pair: LinearModel) -> None:
     light = {0: random(NY, NX, seed=70).numpy()}
     less = pair.without("companions", light)

@@ -314,7 +314,18 @@ class Detection:
         """Write maps (FITS), candidates and contrast curve (ECSV); returns the paths.
 
         `read` needs only the first file, detection.fits. For frames with a date and a position
-        angle there is also astrometry.csv, see `write_astrometry`.
+        angle there is also astrometry.csv, see `write_astrometry`. Extensions of detection.fits:
+
+        - SNR, RESIDUAL_SNR: S/N of a point source at every pixel, and with the candidates removed;
+        - CONTRAST, CONTRAST_ERROR, PHOTON_ERROR: contrast, its standard deviation, and that for a
+          known star;
+        - ERROR_FACTOR, FREEDOM: factor of the errors, and degrees of freedom of Student's t, which
+          noise follows in units of these errors;
+        - OFFSET_X, OFFSET_Y: position of every pixel from the star, arcsec;
+        - SUBTRACTED, numbered by EXTVER: each frame without its star, candidates preserved;
+        - DATA, ERROR, VALID: the first frame, its integrations averaged;
+        - FACTS: candidates, contrast curve, metadata and hashes of the fits, as JSON text, one byte
+          a pixel.
 
         Parameters
         ----------

@@ -93,8 +93,24 @@ class LinearFrame(FrameRows):
 
     def image(self, values: Tensor) -> Tensor:
         """Change of the image, (..., ny, nx), for changes of the unknowns, (size, ...)."""
-        on_rows = self.of_unknowns(values).float()
-        return torch.tensordot(on_rows, self.jacobian, dims=([0], [0])).double()
+        on_rows = self.of_unknowns(values).movedim(0, -1)
+        flat = self.jacobian.flatten(1)
+        parts = [on_rows @ flat[:, piece].double() for piece in pixel_pieces(flat.shape[1])]
+        return torch.cat(parts, dim=-1).unflatten(-1, self.jacobian.shape[1:])
+
+    def pulled(self, images: Tensor) -> Tensor:
+        """Products of the derivatives with images, (k, ny, nx), by row: (rows, k).
+
+        They are computed in the precision of the images. The rounding errors of single precision
+        exceed the noise where a companion's light is 1e5 standard deviations.
+        """
+        flat, columns = self.jacobian.flatten(1), images.flatten(1).T
+        if images.dtype == flat.dtype:
+            return flat @ columns
+        total = torch.zeros(len(flat), columns.shape[1], dtype=images.dtype)
+        for piece in pixel_pieces(len(columns)):
+            total += flat[:, piece].to(images.dtype) @ columns[piece]
+        return total
 
 
 def pixel_pieces(pixels: int) -> list[slice]:

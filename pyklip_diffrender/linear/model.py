@@ -158,8 +158,7 @@ class LinearModel:
         total = torch.zeros(size, len(next(iter(images.values()))), dtype=torch.float64)
         for k, weighted in self.noise.weighted(images).items():
             frame = self.frames[k]
-            on_rows = frame.jacobian.flatten(1) @ weighted.flatten(1).T.to(frame.jacobian.dtype)
-            total += frame.onto_unknowns(on_rows.double(), size)
+            total += frame.onto_unknowns(frame.pulled(weighted).double(), size)
         return total
 
     def projected(self, templates: Mapping[int, Tensor]) -> Tensor:

@@ -137,8 +137,11 @@ class PatternLibrary:
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Write to a FITS file, atomically.
 
-        Each pattern has the extensions PATTERN and PATTERN_ERROR, as a `Systematics`, and STAR, if
-        the star was kept, with the number of the pattern as EXTVER; VALIDATION is a table.
+        Each pattern has the extensions PATTERN and PATTERN_ERROR (NaN where nothing was measured),
+        as a `Systematics`, with the star, file, date, detector and flat field in the header, and
+        STAR (the star without the pattern, MJy/sr), if it was kept. They have the number of the
+        pattern as EXTVER, from 1; VALIDATION is a table, and PATVERS in the primary header the
+        version of the layout.
 
         Parameters
         ----------

@@ -249,9 +249,19 @@ class Refinement:
     ) -> Path:
         """Write the refinement to a FITS file that `read` reads.
 
-        Extensions are PARAMETERS (a table), and for each frame DATA, ERROR, VALID, STAR,
-        COMPANIONS, GAIN, OPD and COEFFICIENTS, numbered by EXTVER. Images of the sky have world
-        coordinates. The file is written atomically.
+        Extensions are the table PARAMETERS (frame, name, value, error, unit, description), the
+        starting map INITIAL_OPD (m), PATTERN and PATTERN_ERROR of the systematics that were used,
+        and for each frame, numbered by EXTVER from 1:
+
+        - DATA, ERROR, VALID: the observation, its integrations averaged;
+        - STAR, COMPANIONS: the fitted star and background, and the light of fitted companions;
+        - GAIN: factor of the star, 1 without systematics;
+        - OPD, ABSORPTION: refined wavefront and, if the pupil's amplitude was free, absorption, m;
+        - COEFFICIENTS: of the wavefront modes, nm.
+
+        UNKNOWNS, CURVATURE and ``LINEAR_*`` are the linear model, and FACTS has settings, status
+        and history as JSON text, one byte a pixel. Images of the sky have world coordinates. The
+        file is written atomically.
 
         Parameters
         ----------

@@ -262,9 +262,7 @@ class Solver:
 
     def _moved(self, state: State, step: Tensor) -> State:
         """The state after a step of the leading unknowns, within the bounds of all parameters."""
-        vector = state.vector.clone()
-        vector[: len(step)] += step
-        return self.objective.at(state.unknowns, state.unknowns.clamped(vector))
+        return self.objective.at(state.unknowns, state.unknowns.stepped(state.vector, step))
 
     def _forget_weights(self) -> None:
         """Keep the Jacobians of the last equations, but not what follows from their weights."""

@@ -254,6 +254,30 @@ class Unknowns:
         joined = self._joined(frame.prior_deviation() for frame in self.frames)
         return joined[: self.where("amplitude").start]
 
+    def stepped(self, vector: Tensor, step: Tensor) -> Tensor:
+        """The vector after a step of the leading unknowns, within the bounds of all parameters.
+
+        The image is linear in the light of companions, the product of flux and contrast, and not in
+        both factors. The step is therefore that of the light, and the contrast follows from it.
+        """
+        moved = vector.clone()
+        moved[: len(step)] += step
+        before, after = self._flux_with_companions(vector), self._flux_with_companions(moved)
+        if before > 0 and after > 0:
+            companions = self.where("companions")
+            contrasts = slice(companions.start, companions.stop, 3)
+            change = after / before - 1
+            moved[contrasts] = (moved[contrasts] + change * vector[contrasts]) / (1 + change)
+        return self.clamped(moved)
+
+    def _flux_with_companions(self, vector: Tensor) -> float:
+        """Flux of the star summed over the frames that show companions."""
+        return sum(
+            frame.level("flux", part.of_unknowns(vector))
+            for frame, part in zip(self.frames, self.rows, strict=True)
+            if frame.shows_companions
+        )
+
     def clamped(self, vector: Tensor) -> Tensor:
         """Clip every parameter to its bounds."""
         vector = vector.clone()

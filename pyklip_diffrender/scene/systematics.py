@@ -172,6 +172,10 @@ class Systematics:
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Write to a FITS file, atomically.
 
+        PATTERN is residual over star, PATTERN_ERROR its standard deviation. The header of PATTERN
+        has STARX and STARY (position of the star, 0-indexed), COLUMN and ROW (first pixel on the
+        detector), PEDESTAL, FILTER and CORONMSK.
+
         Parameters
         ----------
         path : path

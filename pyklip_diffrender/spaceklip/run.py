@@ -80,6 +80,19 @@ def run_obs(
     are needed. The products are added to ``database.red`` and the candidates to ``database.src``.
     Every file is judged before the first fit as `pyklip_diffrender.Sequence.from_files` judges it.
 
+    Files of each concatenation have the prefix ``<mode>_NANNU1_NSUBS1_<concatenation>``:
+
+    - ``-KLmodes-all.fits``: the subtracted image, north up, with spaceKLIP's and pyKLIP's keywords;
+    - ``-throughput.fits``, ``-snr.fits``: throughput, and S/N of a point source;
+    - ``-results.ecsv``: candidates, in the columns of ``extract_companions``;
+    - ``-KLmodes-all_cal_seps.npy``, ``_cal_cons.npy``, ``_cal_maskcons.npy``: 5-sigma contrast
+      curve with the small-sample correction, as ``calibrate_contrast`` saves it;
+    - ``-frames.ecsv``: every file, its use and the reason;
+    - a folder with the files of `pyklip_diffrender.Detection.write`, and ``fit.fits``.
+
+    ``<concatenation>.dat`` is its table, and ``<concatenation>_psfmask.fits`` the transmission of
+    the mask, if the table names the rolls' mask files.
+
     Parameters
     ----------
     database : spaceKLIP.database.Database
