@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-__all__ = ["PLACES", "SIDE", "calints", "starlight"]
+__all__ = ["CENTER", "PLACES", "SIDE", "calints", "starlight"]
 
 SIDE = 180
 CENTER = (88.0, 91.0)

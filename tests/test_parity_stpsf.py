@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from pyklip_diffrender.optics import JWST_DIAMETER, LyotStop, OpticalSystem
 NPIX = 256
 CALL = {
     "monochromatic": 4.5e-6,
-    "fft_oversample": 8,
+    "fft_oversample": 4,
     "detector_oversample": 2,
     "fov_pixels": 80,
 }
@@ -119,6 +120,8 @@ def test_images_agree_to_rounding(stpsf_path: Path, case: str) -> None:
     """Much closer than required: both sample the same points."""
     options, changes = CASES[case]
     instrument, call = nircam(stpsf_path, **options), {**CALL, **changes}
+    if "nlambda" in call:
+        call["nlambda"] = 3  # Their weights show in three as in the benchmark's nine.
     truth = instrument.calc_psf(**call)
     model = from_webbpsf(instrument, **call)
     psf = model.calc_psf()
@@ -136,15 +139,15 @@ def test_the_default_sampling_is_good_enough(stpsf_path: Path) -> None:
     call = {**CALL, "fov_pixels": 60}
     for options in (BARE, {}):
         instrument = nircam(stpsf_path, **options)
-        truth = instrument.calc_psf(**call)[1].data
-        image = from_webbpsf(instrument, **{**call, "fft_oversample": 4})().numpy()
+        truth = instrument.calc_psf(**{**call, "fft_oversample": 8})[1].data
+        image = from_webbpsf(instrument, **call)().numpy()
         assert np.abs(image - truth).max() <= (1e-7 if options else 1e-3) * truth.max()
 
 
 @pytest.mark.parametrize("propagation", ["compact", "fft"])
 def test_either_propagation(stpsf_path: Path, propagation: str) -> None:
     instrument = nircam(stpsf_path)
-    call = {**CALL, "fft_oversample": 4, "detector_oversample": 1}
+    call = {**CALL, "detector_oversample": 1}
     truth = instrument.calc_psf(**call)[0].data
     model = from_webbpsf(instrument, propagation=propagation, **call)
     assert model.propagation == {"MASK335R": propagation}
@@ -210,15 +213,13 @@ FULL = {"fft_oversample": 2, "detector_oversample": 1, "fov_pixels": 80}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["ND squares, 0.6 arcsec", "pupil shift, rotation, offset"])
-def test_converted_models_agree_on_the_official_files(official: Path, case: str) -> None:
-    """To rounding, DET_SAMP and DET_DIST, at 1024 samples."""
-    instrument = nircam(official, 1024, **CASES[case][0])
+def test_converted_models_agree_on_the_official_files(official: Path) -> None:
+    """To rounding at 1024 samples, with ND squares, a moved stop, and all of the detector."""
+    instrument = nircam(official, 1024, **CASES["pupil shift, rotation, offset"][0])
     call = {**FULL, "monochromatic": 4.5e-6}
-    truth = instrument.calc_psf(**call)
-    for distorted, name in ((False, "DET_SAMP"), (True, "DET_DIST")):
-        image = from_webbpsf(instrument, add_distortion=distorted, **call)().numpy()
-        assert np.abs(image - truth[name].data).max() <= 1e-11 * truth[name].data.max()
+    truth = instrument.calc_psf(**call)["DET_DIST"].data
+    image = from_webbpsf(instrument, add_distortion=True, **call)().numpy()
+    assert np.abs(image - truth).max() <= 1e-11 * truth.max()
 
 
 # Every mask in both channels: stpsf's aperture, a filter and a wavelength in it.
@@ -249,14 +250,14 @@ def test_the_embedded_occulter_is_that_of_stpsf(stpsf_path: Path, name: str) -> 
     aperture, band, wavelength = PLACES[name]
     mask, place = (*aperture.split("_")[2:], None)[:2]
     call = {**FULL, "fft_oversample": 4, "fov_pixels": 60, "monochromatic": wavelength}
+    embedded = nircam_coronagraph(
+        band, image_mask=mask, bar_place=place, npix=NPIX, occulter_sampling=4, route="planes"
+    )
     for star, limit, limit_of_bars in (((0.0, 0.0), 2e-7, 1e-2), ((0.35, -0.2), 1e-8, 1e-3)):
         options = {**BARE, "source_offset_x": star[0], "source_offset_y": star[1]}
         instrument = nircam(stpsf_path, band=band, image_mask=mask, aperture=aperture, **options)
         truth = instrument.calc_psf(**call)[1].data
         model = from_webbpsf(instrument, **call)
-        embedded = nircam_coronagraph(
-            band, image_mask=mask, bar_place=place, npix=NPIX, occulter_sampling=4, route="planes"
-        )
         assert embedded.detector.pixelscale == pytest.approx(model.detector.pixelscale, abs=1e-9)
         planes = [embedded.planes[0] if plane.name == mask else plane for plane in model.planes]
         assert embedded.planes[0] in planes
@@ -314,24 +315,37 @@ WRONG: dict[str, dict[str, Any]] = {
 }
 
 
-def differences(official: Path, case: str, wrong: dict[str, Any]) -> list[float]:
-    """Mean difference between the embedded coronagraph and stpsf, and the mean light, in rings."""
-    mask, band, wavelength, tilt_free, theirs, ours, _ = EMBEDDED[case]
-    x, y = 0.05, -0.03
-    options = {**BARE, "jitter": None, "source_offset_x": x, "source_offset_y": y, **theirs}
+OFFSET = (0.05, -0.03)
+"""Of the star from the mask, arcsec."""
+
+
+@cache
+def by_stpsf(official: Path, case: str) -> tuple[np.ndarray, torch.Tensor, Any]:
+    """Image, OPD, and the Zernike coefficients of the instrument."""
+    mask, band, wavelength, _, options, _, _ = EMBEDDED[case]
+    offset = dict(zip(("source_offset_x", "source_offset_y"), OFFSET, strict=True))
+    options = {**BARE, "jitter": None, **offset, **options}
     instrument = nircam(official, 1024, band=band, image_mask=mask, **options)
     call = {**FULL, "monochromatic": wavelength}
-    truth = instrument.calc_psf(**call, add_distortion=False)[1].data
+    image = instrument.calc_psf(**call, add_distortion=False)[1].data
     opd = from_webbpsf(instrument, **call).entrance.opd
+    assert opd is not None
+    return image, opd, instrument._get_aberrations().zernike_coeffs
+
+
+def differences(official: Path, case: str, wrong: dict[str, Any]) -> list[float]:
+    """Mean difference between the embedded coronagraph and stpsf, and the mean light, in rings."""
+    mask, band, wavelength, tilt_free, _, ours, _ = EMBEDDED[case]
+    truth, opd, aberrations = by_stpsf(official, case)
     settings = {
         "image_mask": mask,
-        "si_wfe": instrument._get_aberrations().zernike_coeffs,
+        "si_wfe": aberrations,
         "chromatic_reference": tilt_free,
         **ours,
         **wrong,
     }
     model = nircam_coronagraph(band, monochromatic=wavelength, **settings)
-    error = np.abs(model(opd, (x, y)).numpy() - truth)
+    error = np.abs(model(opd, OFFSET).numpy() - truth)
     rows, columns = np.mgrid[:80, :80] - 39.5
     radius = np.hypot(rows, columns)
     rings = [

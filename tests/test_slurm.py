@@ -38,7 +38,13 @@ def test_a_survey_runs_in_jobs_of_slurm(tmp_path: Path, shared_data: Path) -> No
         [options]
         size = 24
         systematics = "off"
-        settings = {{cycles = [4.0], max_iterations = 3}}
+        [options.settings]
+        cycles = [4.0]
+        max_iterations = 3
+        response_npix = 64
+        response_wavelengths = 1
+        accurate_steps = false
+        companions_if_stalled = false
 
         [[sequence]]
         files = "{shared_data / "hip65426_f444w_calints.fits.gz"}"
