@@ -93,6 +93,7 @@ def run_demo(
     separation: float = 0.6,
     position_angle: float = 54.0,
     hours: float = 40.0,
+    size: int = 80,
     seed: int = 1,
     progress: bool = False,
     device: str = "cpu",
@@ -105,6 +106,8 @@ def run_demo(
         The planet, in arcsec and degrees.
     hours : float
         Age of the wavefront map.
+    size : int
+        Side of the frame in pixels.
     seed : int
         Random seed of wavefront, drift and noise.
     progress : bool
@@ -117,7 +120,7 @@ def run_demo(
     model = nircam_coronagraph(
         "F444W",
         monochromatic=4.5e-6,
-        fov_pixels=80,
+        fov_pixels=size,
         segment_gap=PAPER_SEGMENT_GAP,
         device=device,
     )
