@@ -307,6 +307,19 @@ def test_parameter_jacobian_keeps_the_order_of_names(
     torch.testing.assert_close(both[1:], offset, rtol=1e-12, atol=0)
 
 
+@pytest.mark.parametrize(
+    ("filter_name", "mask", "npix"),
+    [("F182M", "MASKSWB", 256), ("F250M", "MASKLWB", 256), ("F480M", "MASKLWB", 128),
+     ("F182M", "MASK335R", 128)],
+)  # fmt: skip
+def test_copies_of_the_star_do_not_touch_the_mask(filter_name: str, mask: str, npix: int) -> None:
+    """Half a bar is 10 arcsec long, and images of 128 samples at 1.8 um repeat after 7 arcsec."""
+    model = nircam_coronagraph(filter_name, image_mask=mask, npix=512, fov_pixels=32)
+    coarse = coarse_copy(model)
+    assert coarse.npix == npix
+    assert coarse_copy(coarse) is coarse
+
+
 def test_coarse_copy_is_coarser_or_the_model_itself() -> None:
     model = system()
     coarse = coarse_copy(model, 64)

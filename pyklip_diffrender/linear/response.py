@@ -20,6 +20,7 @@ from pyklip_diffrender.linear.last_pupil import LastPupil
 from pyklip_diffrender.linear.mode_fields import ModeFields
 from pyklip_diffrender.optics.batches import batch_of
 from pyklip_diffrender.optics.grid import samples_for_field
+from pyklip_diffrender.optics.planes import CompactOcculter
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.bases import Basis
 
@@ -46,7 +47,9 @@ _PIECE = 16
 def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
     """Return the number of pupil samples of `coarse_copy`."""
     detector = model.detector
-    field = max(n * s for n, s in zip(detector.shape[::-1], detector.pixelscale, strict=True))
+    sides = [n * s for n, s in zip(detector.shape[::-1], detector.pixelscale, strict=True)]
+    masks = [plane.field for plane in model.planes if isinstance(plane, CompactOcculter)]
+    field = max([*sides, *masks])
     while npix < samples_for_field(field, min(model.bandpass.wavelengths), model.diameter):
         npix *= 2
     if "npix" not in model.adjustable or model.npix <= npix or model.npix % npix:
@@ -58,7 +61,8 @@ def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
     """Return a cheaper copy of a model for derivatives, with coarse cells and single precision.
 
     If the pupil grid of the model is fixed, or is already as coarse, the model itself is returned.
-    For a wide field the number of samples is doubled until the image does not repeat inside it.
+    For a wide field or mask the number of samples is doubled until the image does not repeat inside
+    it.
     """
     npix = coarse_npix(model, npix)
     if npix == model.npix:

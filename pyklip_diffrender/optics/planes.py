@@ -55,6 +55,9 @@ __all__ = [
 
 Values = Mapping[str, Tensor]
 
+_STAR = 2.0
+"""Radius of a star's image, arcsec: light beyond it is too faint to matter behind a mask."""
+
 
 @dataclass(frozen=True)
 class Wavefront:
@@ -349,6 +352,11 @@ class CompactOcculter(Plane):
 
     def compact(self, wavelength: float, dtype: torch.dtype, device: torch.device) -> Self:
         return self
+
+    @property
+    def field(self) -> float:
+        """Least period of the star's image, arcsec, for a copy of it not to touch the mask."""
+        return self.radius + _STAR
 
     def cells(self, wavelength: float) -> tuple[Tensor, Tensor, Tensor]:
         """Cell positions along x and along y (radians), and 1 - t on the cells."""
