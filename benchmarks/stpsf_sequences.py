@@ -87,13 +87,16 @@ def _planets(*places: tuple[float, float, float]) -> tuple[Planet, ...]:
 
 
 WIDE = (7, 3)
+BAR = (9, 3)
+"""Along a bar the star is bright, and three wavelengths would show as separate speckles."""
+
 SHORT = _planets((1.5e-4, 0.45, 40.0), (4e-5, 0.75, 210.0))
 CASES = {
     case.name: case
     for case in (
         Case("F210M", "MASK335R", "NRCA2_FULL_MASK335R", 56, SHORT),
         Case("F460M", "MASKLWB", "NRCA5_FULL_MASKLWB_F460M", 32,
-             _planets((1e-4, 0.65, 80.0), (5e-5, 0.85, 240.0))),
+             _planets((1e-4, 0.65, 80.0), (5e-5, 0.85, 240.0)), BAR),
         Case("F210M", "MASK210R", "NRCA2_FULL_MASK210R", 56, SHORT),
         Case("F444W", "MASK335R", "NRCA5_FULL_MASK335R", 32,
              _planets((5e-5, 0.65, 40.0), (2e-5, 0.85, 210.0)), WIDE),
@@ -101,7 +104,7 @@ CASES = {
              _planets((5e-5, 0.70, 40.0), (2e-5, 0.85, 210.0)), WIDE),
         Case("F200W", "MASK335R", "NRCA2_FULL_MASK335R", 56, SHORT, WIDE),
         Case("F210M", "MASKSWB", "NRCA4_FULL_MASKSWB_F210M", 56,
-             _planets((1.5e-4, 0.45, 80.0), (4e-5, 0.75, 240.0))),
+             _planets((1.5e-4, 0.45, 80.0), (4e-5, 0.75, 240.0)), BAR),
     )
 }  # fmt: skip
 
