@@ -31,6 +31,7 @@ from pyklip_diffrender.detection.field import (
 from pyklip_diffrender.detection.groups import groups_of, weigh
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.measurement import contrasts_at
+from pyklip_diffrender.detection.position_errors import with_position_of_star
 from pyklip_diffrender.detection.raised_peaks import with_raised_peaks
 from pyklip_diffrender.detection.relinearise import (
     lacks_candidates,
@@ -174,7 +175,7 @@ def detect(
         snr=maps.snr() / factors,
         residual_snr=maps.snr(maps.without(candidates)) / factors,
         error_factor=factor,
-        sources=candidates,
+        sources=with_position_of_star(maps.groups, candidates),
         false_alarm=false_alarm,
         rings=chi2_by_ring(maps.groups, candidates.offsets, factor),
         threshold=threshold,

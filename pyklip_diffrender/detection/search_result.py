@@ -193,7 +193,8 @@ class Detection:
         with a date the epoch, and for calibrated frames the flux density and the AB magnitude.
 
         Errors are standard deviations, with all parameters of the star marginalised. Those of
-        positions do not include errors of the pixel scale and of the roll angle. The error of the
+        positions include the error of the star's position behind the mask, and do not include
+        errors of the pixel scale and of the roll angle. The error of the
         contrast includes the errors of the star's flux (10 % for real frames, unless
         ``reduce(star_flux=...)`` says it) and of the source's own image; that of the flux density
         does not depend on the star's flux. The S/N includes neither, because they do not change the

@@ -209,6 +209,10 @@ class Templates:
             self._rendered[key] = torch.stack(parts)
         return self._rendered[key]
 
+    def place_of(self, k: int, offset: Tensor) -> Tensor:
+        """Position of a planet from the occulter in frame k, (2,), arcsec."""
+        return self._star(self.frames[k]) + self._turned(k, offset)
+
     def image(self, k: int, offset: Tensor, change: Tensor | None = None) -> Tensor:
         """One planet in frame k, as a fraction of the star's light, (ny, nx).
 
@@ -221,8 +225,7 @@ class Templates:
             Of the fitted wavefront, m.
         """
         frame = self.frames[k]
-        star = self._star(frame) + self._turned(k, offset)
-        values = {**frame.optical_values, "star_offset": star}
+        values = {**frame.optical_values, "star_offset": self.place_of(k, offset)}
         opd = _as_tensor(frame.opd)
         return frame.model(opd if change is None else opd + change, **values).double()
 

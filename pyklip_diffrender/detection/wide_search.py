@@ -16,6 +16,7 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.contrast import contrast_table
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.field import Image, far_from, ring_pixels, separation_of
+from pyklip_diffrender.detection.position_errors import with_position_of_star
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.detection.whole_frames import WholeFrame
@@ -102,7 +103,9 @@ def wide_field(
     outer[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
     outer[rows, columns] = False
     information, measured, factor = _search(frames, outer, grid, threshold, detection)
-    sources = _candidates(measured)
+    # The star's displacement is that of a source at half the height of the fitted frame.
+    halfway = torch.tensor([0.0, float(np.abs(detection.grid[..., 1]).max()) / 2])
+    sources = with_position_of_star(detection.groups, _candidates(measured), halfway.double())
     numerator = np.sum(
         [each.on_first(grid, each.products(each.residual))[0] for each in frames], axis=0
     )

@@ -127,10 +127,19 @@ class LinearModel:
         """Posterior covariance of all unknowns, (unknowns, unknowns)."""
         return torch.cholesky_inverse(self._factor) * self._scale[:, None] * self._scale
 
+    def covariances(self, combinations: Tensor) -> Tensor:
+        """Posterior covariance, (k, k), of linear combinations of the unknowns, (unknowns, k)."""
+        solved = self._solved(combinations)
+        return solved.T @ solved
+
     def variances(self, combinations: Tensor) -> Tensor:
         """Posterior variances, (k,), of linear combinations of the unknowns, (unknowns, k)."""
+        return self._solved(combinations).square_().sum(dim=0)
+
+    def _solved(self, combinations: Tensor) -> Tensor:
+        """L^-1 of combinations of the unknowns, (unknowns, k)."""
         scaled = combinations * self._scale[:, None]
-        return torch.linalg.solve_triangular(self._factor, scaled, upper=False).square_().sum(dim=0)
+        return torch.linalg.solve_triangular(self._factor, scaled, upper=False)
 
     @cached_property
     def step(self) -> Tensor:

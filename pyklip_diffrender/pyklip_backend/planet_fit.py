@@ -57,6 +57,7 @@ def planet_cards(
     from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
     from pyklip_diffrender.detection.error_inflation import default_factor
     from pyklip_diffrender.detection.groups import groups_of
+    from pyklip_diffrender.detection.position_errors import with_position_of_star
 
     cards = fits.Header()
     start, resolution = part.from_star(planet.offset), part.resolution
@@ -73,6 +74,7 @@ def planet_cards(
     if not (np.hypot(*moved) < resolution and flux > 0):
         logger.info("no source within lambda/D of the planet of the forward model")
         return cards
+    sources = with_position_of_star(groups, sources)
     covariance = sources.covariance.numpy().reshape(3, len(sources), 3, len(sources))[:, -1, :, -1]
     if error_factor is None:
         error_factor = default_factor([part.result], groups, sources)
