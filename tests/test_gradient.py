@@ -222,7 +222,7 @@ def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
     errors = same._solve(state.unknowns, fine, errors=True).variance.sqrt()
     assert (direct / errors).norm() > 10
     for step in steps:
-        assert ((step - direct) / errors).norm() < 0.2
+        assert ((step - direct) / errors).norm() < 0.3
     assert ((too_coarse - direct) / errors).norm() > 10
 
 

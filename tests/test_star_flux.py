@@ -91,7 +91,7 @@ def test_contrasts_refer_to_the_catalogues_star(fit: Refinement, share: float) -
     ratio = (now["flux_density"] / then["flux_density"]).value
     assert ratio == pytest.approx(1.0, abs=6e-3)
     # That of the star, and of what a star held at a wrong flux leaves.
-    assert 0.05 < now["contrast_error"] / now["contrast"] < 0.08
+    assert 0.05 < now["contrast_error"] / now["contrast"] < 0.1
 
 
 @pytest.mark.slow
