@@ -35,7 +35,9 @@ def with_position_of_star(
 ) -> Candidates:
     """Add the error of the star's position to the covariance of candidates' positions.
 
-    The star's unknowns and the noise in the candidates' pixels are taken as independent.
+    The star's unknowns and the noise in the candidates' pixels are taken as independent. Errors of
+    a companion so bright that its light counts in the star's derivatives contain that of the star
+    already, and become too large by up to the square root of 2.
 
     Parameters
     ----------
