@@ -223,7 +223,7 @@ def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
     assert (direct / errors).norm() > 10
     for step in steps:
         assert ((step - direct) / errors).norm() < 0.3
-    assert ((too_coarse - direct) / errors).norm() > 10
+    assert ((too_coarse - direct) / errors).norm() > 5
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 3])

@@ -108,6 +108,6 @@ def _products(
         weighted = columns * frame.weight.to(columns.device) ** 2
         matrix = torch.tensordot(weighted, columns, dims=[[1, 2], [1, 2]])
     # Products that do not depend on any row have derivatives as well.
-    products = torch.tensordot(weighted, source, dims=2) + 0.0 * change.sum()
+    products = torch.tensordot(weighted, source, dims=2).cpu() + 0.0 * change.sum()
     by_row = [torch.autograd.grad(each, change, retain_graph=True)[0] for each in products]
-    return matrix.cpu(), torch.stack(by_row, dim=1).cpu()
+    return matrix.cpu(), torch.stack(by_row, dim=1)
