@@ -9,9 +9,8 @@ has drifted since its map. Each has one companion: of contrast 1e-5 to 1e-2 at .
 most the edge of the frame), every fifth one of .01 to .1 at such separations. It counts as found if
 a candidate is within half a lambda/D; one that is not found is explained if it is fainter than the
 curve at its separation, with the small-sample correction that the threshold has, or nearer to the
-star than the curve begins. The script prints a
-line for each that is not found or has other candidates beside it, the counts, and how far the
-contrasts are from the truth in units of their errors.
+star than the curve begins. The script prints a line for each that is not found or has other
+candidates beside it, the counts, and how far contrasts are from the truth in units of their errors.
 """
 
 from __future__ import annotations
@@ -71,9 +70,8 @@ def searched(seed: int, **settings: Any) -> Outcome:
         return Outcome("the fit says that it failed", words)
     result = dr.detect(fit)
     table = result.candidates
-    away = np.hypot(
-        table["x"].value - planet.offset[0], table["y"].value - planet.offset[1]
-    )  # fmt: skip
+    x, y = planet.offset
+    away = np.hypot(table["x"].value - x, table["y"].value - y)
     near = away < 0.5 * model.resolution
     false = tuple(table["snr"][~near].tolist())
     if near.any():

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import embedded_table
+from pyklip_diffrender.optics.planes import STAR_RADIUS
 
 __all__ = [
     "FILTERS",
@@ -212,7 +213,7 @@ class DetectorPlace:
     def field(self) -> float:
         """Least period of the star's image, arcsec, for a copy of it not to touch the mask."""
         bar = isinstance(MASKS[self.mask], BarMask)
-        return _HALF_BAR + abs(self.offset) + 2.0 if bar else 0.0
+        return _HALF_BAR + abs(self.offset) + STAR_RADIUS if bar else 0.0
 
     @property
     def header_detector(self) -> str:

@@ -43,6 +43,7 @@ from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, transform
 from pyklip_diffrender.optics.zernike import zernike_basis
 
 __all__ = [
+    "STAR_RADIUS",
     "CompactOcculter",
     "EntrancePupil",
     "InternalAberration",
@@ -55,7 +56,7 @@ __all__ = [
 
 Values = Mapping[str, Tensor]
 
-_STAR = 2.0
+STAR_RADIUS = 2.0
 """Radius of a star's image, arcsec: light beyond it is too faint to matter behind a mask."""
 
 
@@ -356,7 +357,7 @@ class CompactOcculter(Plane):
     @property
     def field(self) -> float:
         """Least period of the star's image, arcsec, for a copy of it not to touch the mask."""
-        return self.radius + _STAR
+        return self.radius + STAR_RADIUS
 
     def cells(self, wavelength: float) -> tuple[Tensor, Tensor, Tensor]:
         """Cell positions along x and along y (radians), and 1 - t on the cells."""

@@ -57,8 +57,8 @@ def pattern_size(fit: Refinement) -> tuple[float, float] | None:
     >>> settings = dr.GaussNewton(cycles=6)
     >>> fit = dr.refine(model, frames, opd, settings=settings, systematics=known)
     >>> size, error = pattern_size(fit)
-    >>> print(f"{size:.1f} +- {error:.1f}")
-    0.2 +- 0.0
+    >>> print(f"{size:.2f} +- {error:.2f}")
+    0.25 +- 0.02
     """
     if fit.systematics is None:
         return None

@@ -29,9 +29,9 @@ _TINY = 1e-9
 _ADVICE = {
     Status.CONVERGED: "The stated errors and limits can be used as they are.",
     Status.MODEL_MISMATCH: (
-        "Real frames without a known flat-field pattern often end so. The errors have been scaled "
-        "to the scatter in the S/N map, but faint candidates deserve a second look: see whether "
-        "they are in every roll and whether they look like a point source. Check the filter, the "
+        "Real frames often end so, above all where the flat-field pattern is not known or light is "
+        "extended. The errors have been scaled to the scatter in the S/N map, but faint candidates "
+        "deserve a second look: see whether they are in every roll and whether they look like a point source. Check the filter, the "
         "masks and the date of the wavefront map."
     ),
     Status.PRIOR_MISMATCH: (
