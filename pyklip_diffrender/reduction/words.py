@@ -31,8 +31,8 @@ _ADVICE = {
     Status.MODEL_MISMATCH: (
         "Real frames often end so, above all where the flat-field pattern is not known or light is "
         "extended. The errors have been scaled to the scatter in the S/N map, but faint candidates "
-        "deserve a second look: see whether they are in every roll and whether they look like a point source. Check the filter, the "
-        "masks and the date of the wavefront map."
+        "deserve a second look: see whether they are in every roll and whether they look like a "
+        "point source. Check the filter, the masks and the date of the wavefront map."
     ),
     Status.PRIOR_MISMATCH: (
         "The errors have been scaled to the scatter in the S/N map. Repeat the fit with "
