@@ -105,12 +105,15 @@ class BarMask:
         2.2.0, class ``NIRCam_BandLimitedCoron``).
     offset : float
         x of the star from the middle of the bar, arcsec.
+    longest : float or None
+        Distance from the star along x up to which the bar is modelled, arcsec; None is all of it.
     """
 
     name: str
     widens: int
     scale: Polynomial
     offset: float = 0.0
+    longest: float | None = None
 
     stop = "MASKBAR"
     """The Lyot stop that is made for it."""
@@ -118,7 +121,9 @@ class BarMask:
     @property
     def reach(self) -> tuple[float, float]:
         """Half the sides of the rectangle about the star beyond which the mask is clear, arcsec."""
-        return _HALF_BAR + abs(self.offset), 2 * math.pi / float(self.scale(_WIDTHS[1]))
+        x = min(_HALF_BAR + abs(self.offset), self.longest or math.inf)
+        widest = self._width(torch.tensor([-x, x], dtype=torch.float64) + self.offset).max()
+        return x, 2 * math.pi / float(self.scale(float(widest)))
 
     def complement(self, x: Tensor, y: Tensor) -> Tensor:
         """Amplitude that the mask removes, 1 - t.
@@ -128,17 +133,21 @@ class BarMask:
         x, y : Tensor
             Angles from the star's place on the bar, arcsec, broadcast against each other.
         """
-        x, y = torch.broadcast_tensors(x + self.offset, y)
-        narrow, wide = _WIDTHS
-        along = 0.5 + self.widens * x / (2 * _HALF_WEDGE)
-        width = (narrow + (wide - narrow) * along).clamp(narrow, wide)
-        s = torch.as_tensor(self.scale(width.numpy())) * y.abs()
-        inside = (s < 2 * math.pi) & (x.abs() <= _HALF_BAR)
+        x, y = torch.broadcast_tensors(x, y)
+        on_bar = x + self.offset
+        s = torch.as_tensor(self.scale(self._width(on_bar).numpy())) * y.abs()
+        inside = (s < 2 * math.pi) & (on_bar.abs() <= _HALF_BAR) & (x.abs() <= self.reach[0])
         return torch.where(inside, torch.sinc(s / math.pi) ** 2, 0.0)
 
-    def at(self, offset: float) -> Self:
-        """Return the mask with the star at another place along the bar, arcsec from its middle."""
-        return replace(self, offset=offset)
+    def _width(self, on_bar: Tensor) -> Tensor:
+        """Half width at half maximum, lambda/D, at places along the bar, arcsec from its middle."""
+        narrow, wide = _WIDTHS
+        along = 0.5 + self.widens * on_bar / (2 * _HALF_WEDGE)
+        return (narrow + (wide - narrow) * along).clamp(narrow, wide)
+
+    def at(self, offset: float, longest: float | None = None) -> Self:
+        """Return the mask with the star at another place, arcsec from the middle of the bar."""
+        return replace(self, offset=offset, longest=longest)
 
 
 _HALF_BAR = 10.0
@@ -209,11 +218,18 @@ class DetectorPlace:
         """Scale in arcsec per pixel, the square scale that stpsf 2.2.0 uses before distortion."""
         return sum(self.siaf_pixelscale) / 2
 
-    @property
-    def field(self) -> float:
-        """Least period of the star's image, arcsec, for a copy of it not to touch the mask."""
-        bar = isinstance(MASKS[self.mask], BarMask)
-        return _HALF_BAR + abs(self.offset) + STAR_RADIUS if bar else 0.0
+    def period(self, bar_reach: float | None = None) -> float:
+        """Least period of the star's image, arcsec, for a copy of it not to touch a bar.
+
+        Parameters
+        ----------
+        bar_reach : float, optional
+            See `nircam_coronagraph`.
+        """
+        mask = MASKS[self.mask]
+        if isinstance(mask, RoundMask):
+            return 0.0
+        return mask.at(self.offset, bar_reach).reach[0] + STAR_RADIUS
 
     @property
     def header_detector(self) -> str:

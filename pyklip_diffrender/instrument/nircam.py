@@ -100,6 +100,7 @@ def nircam_coronagraph(
     defaults: Mapping[str, Value] | None = None,
     npix: int = 1024,
     occulter_sampling: float | None = None,
+    bar_reach: float | None = None,
     route: str = "auto",
     dtype: torch.dtype = torch.float64,
     device: str | torch.device = "cpu",
@@ -163,6 +164,9 @@ def nircam_coronagraph(
     occulter_sampling : float, optional
         Cells per lambda/D in the occulter's disc: the minimum for the route "lattice" (default 2),
         the exact number for the route "planes" (default 4).
+    bar_reach : float, optional
+        Distance from the star up to which a bar is modelled, arcsec; default all of it. With 4
+        arcsec, images of 56 pixels in F210M change by 5e-4 of their peak.
     route : "auto", "lattice" or "planes"
         See `OpticalSystem`.
     dtype : torch.dtype
@@ -193,7 +197,7 @@ def nircam_coronagraph(
     _require_supported(place, recipe)
     bandpass = _bandpass(recipe)
     detector = _detector(place, recipe)
-    _require_samples(npix, place if image_mask else None, detector, bandpass)
+    _require_samples(npix, place.period(bar_reach) if image_mask else 0.0, detector, bandpass)
     amplitude = _pupil(npix, recipe["segment_gap"], pupil).to(detector.device)
     return OpticalSystem(
         EntrancePupil(amplitude, JWST_DIAMETER, dtype, name="JWST pupil"),
@@ -213,6 +217,7 @@ def _in_plain_numbers(recipe: dict[str, Any]) -> dict[str, Any]:
         ("monochromatic", u.m, "positive"),
         ("fov_arcsec", u.arcsec, "positive"),
         ("segment_gap", u.m, "not negative"),
+        ("bar_reach", u.arcsec, "positive"),
         ("chromatic_reference", u.m, "positive"),
     )
     for name, unit, bound in bounds:
@@ -277,11 +282,9 @@ def _detector(place: DetectorPlace, recipe: Mapping[str, Any]) -> Detector:
     )
 
 
-def _require_samples(
-    npix: int, place: DetectorPlace | None, detector: Detector, bandpass: Bandpass
-) -> None:
+def _require_samples(npix: int, period: float, detector: Detector, bandpass: Bandpass) -> None:
     (ny, nx), (x, y) = detector.shape, detector.pixelscale
-    field = max(nx * x, ny * y, 0.0 if place is None else place.field)
+    field = max(nx * x, ny * y, period)
     needed = samples_for_field(field, min(bandpass.wavelengths))
     if npix < needed:
         raise IncompatibleSetupError(
@@ -297,7 +300,7 @@ def _planes(place: DetectorPlace, bandpass: Bandpass, recipe: Mapping[str, Any])
     if recipe["image_mask"] is not None:
         mask, sampling = require_mask(place.mask), recipe["occulter_sampling"]
         if isinstance(mask, BarMask):
-            mask = mask.at(place.offset)
+            mask = mask.at(place.offset, recipe["bar_reach"])
         planes.append(
             CompactOcculter(
                 mask.complement, mask.reach, sampling, JWST_DIAMETER, dtype, device, mask.name

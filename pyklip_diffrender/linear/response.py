@@ -20,7 +20,7 @@ from pyklip_diffrender.linear.last_pupil import LastPupil
 from pyklip_diffrender.linear.mode_fields import ModeFields
 from pyklip_diffrender.optics.batches import batch_of
 from pyklip_diffrender.optics.grid import samples_for_field
-from pyklip_diffrender.optics.planes import CompactOcculter
+from pyklip_diffrender.optics.planes import STAR_RADIUS, CompactOcculter
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.bases import Basis
 
@@ -46,11 +46,10 @@ _PIECE = 16
 
 def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
     """Return the number of pupil samples of `coarse_copy`."""
-    detector = model.detector
-    sides = [n * s for n, s in zip(detector.shape[::-1], detector.pixelscale, strict=True)]
-    masks = [plane.field for plane in model.planes if isinstance(plane, CompactOcculter)]
-    field = max([*sides, *masks])
-    while npix < samples_for_field(field, min(model.bandpass.wavelengths), model.diameter):
+    masks = [plane.radius for plane in model.planes if isinstance(plane, CompactOcculter)]
+    reach = _bar_reach(model) or max(masks, default=0.0)
+    period = max(_field(model), reach + STAR_RADIUS)
+    while npix < samples_for_field(period, min(model.bandpass.wavelengths), model.diameter):
         npix *= 2
     if "npix" not in model.adjustable or model.npix <= npix or model.npix % npix:
         return model.npix
@@ -58,18 +57,36 @@ def coarse_npix(model: OpticalSystem, npix: int = 128) -> int:
 
 
 def coarse_copy(model: OpticalSystem, npix: int = 128) -> OpticalSystem:
-    """Return a cheaper copy of a model for derivatives, with coarse cells and single precision.
+    """Return a cheaper copy of a model for derivatives.
 
-    If the pupil grid of the model is fixed, or is already as coarse, the model itself is returned.
-    For a wide field or mask the number of samples is doubled until the image does not repeat inside
-    it.
+    It has fewer pupil samples, coarse cells, single precision, and of a bar only the part within
+    `STAR_RADIUS` of the field. If the pupil grid of the model is fixed, or is already as coarse,
+    the model itself is returned. For a wide field or mask the number of samples is doubled until
+    the image does not repeat inside it.
     """
-    npix = coarse_npix(model, npix)
-    if npix == model.npix:
+    if "npix" not in model.adjustable or model.npix <= npix:
         return model
-    cells = min(_CELLS, model.recipe.get("occulter_sampling") or _CELLS)
-    coarser = {"npix": npix, "occulter_sampling": cells, "dtype": torch.float32}
+    coarser = {
+        "npix": coarse_npix(model, npix),
+        "occulter_sampling": min(_CELLS, model.recipe.get("occulter_sampling") or _CELLS),
+        "bar_reach": _bar_reach(model),
+        "dtype": torch.float32,
+    }
     return model.with_fidelity(**{k: v for k, v in coarser.items() if k in model.adjustable})
+
+
+def _field(model: OpticalSystem) -> float:
+    """Side of the detector, arcsec."""
+    detector = model.detector
+    return max(n * s for n, s in zip(detector.shape[::-1], detector.pixelscale, strict=True))
+
+
+def _bar_reach(model: OpticalSystem) -> float | None:
+    """Distance from the star up to which a bar matters for derivatives, arcsec; None: no bar."""
+    bars = [p for p in model.planes if isinstance(p, CompactOcculter) and p.reach[0] > p.reach[1]]
+    if not bars or "bar_reach" not in model.adjustable:
+        return None
+    return min(bars[0].reach[0], _field(model) / 2 + STAR_RADIUS)
 
 
 def downsample(opd: Tensor, npix: int) -> Tensor:

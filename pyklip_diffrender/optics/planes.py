@@ -354,11 +354,6 @@ class CompactOcculter(Plane):
     def compact(self, wavelength: float, dtype: torch.dtype, device: torch.device) -> Self:
         return self
 
-    @property
-    def field(self) -> float:
-        """Least period of the star's image, arcsec, for a copy of it not to touch the mask."""
-        return self.radius + STAR_RADIUS
-
     def cells(self, wavelength: float) -> tuple[Tensor, Tensor, Tensor]:
         """Cell positions along x and along y (radians), and 1 - t on the cells."""
 

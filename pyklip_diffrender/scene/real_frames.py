@@ -107,7 +107,7 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
         shortest = float(filter_throughput(observation.filter)[0][0])
         (ny, nx), (x, y) = observation.shape, place.siaf_pixelscale
         npix = _NPIX
-        while npix < samples_for_field(max(nx * x, ny * y, place.field), shortest):
+        while npix < samples_for_field(max(nx * x, ny * y, place.period()), shortest):
             npix *= 2
         arguments |= {
             "image_mask": name,
