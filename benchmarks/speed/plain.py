@@ -45,11 +45,13 @@ def plain_poppy(
     import poppy
     import torch
     from astropy import units as u
+    from poppy.accel_math import ensure_not_on_gpu, xp
 
     class Occulter(poppy.optics.AnalyticImagePlaneElement):
         def get_transmission(self, wave: Any) -> Array:
-            y, x = (torch.from_numpy(np.asarray(a)) for a in self.get_coordinates(wave))
-            return np.asarray(1 - MASKS["MASK335R"].complement(x, y))
+            on_cpu = map(ensure_not_on_gpu, self.get_coordinates(wave))
+            y, x = (torch.from_numpy(np.asarray(a)) for a in on_cpu)
+            return xp.asarray((1 - MASKS["MASK335R"].complement(x, y)).numpy())
 
     def optic(name: str, transmission: NDArray[Any], path: NDArray[Any]) -> Any:
         # As the exit pupil has them: y inverted.
