@@ -71,11 +71,12 @@ class Case:
     filter: str
     mask: str
     aperture: str
-    size: int
     planets: tuple[Planet, ...]
     nlambda: tuple[int, int] = (3, 1)
     """Number of wavelengths of the star and of planets."""
     flux: float = 3e7
+    size: int = 80
+    """Side of the fitted square, pixels."""
 
     @property
     def name(self) -> str:
@@ -94,16 +95,16 @@ SHORT = _planets((1.5e-4, 0.45, 40.0), (4e-5, 0.75, 210.0))
 CASES = {
     case.name: case
     for case in (
-        Case("F210M", "MASK335R", "NRCA2_FULL_MASK335R", 56, SHORT),
-        Case("F460M", "MASKLWB", "NRCA5_FULL_MASKLWB_F460M", 32,
+        Case("F210M", "MASK335R", "NRCA2_FULL_MASK335R", SHORT),
+        Case("F460M", "MASKLWB", "NRCA5_FULL_MASKLWB_F460M",
              _planets((1e-4, 0.65, 80.0), (5e-5, 0.85, 240.0)), BAR),
-        Case("F210M", "MASK210R", "NRCA2_FULL_MASK210R", 56, SHORT),
-        Case("F444W", "MASK335R", "NRCA5_FULL_MASK335R", 32,
+        Case("F210M", "MASK210R", "NRCA2_FULL_MASK210R", SHORT),
+        Case("F444W", "MASK335R", "NRCA5_FULL_MASK335R",
              _planets((5e-5, 0.65, 40.0), (2e-5, 0.85, 210.0)), WIDE),
-        Case("F356W", "MASK430R", "NRCA5_FULL_MASK430R", 32,
+        Case("F356W", "MASK430R", "NRCA5_FULL_MASK430R",
              _planets((5e-5, 0.70, 40.0), (2e-5, 0.85, 210.0)), WIDE),
-        Case("F200W", "MASK335R", "NRCA2_FULL_MASK335R", 56, SHORT, WIDE),
-        Case("F210M", "MASKSWB", "NRCA4_FULL_MASKSWB_F210M", 56,
+        Case("F200W", "MASK335R", "NRCA2_FULL_MASK335R", SHORT, WIDE),
+        Case("F210M", "MASKSWB", "NRCA4_FULL_MASKSWB_F210M",
              _planets((1.5e-4, 0.45, 80.0), (4e-5, 0.75, 240.0)), BAR),
     )
 }  # fmt: skip
