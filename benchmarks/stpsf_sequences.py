@@ -177,13 +177,15 @@ def write_frames(case: Case, folder: Path, references: int = 0) -> Path:
     hdu = fits.PrimaryHDU(opd, header)
     hdu.header["BUNIT"] = "m"
     hdu.writeto(before, overwrite=True)
-    rng = np.random.default_rng(335)
+    # Of its own for every case: errors of planets at the same place are independent.
+    rng = np.random.default_rng(list(case.name.encode()))
+    seeds = rng.integers(2**31, size=1 + len(ROLLS) + references)
     flat = 1 + FLAT_ERROR * rng.normal(size=(SIDE, SIDE))
     flagged = rng.random((SIDE, SIDE)) < FLAGGED
     hot = rng.integers(SIDE // 2 - 15, SIDE // 2 + 15, (UNFLAGGED, 2))
-    changed = opd + _change(1, DRIFT, opd)
+    changed = opd + _change(int(seeds[0]), DRIFT, opd)
     for k, (roll, star) in enumerate(zip(ROLLS, STARS, strict=True), 1):
-        now = changed + _change(10 + k, BETWEEN, opd)
+        now = changed + _change(int(seeds[k]), BETWEEN, opd)
         light = image(nircam, case, now, header, star, case.nlambda[0])
         for planet in case.planets:
             away = np.add(star, planet.rotated(-roll).offset)
@@ -191,7 +193,7 @@ def write_frames(case: Case, folder: Path, references: int = 0) -> Path:
             light = light + planet.contrast * source
         _write(case, folder, "HD 1", k, roll, flat * case.flux * light, flagged, hot)
     for k, dither in enumerate(DITHERS[:references], len(ROLLS) + 1):
-        now = changed + _change(10 + k, BETWEEN, opd)
+        now = changed + _change(int(seeds[k]), BETWEEN, opd)
         light = image(nircam, case, now, header, dither, case.nlambda[0])
         _write(case, folder, "HD 2", k, 120.0, 2 * flat * case.flux * light, flagged, hot)
     return before
@@ -226,11 +228,12 @@ def _write(
         for row, column in hot:
             arrays["SCI"][:, row, column] += 20 * arrays["ERR"][:, row, column]
 
+    minute = list(CASES.values()).index(case)  # The noise is drawn by the date.
     name = f"jw01184{k:03d}001_03106_00001_{place.header_detector.lower()}_calints.fits"
     path = folder / "frames" / name
     path.unlink(missing_ok=True)
     calints(
-        path, star, observation=k, roll=roll, date=f"2022-10-03T0{k}:00:00", cards=cards,
+        path, star, observation=k, roll=roll, date=f"2022-10-03T0{k}:{minute:02}:00", cards=cards,
         light=light, change=spoil,
     )  # fmt: skip
 
