@@ -394,8 +394,7 @@ def test_pixels_that_the_fit_left_out_are_named() -> None:
     valid = frame.observation.valid.copy()
     valid[0, 3, 5] = False
     fitted = replace(frame, observation=replace(frame.observation, valid=valid))
-    fits = (replace(whole.detection.fits[0], frames=(fitted,)),)
-    summary = summarise(replace(whole, detection=replace(whole.detection, fits=fits)))
+    summary = summarise(replace(whole, fit=replace(whole.fit, frames=(fitted,))))
     (place,) = summary["frames"][0]["bad_pixels"]
     assert place == pytest.approx(frame.grid[3, 5], abs=6e-4)
     assert f"({place[0]:+.2f}, {place[1]:+.2f})" in page(summary, [], [], [], [])

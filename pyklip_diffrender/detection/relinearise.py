@@ -112,7 +112,8 @@ def with_companions(
         if not has_only_reference_stars(fit):
             # Companions of a fit have the orientation of its own first frame.
             roll = fit.frames[0].observation.roll_from(origin)
-            fit = refine_again(fit, companions=candidates.planets(roll), progress=progress)
+            again = refine_again(fit, companions=candidates.planets(roll), progress=progress)
+            fit = replace(again, seconds=fit.seconds + again.seconds)
         refined.append(fit)
     return refined
 

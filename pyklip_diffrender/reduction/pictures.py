@@ -195,7 +195,7 @@ def star_pictures(reduction: Reduction, frame: int) -> list[Picture]:
 
 def wavefront_pictures(reduction: Reduction, summary: Mapping[str, Any]) -> list[Picture]:
     """The wavefront before and after the fit."""
-    fit, about = reduction.detection.fits[0], summary["wavefront_map"]
+    fit, about = reduction.fit, summary["wavefront_map"]
     before, after = wavefronts(fit)
     rms = [number(about[f"{key}rms_nm"], ".1f", "nm") for key in ("", "refined_", "change_")]
     figures, axes = _panels(3)

@@ -211,7 +211,7 @@ class _Run:
                 fractions = completeness(detection, progress=self.progress)
         return Reduction(
             sequence,
-            fit,
+            detection.fits[0],
             detection,
             choice.references,
             choice.systematics,

@@ -73,9 +73,8 @@ def write_products(
     """
     written = reduction.detection.write(folder, overwrite=True)
     if fit:
-        # The fit that was searched: with the candidates in the model, if the star was fitted again.
-        searched = reduction.detection.fits[0]
-        written.append(searched.write(folder / "fit.fits", linear=derivatives, overwrite=True))
+        path = folder / "fit.fits"
+        written.append(reduction.fit.write(path, linear=derivatives, overwrite=True))
     if reduction.wide is not None:
         written += reduction.wide.write(folder, overwrite=True)
     if reduction.disk is not None:
@@ -124,7 +123,7 @@ def _write_report(
     summary = summarise(reduction, klip)
     injections, fractions = reduction.injections, reduction.completeness
     curve = reduction.detection.contrast_curve
-    frames = range(min(len(reduction.detection.fits[0].frames), MOST_FRAMES))
+    frames = range(min(len(reduction.fit.frames), MOST_FRAMES))
     text = page(
         summary,
         overview_pictures(overview, summary),

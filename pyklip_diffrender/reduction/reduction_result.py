@@ -36,7 +36,8 @@ class Reduction:
     sequence : Sequence
         The frames, cut to the fitted pixels.
     fit : Refinement
-        All frames of the target, fitted together; without the light of a disk, if that was fitted.
+        The fit that was searched: all frames of the target together, with the bright candidates in
+        the model, and without the light of a disk, if that was fitted.
     detection : Detection
     references : tuple of Refinement
         One for each reference star that was fitted.

@@ -46,8 +46,7 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
         Keys end in the unit of their values; None stands for what is not known.
     """
     sequence, detection = reduction.sequence, reduction.detection
-    # What was searched: a bright companion is fitted once more, with the star.
-    fit = detection.fits[0]
+    fit = reduction.fit
     first = sequence.science[0]
     dates = [each.date for each in sequence.science if each.date is not None]
     summary = {
@@ -106,7 +105,7 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
         ],
         "settings": _settings(fit.settings),
         "seed": fit.seed,
-        "seconds": _seconds(reduction, fit),
+        "seconds": sum(each.seconds for each in (fit, *reduction.references)),
         "versions": {
             "pyklip_diffrender": __version__,
             "python": platform.python_version(),
@@ -288,12 +287,6 @@ def _bad_pixels(observation: Observation, fitted: FrameFit) -> list[list[float]]
     """x, y from the star, arcsec, of good pixels of the file that the fit has left out."""
     left_out = observation.valid.any(axis=0) & ~fitted.observation.valid.any(axis=0)
     return [[round(float(v), 3) for v in place] for place in fitted.grid[left_out]]
-
-
-def _seconds(reduction: Reduction, fit: Refinement) -> float:
-    """Of all fits; those that never ran again count once."""
-    fits = {id(each): each.seconds for each in (reduction.fit, fit, *reduction.references)}
-    return sum(fits.values())
 
 
 def _settings(settings: Any) -> dict[str, Any]:
