@@ -11,7 +11,6 @@ import poppy
 import torch
 from astropy import units as u
 from numpy.typing import NDArray
-from poppy.accel_math import xp
 from poppy.poppy_core import PlaneType
 from torch import Tensor
 
@@ -42,7 +41,6 @@ from pyklip_diffrender.bridges.sampling import (
     MaskStack,
     complement_box,
     pupil_phasor,
-    to_numpy,
 )
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, native_float64, to_metres
@@ -187,7 +185,7 @@ class Conversion:
             oversample=self.osys.oversample,
         )
         if padded:
-            wave.wavefront = xp.ones((self.sampled * self.osys.oversample,) * 2, dtype=complex)
+            wave.wavefront = np.ones((self.sampled * self.osys.oversample,) * 2, dtype=complex)
             wave.ispadded = True
         return wave
 
@@ -327,7 +325,7 @@ class Conversion:
             if transposed:  # Optics expect x to grow along the second axis of the array.
                 local_x, local_y = local_x.T, local_y.T
             wave = ImageSamples(wavelength, diameter, oversample, local_x, local_y)
-            blocked = torch.from_numpy(1 - to_numpy(optic.get_phasor(wave)).astype(complex))
+            blocked = torch.from_numpy(1 - np.asarray(optic.get_phasor(wave), dtype=complex))
             return blocked.T if transposed else blocked
 
         return complement
@@ -358,7 +356,7 @@ class Conversion:
                 axis[None, :].expand(count, count),
                 axis[:, None].expand(count, count),
             )
-            phasor = np.broadcast_to(to_numpy(optic.get_phasor(wave)), (count, count))
+            phasor = np.broadcast_to(np.asarray(optic.get_phasor(wave)), (count, count))
             return to_system.apply_to_lattice(torch.from_numpy(np.array(phasor, dtype=complex)))
 
         return FourierMask(transmission, padding, self.npix, diameter, optic.name)

@@ -17,7 +17,6 @@ from torch import Tensor
 from pyklip_diffrender.bridges.convert import Conversion
 from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
 from pyklip_diffrender.bridges.sampled_planes import PupilOptic
-from pyklip_diffrender.bridges.sampling import to_numpy
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_metres
 from pyklip_diffrender.optics.bandpass import Bandpass
@@ -308,7 +307,7 @@ def opd_to_poppy(opd: Any, osys: poppy.OpticalSystem) -> poppy.OpticalSystem:
     wave = changed.input_wavefront(1e-6 * u.m)
     replacement = poppy.ArrayOpticalElement(
         name=first.name,
-        transmission=np.array(np.broadcast_to(to_numpy(first.get_transmission(wave)), wave.shape)),
+        transmission=np.array(np.broadcast_to(first.get_transmission(wave), wave.shape)),
         opd=resample(to_metres(opd, "opd"), wave.shape[0]),
         pixelscale=wave.pixelscale,
         planetype=PlaneType.pupil,

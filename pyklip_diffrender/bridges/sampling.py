@@ -1,7 +1,4 @@
-"""Evaluate poppy's optics at chosen positions.
-
-With CuPy installed, the arrays of poppy are on the GPU; those of this package are not.
-"""
+"""Evaluate poppy's optics at chosen positions."""
 
 from __future__ import annotations
 
@@ -15,22 +12,13 @@ import poppy
 import torch
 from astropy import units as u
 from numpy.typing import NDArray
-from poppy.accel_math import ensure_not_on_gpu, xp
 from poppy.poppy_core import PlaneType
 from scipy.special import jn_zeros
 from torch import Tensor
 
 from pyklip_diffrender.bridges.image_masks import Box
 
-__all__ = [
-    "COMPACT_OPTICS",
-    "ImageSamples",
-    "MaskStack",
-    "Part",
-    "complement_box",
-    "pupil_phasor",
-    "to_numpy",
-]
+__all__ = ["COMPACT_OPTICS", "ImageSamples", "MaskStack", "Part", "complement_box", "pupil_phasor"]
 
 Array = NDArray[Any]
 
@@ -64,14 +52,14 @@ class ImageSamples(poppy.Wavefront):
             pixelscale=spacing * u.arcsec / u.pix,
         )
         # Only its shape is used, so it needs no memory.
-        self.wavefront = xp.broadcast_to(xp.asarray(1 + 0j), tuple(x.shape))
+        self.wavefront = np.broadcast_to(np.complex128(1), tuple(x.shape))
         self.planetype = PlaneType.image
         self._last_transform_type = "FFT"
         self._positions = (y, x)
 
-    def coordinates(self) -> tuple[Any, Any]:
+    def coordinates(self) -> tuple[Array, Array]:
         """Copies of y and x, because optics shift and rotate them in place."""
-        return xp.array(self._positions[0].numpy()), xp.array(self._positions[1].numpy())
+        return self._positions[0].numpy().copy(), self._positions[1].numpy().copy()
 
 
 class MaskStack:
@@ -95,13 +83,8 @@ class MaskStack:
         """Product of the transmissions."""
         product = np.ones(wave.shape, dtype=np.complex128)
         for optic in self.optics:
-            product = product * to_numpy(optic.get_phasor(wave))
+            product = product * np.asarray(optic.get_phasor(wave))
         return product
-
-
-def to_numpy(array: Any) -> Array:
-    """Return an array of poppy's as one of numpy."""
-    return np.asarray(ensure_not_on_gpu(array))
 
 
 def pupil_phasor(optic: Any, wave: poppy.Wavefront) -> tuple[Array, Array]:
@@ -110,11 +93,11 @@ def pupil_phasor(optic: Any, wave: poppy.Wavefront) -> tuple[Array, Array]:
     Some optics tilt the given wave instead of returning an OPD; the tilt then is part of the
     transmission.
     """
-    phasor = to_numpy(optic.get_phasor(wave)).astype(np.complex128)
-    changed = to_numpy(wave.wavefront)
+    phasor = np.asarray(optic.get_phasor(wave), dtype=np.complex128)
+    changed = np.asarray(wave.wavefront)
     if (changed != 1).any():
         phasor = phasor * changed
-    opd = to_numpy(optic.get_opd(wave)).astype(np.float64)
+    opd = np.asarray(optic.get_opd(wave), dtype=np.float64)
     if opd.size == 1:
         opd = opd.reshape(())
     elif opd.shape != phasor.shape:
@@ -228,7 +211,7 @@ def _nircam_parts(optic: Any) -> list[Part]:
             torch.linspace(x0 - 10, x0 + 10, 401, dtype=torch.float64)[None, :].expand(401, 401),
             torch.linspace(y0, y0 + 20, 401, dtype=torch.float64)[:, None].expand(401, 401),
         )
-        rows = np.flatnonzero((to_numpy(bare.get_transmission(wide)) < 1).any(axis=1))
+        rows = np.flatnonzero((bare.get_transmission(wide) < 1).any(axis=1))
         half = (rows[-1] + 2) * 20 / 400
         parts = [Part(_around((x0, y0), 10.0, half), bare)]
     if not optic.nd_squares:

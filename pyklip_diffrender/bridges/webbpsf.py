@@ -6,6 +6,7 @@ import os
 from collections.abc import Collection, Mapping
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from astropy import units as u
 from astropy.io import fits
@@ -14,7 +15,6 @@ from pyklip_diffrender.bridges.convert import Conversion
 from pyklip_diffrender.bridges.intermediates import intermediate_wavefronts
 from pyklip_diffrender.bridges.poppy import PoppySystem, check_supported, refuse_saving
 from pyklip_diffrender.bridges.sampled_planes import AberrationOptic
-from pyklip_diffrender.bridges.sampling import to_numpy
 from pyklip_diffrender.bridges.stpsf_instrument import (
     band,
     data_errors,
@@ -246,7 +246,7 @@ def from_webbpsf(
     first = osys.planes[0]
     # Before stpsf adds the field dependence, which is not blank outside the pupil.
     original = getattr(first, "_opd_original", first.opd)
-    check_opd(to_numpy(original), to_numpy(first.amplitude), "pupilopd")
+    check_opd(np.asarray(original), np.asarray(first.amplitude), "pupilopd")
     aberrations = _aberrations(osys)
     flipped = None if aberrations is None else _set_flip(aberrations, flip_si_wfe)
     conversion = Conversion(
@@ -307,12 +307,12 @@ def opd_to_webbpsf(opd: Any, nircam: Any) -> fits.HDUList:
     """
     instrument = private_copy(nircam)
     with data_errors():
-        amplitude = to_numpy(instrument._get_telescope_pupil_and_aberrations().amplitude)
+        amplitude = np.asarray(instrument._get_telescope_pupil_and_aberrations().amplitude)
     values = resample(to_metres(opd, "opd"), len(amplitude))
     check_opd(values, amplitude, "opd")
     hdus = opd_to_hdus(values)
     instrument.pupilopd = hdus
     with data_errors():
-        added = to_numpy(instrument._get_telescope_pupil_and_aberrations().opd) - values
+        added = np.asarray(instrument._get_telescope_pupil_and_aberrations().opd) - values
     hdus[0].data = values - added
     return hdus
