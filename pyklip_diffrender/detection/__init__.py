@@ -19,7 +19,7 @@ from pyklip_diffrender.detection.search import contrast_curve, detect, measure
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.true_positives import completeness, contrast_of_completeness
 from pyklip_diffrender.detection.wide_result import WideField
-from pyklip_diffrender.detection.wide_search import wide_field
+from pyklip_diffrender.detection.wide_search import require_outer_pixels, wide_field
 
 __all__ = [
     "Candidates",
@@ -38,6 +38,7 @@ __all__ = [
     "measure",
     "measured_planet",
     "recover_planets",
+    "require_outer_pixels",
     "wide_field",
     "with_planets",
 ]

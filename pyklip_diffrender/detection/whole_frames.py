@@ -104,7 +104,10 @@ class WholeFrame:
 
         combined = self.observation.combined()
         image = np.asarray(combined.data[0] - self.stars)
-        unused = ~combined.valid[0] | (separation_of(self.grid) < _CORE)
+        separation = separation_of(self.grid)
+        # Of a small frame, its outer part.
+        core = min(_CORE, 0.7 * float(separation.max()))
+        unused = ~combined.valid[0] | (separation < core)
         ground = Background2D(
             np.where(combined.valid[0], image, 0.0),
             _BOX,

@@ -25,7 +25,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import star_flux_error
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["wide_field"]
+__all__ = ["require_outer_pixels", "wide_field"]
 
 _log = logging.getLogger(__name__)
 
@@ -102,6 +102,8 @@ def wide_field(
     outer = np.zeros(grid.shape[:2], dtype=bool)
     outer[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
     outer[rows, columns] = False
+    if not outer.any():
+        require_outer_pixels(observations[0], len(detection.grid))
     information, measured, factor = _search(frames, outer, grid, threshold, detection)
     # The star's displacement is that of a source at half the height of the fitted frame.
     halfway = torch.tensor([0.0, float(np.abs(detection.grid[..., 1]).max()) / 2])
@@ -143,6 +145,28 @@ def wide_field(
         _curve(detection, error, information, grid, window, factor),
         tuple(frame.light(*_light_of(measured)) for frame in frames),
     )
+
+
+def require_outer_pixels(observation: Observation, size: int) -> None:
+    """Refuse a frame that is hardly larger than the fitted square.
+
+    Parameters
+    ----------
+    observation : Observation
+    size : int
+        Side of the fitted square, pixels.
+
+    Raises
+    ------
+    IncompatibleSetupError
+    """
+    ny, nx = observation.shape
+    if max(ny, nx) <= size + 2 * _EDGE:
+        raise IncompatibleSetupError(
+            f"wide: got {ny} x {nx} pixels in {observation.name}, expected more than "
+            f"{size + 2 * _EDGE} along an axis, for beyond the {size} fitted ones, {_EDGE} at "
+            "every edge are not searched. Choose a smaller size, or leave out wide"
+        )
 
 
 def _frames(detection: Detection, observations: Sequence[Observation]) -> list[WholeFrame]:

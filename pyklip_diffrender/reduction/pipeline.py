@@ -16,6 +16,7 @@ from pyklip_diffrender.detection import (
     detect,
     fit_disk,
     recover_planets,
+    require_outer_pixels,
     wide_field,
 )
 from pyklip_diffrender.errors import DiffrenderError
@@ -137,6 +138,8 @@ def prepare(sequence: Sequence, opd: Any, options: ReduceOptions) -> Preparation
             "without a wavefront map the star's flux, and contrasts with it, may be wrong by 40 %; "
             "give the flux as star_flux (--star-flux)"
         )
+    if options.wide:
+        require_outer_pixels(sequence.science[0], options.size)
     model = model_for(sequence.science[0], options.size, device=options.device)
     return Preparation(sequence, sequence.cutout(options.size), model, wavefront, options)
 
