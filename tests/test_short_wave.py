@@ -94,6 +94,8 @@ def test_a_planet_is_where_it_is_and_nothing_else(tmp_path: Path) -> None:
     frame, opd = calints(tmp_path, 0.0), random_opd(1, npix=256)
     result = reduce([frame], opd, size=SIZE, settings=settings)
     assert result.systematics is None
+    assert result.fit is result.detection.fits[0]
+    assert len(result.fit.companions) == 1
     table = result.detection.candidates
     assert len(table) == 1
     # Seven times the stated error, and the tenth by which the star's flux is uncertain.

@@ -148,7 +148,7 @@ def wide_field(
 
 
 def require_outer_pixels(observation: Observation, size: int) -> None:
-    """Refuse a frame that is hardly larger than the fitted square.
+    """Refuse a frame of which a search beyond the fitted square leaves no pixel.
 
     Parameters
     ----------
@@ -161,11 +161,12 @@ def require_outer_pixels(observation: Observation, size: int) -> None:
     IncompatibleSetupError
     """
     ny, nx = observation.shape
-    if max(ny, nx) <= size + 2 * _EDGE:
+    if max(ny, nx) <= size + 2 * _EDGE or min(ny, nx) <= 2 * _EDGE:
         raise IncompatibleSetupError(
             f"wide: got {ny} x {nx} pixels in {observation.name}, expected more than "
-            f"{size + 2 * _EDGE} along an axis, for beyond the {size} fitted ones, {_EDGE} at "
-            "every edge are not searched. Choose a smaller size, or leave out wide"
+            f"{size + 2 * _EDGE} along an axis and {2 * _EDGE} along the other: beyond the {size} "
+            f"fitted ones, {_EDGE} at every edge are not searched. Choose a smaller size, or leave "
+            "out wide"
         )
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import embedded_table
-from pyklip_diffrender.optics.planes import STAR_RADIUS
+from pyklip_diffrender.optics.grid import STAR_RADIUS
 
 __all__ = [
     "FILTERS",

@@ -19,8 +19,8 @@ from pyklip_diffrender.io.progress import ProgressBar
 from pyklip_diffrender.linear.last_pupil import LastPupil
 from pyklip_diffrender.linear.mode_fields import ModeFields
 from pyklip_diffrender.optics.batches import batch_of
-from pyklip_diffrender.optics.grid import samples_for_field
-from pyklip_diffrender.optics.planes import STAR_RADIUS, CompactOcculter
+from pyklip_diffrender.optics.grid import STAR_RADIUS, samples_for_field
+from pyklip_diffrender.optics.planes import CompactOcculter
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.bases import Basis
 

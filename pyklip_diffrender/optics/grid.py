@@ -19,6 +19,7 @@ from pyklip_diffrender.io.units import ARCSEC, native_float64
 
 __all__ = [
     "JWST_DIAMETER",
+    "STAR_RADIUS",
     "PupilGrid",
     "polygon_coverage",
     "resample",
@@ -29,6 +30,9 @@ __all__ = [
 
 JWST_DIAMETER = 6.603464
 """Circumscribed diameter of the primary, m (stpsf.constants 2.2.0)."""
+
+STAR_RADIUS = 2.0
+"""Radius of a star's image, arcsec: light beyond it is too faint to matter behind a mask."""
 
 
 @dataclass(frozen=True)

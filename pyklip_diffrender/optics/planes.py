@@ -43,7 +43,6 @@ from pyklip_diffrender.optics.grid import PupilGrid, polygon_coverage, transform
 from pyklip_diffrender.optics.zernike import zernike_basis
 
 __all__ = [
-    "STAR_RADIUS",
     "CompactOcculter",
     "EntrancePupil",
     "InternalAberration",
@@ -55,9 +54,6 @@ __all__ = [
 ]
 
 Values = Mapping[str, Tensor]
-
-STAR_RADIUS = 2.0
-"""Radius of a star's image, arcsec: light beyond it is too faint to matter behind a mask."""
 
 
 @dataclass(frozen=True)
