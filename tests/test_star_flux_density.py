@@ -95,3 +95,28 @@ def test_files_that_do_not_say_the_flux(tmp_path):
         dr.star_flux_density(path, "F444W")
     with pytest.raises(IncompatibleSetupError, match="F999W"):
         dr.star_flux_density(as_text(tmp_path), "F999W")
+
+
+def test_spectral_type():
+    # Colours of type A0V are close to zero in all bands: the flux is that of Vega, F444W 184 Jy and
+    # F210M 690 Jy (SVO filter profile service), within the error of the type's mean colours.
+    assert dr.star_flux_density("A0V, K=0", "F444W").value == pytest.approx(184, rel=0.07)
+    assert dr.star_flux_density("A0V, K=0", "F210M").value == pytest.approx(690, rel=0.05)
+    # A magnitude is a factor of 2.512; other ways to write it mean the same.
+    bright, faint = (dr.star_flux_density(f"M4, K={k}", "F356W").value for k in ("5", "6.0"))
+    assert bright / faint == pytest.approx(10**0.4)
+    assert dr.star_flux_density("M4V,K=5", "F356W").value == bright
+    # Between K5 and M5 the table has no W1 - W2; it has to increase from one to the other.
+    ratio = [
+        dr.star_flux_density(f"{each}, K=5", "F460M")
+        / dr.star_flux_density(f"{each}, K=5", "F356W")
+        for each in ("K5V", "M0V", "M2.5V", "M5V")
+    ]
+    assert np.all(np.diff(ratio) > 0)
+
+
+def test_spectral_types_that_are_not_known(tmp_path):
+    with pytest.raises(IncompatibleSetupError, match="got type B2, expected B5 to M9"):
+        dr.star_flux_density("B2V, K=5", "F444W")
+    with pytest.raises(FileNotFoundError, match=r'such as "A2V, K=6\.77"'):
+        dr.star_flux_density("K0III, K=5", "F444W")

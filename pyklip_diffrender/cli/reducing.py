@@ -51,7 +51,7 @@ def run_reduction(
     dry_run: bool,
     opd: str,
     opd_date: Rule | None,
-    star_sed: Path | None,
+    star_sed: str | None,
     **options: Any,
 ) -> None:
     """Reduce the epochs and filters of a target, write all products and say what they show.
@@ -117,12 +117,12 @@ def run_reduction(
         click.echo(dumps(summary, indent=2))
 
 
-def _with_flux(options: ReduceOptions, star_sed: Path | None, name: str | None) -> ReduceOptions:
+def _with_flux(options: ReduceOptions, star_sed: str | None, name: str | None) -> ReduceOptions:
     """Options with the star's flux density in a filter, from its spectrum if there is one."""
     if star_sed is None:
         return options
     flux = star_flux_density(star_sed, name or "unknown")
-    click.echo(f"star: {flux.value:.4g} Jy in {name}, by {star_sed.name}")
+    click.echo(f"star: {flux.value:.4g} Jy in {name}, by {Path(star_sed).name}")
     return replace(options, star_flux=flux)
 
 

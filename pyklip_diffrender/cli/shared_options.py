@@ -253,9 +253,10 @@ search = _all(
     option("--star-flux", metavar="FLUX", section="Fit and search",
            help='Flux density of the star in the filter, such as "0.45 Jy", to which contrasts '
                 "refer; default: what diffracted light says, to 10 %."),
-    option("--star-sed", type=file_type(), metavar="FILE", section="Fit and search",
+    option("--star-sed", metavar="FILE", section="Fit and search",
            help="Spectrum or photometry of the star, in place of --star-flux: two columns in "
-                "micron and Jy, a table with units, or a VOTable of VizieR's photometry viewer."),
+                "micron and Jy, a table with units, or a VOTable of VizieR's photometry viewer. "
+                'Or a dwarf\'s spectral type and K magnitude, such as "A2V, K=6.77".'),
     option("--star-flux-error", type=float, default=0.05, show_default=True, metavar="FRACTION",
            section="Fit and search", help="Relative error of --star-flux, at most 1."),
     option("--systematics", default="auto", show_default=True, metavar="CHOICE",

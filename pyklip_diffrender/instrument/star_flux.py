@@ -1,4 +1,4 @@
-"""Flux density of a star in a filter, from its spectrum or its photometry."""
+"""Flux density of a star in a filter, from its spectrum, its photometry or its spectral type."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
+from pyklip_diffrender.instrument.dwarf_stars import dwarf_photometry, is_dwarf
 from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.units import native_float64
@@ -31,8 +32,8 @@ _RANGE = (2e-6, 5.2e-6)
 _Spectrum = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def star_flux_density(path: str | os.PathLike[str], filter: str) -> u.Quantity:
-    r"""Flux density of a star in a NIRCam filter, from a file with its spectrum.
+def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
+    r"""Flux density of a star in a NIRCam filter, from its spectrum or its spectral type.
 
     It is the mean over detected photons,
     ``integral(F_nu T dnu / nu) / integral(T dnu / nu)`` with the throughput T of the filter, to
@@ -40,8 +41,9 @@ def star_flux_density(path: str | os.PathLike[str], filter: str) -> u.Quantity:
 
     Parameters
     ----------
-    path : path
-        File with the spectrum, see `read_spectrum`.
+    star : path or str
+        File with the spectrum, see `read_spectrum`; or spectral type of a dwarf (B5 to M9) and its
+        2MASS Ks magnitude, such as "A2V, K=6.77". From the type, the flux is good to about 5 %.
     filter : str
         Such as "F444W".
 
@@ -71,14 +73,19 @@ def star_flux_density(path: str | os.PathLike[str], filter: str) -> u.Quantity:
     ...     _ = path.write_text("3.0 0.9\n4.0 0.5\n5.0 0.3\n6.0 0.2\n")
     ...     print(dr.star_flux_density(path, "F444W").round(3))
     0.411 Jy
+
+    A2V with the K magnitude of HIP 65426:
+
+    >>> print(dr.star_flux_density("A2V, K=6.77", "F444W").round(3))
+    0.378 Jy
     """
     wavelength, throughput = filter_throughput(filter)
-    grid, flux = read_spectrum(path)
+    grid, flux = dwarf_photometry(str(star)) if is_dwarf(str(star)) else read_spectrum(star)
     inside = throughput > 0.01 * throughput.max()
     first, last = wavelength[inside][[0, -1]]
     if grid[0] > first or grid[-1] < last:
         raise IncompatibleSetupError(
-            f"{path}: the spectrum covers {grid[0] * 1e6:.3f} to {grid[-1] * 1e6:.3f} micron, the "
+            f"{star}: the spectrum covers {grid[0] * 1e6:.3f} to {grid[-1] * 1e6:.3f} micron, the "
             f"filter {filter} needs {first * 1e6:.3f} to {last * 1e6:.3f} micron"
         )
     fine = np.linspace(first, last, 4001)
@@ -118,7 +125,10 @@ def read_spectrum(path: str | os.PathLike[str]) -> _Spectrum:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a star's spectrum or photometry")
+        raise FileNotFoundError(
+            f"{path}: no such file; expected a star's spectrum or "
+            'photometry, or a spectral type and a K magnitude such as "A2V, K=6.77"'
+        )
     suffix = path.suffix.lower()
     is_photometry = suffix in (".vot", ".xml", ".votable")
     try:
