@@ -3,6 +3,7 @@
 Run from the root of the project, with stpsf installed and its data named by STPSF_PATH::
 
     STPSF_PATH=... python -m benchmarks.stpsf_sequences --output FOLDER [--cases NAME ...]
+        [--repeat N]
 
 Each case has two rolls of a star with two planets, as calints files with the headers of MAST. The
 images are stpsf's, with its internal wavefront errors, jitter, distortion, charge diffusion and
@@ -10,11 +11,13 @@ interpixel capacitance. The wavefront has drifted from stpsf's map, from which t
 and from roll to roll; the star is a few milliarcseconds from the middle of the mask. The flat field
 has an error of 2 % in every pixel, which nobody tells the reduction; pixels are bad, some of them
 without a flag; and there are photon and read noise. With ``--references`` a second, brighter star
-was observed at small dithers.
+was observed at small dithers. Other numbers of ``--repeat`` have other wavefronts, flat fields,
+bad pixels and noise.
 
 Prints a row for each case: planets that were found and missed, false candidates, pulls of flux and
 position, scatter of the S/N without the candidates, limits over those for a known star beyond 0.5
-arcsec, time of the processor and memory. What is finished in FOLDER is not repeated.
+arcsec, time of the processor and memory; then the rms of the pulls of everything that is finished
+in FOLDER, which is not repeated.
 """
 
 from __future__ import annotations
@@ -169,7 +172,7 @@ def image(
     return np.array(detected.data, dtype=float)
 
 
-def write_frames(case: Case, folder: Path, references: int = 0) -> Path:
+def write_frames(case: Case, folder: Path, references: int = 0, repeat: int = 0) -> Path:
     """Write the frames of a case and the map of before; returns the map."""
     nircam = instrument_of(case)
     opd, header = map_of(nircam)
@@ -178,7 +181,7 @@ def write_frames(case: Case, folder: Path, references: int = 0) -> Path:
     hdu.header["BUNIT"] = "m"
     hdu.writeto(before, overwrite=True)
     # Of its own for every case: errors of planets at the same place are independent.
-    rng = np.random.default_rng(list(case.name.encode()))
+    rng = np.random.default_rng([*case.name.encode(), *([repeat] if repeat else [])])
     seeds = rng.integers(2**31, size=1 + len(ROLLS) + references)
     flat = 1 + FLAT_ERROR * rng.normal(size=(SIDE, SIDE))
     flagged = rng.random((SIDE, SIDE)) < FLAGGED
@@ -191,11 +194,12 @@ def write_frames(case: Case, folder: Path, references: int = 0) -> Path:
             away = np.add(star, planet.rotated(-roll).offset)
             source = image(nircam, case, now, header, (away[0], away[1]), case.nlambda[1])
             light = light + planet.contrast * source
-        _write(case, folder, "HD 1", k, roll, flat * case.flux * light, flagged, hot)
+        _write(case, folder, "HD 1", k, roll, flat * case.flux * light, flagged, hot, repeat)
     for k, dither in enumerate(DITHERS[:references], len(ROLLS) + 1):
         now = changed + _change(int(seeds[k]), BETWEEN, opd)
         light = image(nircam, case, now, header, dither, case.nlambda[0])
-        _write(case, folder, "HD 2", k, 120.0, 2 * flat * case.flux * light, flagged, hot)
+        light = 2 * flat * case.flux * light
+        _write(case, folder, "HD 2", k, 120.0, light, flagged, hot, repeat)
     return before
 
 
@@ -205,7 +209,7 @@ def _change(seed: int, rms: float, opd: np.ndarray) -> np.ndarray:
 
 def _write(
     case: Case, folder: Path, star: str, k: int, roll: float, light: np.ndarray,
-    flagged: np.ndarray, hot: np.ndarray,
+    flagged: np.ndarray, hot: np.ndarray, repeat: int,
 ) -> None:  # fmt: skip
     place = detector_place(case.mask, case.filter, case.aperture.rpartition("_")[2]
                            if case.mask.endswith("WB") else None)  # fmt: skip
@@ -233,12 +237,12 @@ def _write(
     path = folder / "frames" / name
     path.unlink(missing_ok=True)
     calints(
-        path, star, observation=k, roll=roll, date=f"2022-10-03T0{k}:{minute:02}:00", cards=cards,
-        light=light, change=spoil,
+        path, star, observation=k, roll=roll, cards=cards, light=light, change=spoil,
+        date=f"2022-10-03T0{k}:{minute:02}:{repeat:02}",
     )  # fmt: skip
 
 
-def reduced(case: Case, folder: Path, references: int = 0) -> dict[str, Any]:
+def reduced(case: Case, folder: Path, references: int = 0, repeat: int = 0) -> dict[str, Any]:
     """Make the frames of a case, reduce them with the defaults, and compare with the truth."""
     done = folder / "result.json"
     if done.is_file():
@@ -248,7 +252,7 @@ def reduced(case: Case, folder: Path, references: int = 0) -> dict[str, Any]:
     made = time.process_time()
     before = folder / "opd_2022-10-01.fits"
     if len(list((folder / "frames").glob("*.fits"))) < len(ROLLS) + references:
-        before = write_frames(case, folder, references)
+        before = write_frames(case, folder, references, repeat)
     made = time.process_time() - made
     sequence = Sequence.from_files(folder / "frames", target="HD 1")
     began = time.process_time()
@@ -335,9 +339,19 @@ def line(result: dict[str, Any]) -> str:
     )
 
 
-def _run(name: str, folder: Path, references: int) -> dict[str, Any]:
+def pulls(results: list[dict[str, Any]]) -> str:
+    """Number, mean and rms of the pulls of all planets that were found."""
+    planets = [each for result in results for each in result["planets"] if "snr" in each]
+    words = []
+    for name in ("flux", "separation", "angle"):
+        values = np.array([each[f"{name}_pull"] for each in planets])
+        words.append(f"{name} {values.mean():+.2f}, {np.sqrt((values**2).mean()):.2f}")
+    return f"pulls of {len(planets)} planets, mean and rms: {'; '.join(words)}"
+
+
+def _run(name: str, folder: Path, references: int, repeat: int) -> dict[str, Any]:
     warnings.simplefilter("ignore")
-    return reduced(CASES[name], folder, references)
+    return reduced(CASES[name], folder, references, repeat)
 
 
 def main() -> None:
@@ -346,6 +360,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
     parser.add_argument("--references", type=int, default=0, choices=range(len(DITHERS) + 1))
+    parser.add_argument("--repeat", type=int, default=0, choices=range(60))
     options = parser.parse_args()
     columns = ["case", "found", "false", "S/N", "flux / truth", "pull of flux", "of separation",
                "of angle", "away, mas", "S/N scatter", "limits / known star", "status", "CPU s",
@@ -353,14 +368,18 @@ def main() -> None:
     print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|", flush=True)
     context = multiprocessing.get_context("spawn")
     for name in options.cases:
-        folder = options.output / f"{name.replace(' ', '_')}_{options.references}"
+        again = f"_{options.repeat}" if options.repeat else ""
+        folder = options.output / f"{name.replace(' ', '_')}_{options.references}{again}"
         with ProcessPoolExecutor(1, mp_context=context) as pool:
             try:
-                result = pool.submit(_run, name, folder, options.references).result()
+                about = (name, folder, options.references, options.repeat)
+                result = pool.submit(_run, *about).result()
             except Exception as error:
                 print(f"| {name} | {type(error).__name__}: {error} |", flush=True)
             else:
                 print(line(result), flush=True)
+    done = sorted(options.output.glob("*/result.json"))
+    print(pulls([json.loads(path.read_text(encoding="utf-8")) for path in done]))
 
 
 if __name__ == "__main__":
