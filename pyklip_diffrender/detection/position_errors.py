@@ -20,7 +20,9 @@ from torch import Tensor
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.groups import Group
+from pyklip_diffrender.detection.relinearise import SAME_SOURCE
 from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.linear import NANOMETRE, LinearModel, coarse_copy, downsample
 from pyklip_diffrender.optics.grid import PupilGrid
 
@@ -36,8 +38,8 @@ def with_position_of_star(
     """Add the error of the star's position to the covariance of candidates' positions.
 
     The star's unknowns and the noise in the candidates' pixels are taken as independent. Errors of
-    a companion so bright that its light counts in the star's derivatives contain that of the star
-    already, and become too large by up to the square root of 2.
+    a companion whose light counts in the derivatives by the star's unknowns contain that of the
+    star already, and do not change.
 
     Parameters
     ----------
@@ -57,10 +59,26 @@ def with_position_of_star(
     places = candidates.offsets if place is None else place[None]
     rates = [_rates(groups, each) for each in places]
     covariance = candidates.covariance.clone()
-    for k, (linear, _) in enumerate(groups):
+    for k, (_, templates) in enumerate(groups):
         changes = torch.stack([each[k] for each in rates], dim=2).expand(-1, -1, count)
-        covariance[count:, count:] += linear.covariances(changes.flatten(1))
+        changes = torch.where(_is_bright_companion(templates, candidates.offsets), 0.0, changes)
+        # A companion whose place is not known says nothing about that of the star.
+        linear = templates.fit.linear
+        of_star = torch.tensor([each.name != "companions" for each in linear.unknowns])
+        combinations = torch.zeros(len(of_star), 2 * count, dtype=torch.float64)
+        combinations[of_star] = changes.flatten(1)
+        covariance[count:, count:] += linear.covariances(combinations)
     return replace(candidates, covariance=covariance)
+
+
+def _is_bright_companion(templates: Templates, offsets: Tensor) -> Tensor:
+    """Which positions are those of companions in the derivatives of a fit, (k,)."""
+    fit = templates.fit
+    roll = fit.frames[0].observation.roll_from(templates.origin.observation)
+    turned = offsets @ torch.from_numpy(rotation_matrix(roll)).T
+    companions = torch.from_numpy(fit.bright_companions[:, 1:])
+    near = torch.cdist(turned, companions) < SAME_SOURCE * fit.model.resolution
+    return near.any(dim=1)
 
 
 def _rates(groups: Sequence[Group], offset: Tensor) -> list[Tensor]:

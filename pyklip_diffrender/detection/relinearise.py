@@ -15,13 +15,14 @@ from pyklip_diffrender.refinement import Refinement, refine_again
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
+    "SAME_SOURCE",
     "lacks_candidates",
     "unconfirmed_companions",
     "with_companions",
     "without_light",
 ]
 
-_NEAR = 0.25
+SAME_SOURCE = 0.25
 """lambda/D between a companion of a fit and a candidate that are the same source. Positions of
 sources above the threshold are known to a tenth of it."""
 
@@ -86,7 +87,7 @@ def _confirmed(
     near = np.hypot(*np.moveaxis(fit.companions[:, None, 1:] - places, -1, 0))
     difference = np.abs(fit.companions[:, None, 0] - contrasts)
     allowed = np.hypot(_SIMILAR * contrasts, _SIGMAS * fit.companion_errors[:, None, 0])
-    same = (near < _NEAR * fit.model.resolution) & (difference < allowed)
+    same = (near < SAME_SOURCE * fit.model.resolution) & (difference < allowed)
     return np.asarray(same.any(axis=1))
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from astropy.io import fits
 from astropy.table import QTable
 from astropy.time import Time
@@ -35,6 +36,7 @@ from pyklip_diffrender.refinement.fit_file import (
 from pyklip_diffrender.refinement.frame_fit import FrameFit, parameter_table
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.status import Status
+from pyklip_diffrender.refinement.unknowns import brightest
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.product_headers import primary_hdu
 from pyklip_diffrender.scene.systematics import Systematics
@@ -191,6 +193,11 @@ class Refinement:
     def planets(self) -> tuple[Planet, ...]:
         """The companions as planets; negative contrasts become 0."""
         return tuple(Planet.from_offset(max(c, 0.0), x, y) for c, x, y in self.companions.tolist())
+
+    @property
+    def bright_companions(self) -> Image:
+        """Those of `companions` whose light counts in the derivatives by the star, (k, 3)."""
+        return brightest(torch.from_numpy(self.companions)).numpy()
 
     @property
     def linear(self) -> LinearModel:

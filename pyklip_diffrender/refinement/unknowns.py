@@ -21,17 +21,35 @@ from pyklip_diffrender.linear.frames import FrameRows, Unknown
 from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.scene.objects import Planet
 
-__all__ = ["COMPANION_PRIOR", "FrameUnknowns", "Unknowns"]
+__all__ = ["COMPANION_PRIOR", "FrameUnknowns", "Unknowns", "brightest"]
 
 _LINEAR = tuple(p.name for p in LEVELS)
 
-_BRIGHT = 5e-3
+_BRIGHT = 1e-4
 """Contrast of a companion whose light counts in derivatives by optics, flux and wavefront. A change
-of the wavefront by 10 nm moves 1 % of it. Companions outshine what the mask leaves of the star from
-about 0.02."""
+of the wavefront by 10 nm moves 1 % of it, and 1e-6 of the star is as much as a planet at the limit.
+Without these derivatives, companions of 1e-3 have false candidates beside them."""
 
 COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 """Prior standard deviations of a companion's contrast, x and y (arcsec) about its start."""
+
+
+def brightest(sources: Tensor) -> Tensor:
+    """The brightest of companions, if its light depends noticeably on the wavefront.
+
+    One, because its derivatives take as long as those of the star.
+
+    Parameters
+    ----------
+    sources : Tensor, (companions, 3)
+        Contrast, x and y.
+
+    Returns
+    -------
+    Tensor, (0, 3) or (1, 3)
+    """
+    first = sources[sources[:, 0].argsort(descending=True)[:1]]
+    return first[first[:, 0] > _BRIGHT]
 
 
 @dataclass(frozen=True)
@@ -126,13 +144,8 @@ class FrameUnknowns:
         return vector[self.where("companions")].reshape(-1, 3)
 
     def bright_sources(self, vector: Tensor) -> Tensor:
-        """The brightest of `sources`, if its light depends noticeably on the wavefront, (k, 3).
-
-        One, because its derivatives take as long as those of the star.
-        """
-        sources = self.sources(vector)
-        brightest = sources[sources[:, 0].argsort(descending=True)[:1]]
-        return brightest[(brightest[:, 0] > _BRIGHT) & self.shows_companions]
+        """Those of `sources` whose light counts in the derivatives by the star, (k, 3)."""
+        return brightest(self.sources(vector)) if self.shows_companions else torch.zeros(0, 3)
 
     @property
     def turn(self) -> Tensor:
