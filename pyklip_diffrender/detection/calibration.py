@@ -12,6 +12,7 @@ from torch import Tensor
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.groups import Group
+from pyklip_diffrender.detection.relinearise import in_derivatives
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.linear.frames import LinearFrame
 from pyklip_diffrender.linear.mode_fields import NANOMETRE
@@ -42,7 +43,8 @@ def calibration_errors(
     image that depends on the wavefront, so errors of the wavefront and of the star's flux change
     the contrast in proportion. They do not change the significance of a source. Both come from
     the same posterior and may partly cancel. In real frames the posterior understates the error of
-    the star's flux, see `star_flux_error`, which is added.
+    the star's flux, see `star_flux_error`, which is added. Errors of a companion whose light counts
+    in the derivatives by the star's unknowns contain the posterior's already; only this is added.
 
     Parameters
     ----------
@@ -65,15 +67,17 @@ def calibration_errors(
     variance = torch.zeros(2 * count, dtype=torch.float64)
     for linear, templates in groups:
         changes = torch.zeros(len(linear.vector), 2 * count, dtype=torch.float64)
+        contained = in_derivatives(templates, offsets)
         for k, fitted in templates.frames.items():
             frame = linear.frames[k]
             on_rows = torch.zeros(len(frame.rows), 2 * count, dtype=torch.float64)
             for row, unknown in enumerate(frame.rows[: frame.first_mode].tolist()):
                 if linear.unknowns[unknown].name == "flux":
                     on_rows[row, :count] = 1 / fitted.flux
-            for j in torch.nonzero(snr > _CLEAR).flatten().tolist():
+            for j in torch.nonzero((snr > _CLEAR) & ~contained).flatten().tolist():
                 by_modes = _by_modes(templates, k, frame, offsets[j])
                 on_rows[frame.first_mode :, [j, count + j]] = by_modes[:, None]
+            on_rows[:, contained.repeat(2)] = 0.0
             changes += frame.onto_unknowns(on_rows, len(linear.vector)) / frames
         variance += linear.variances(changes)
     errors = factors * variance.sqrt().reshape(2, count)

@@ -20,9 +20,8 @@ from torch import Tensor
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.groups import Group
-from pyklip_diffrender.detection.relinearise import SAME_SOURCE
+from pyklip_diffrender.detection.relinearise import in_derivatives
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.linear import NANOMETRE, LinearModel, coarse_copy, downsample
 from pyklip_diffrender.optics.grid import PupilGrid
 
@@ -61,7 +60,7 @@ def with_position_of_star(
     covariance = candidates.covariance.clone()
     for k, (_, templates) in enumerate(groups):
         changes = torch.stack([each[k] for each in rates], dim=2).expand(-1, -1, count)
-        changes = torch.where(_is_bright_companion(templates, candidates.offsets), 0.0, changes)
+        changes = torch.where(in_derivatives(templates, candidates.offsets), 0.0, changes)
         # A companion whose place is not known says nothing about that of the star.
         linear = templates.fit.linear
         of_star = torch.tensor([each.name != "companions" for each in linear.unknowns])
@@ -69,16 +68,6 @@ def with_position_of_star(
         combinations[of_star] = changes.flatten(1)
         covariance[count:, count:] += linear.covariances(combinations)
     return replace(candidates, covariance=covariance)
-
-
-def _is_bright_companion(templates: Templates, offsets: Tensor) -> Tensor:
-    """Which positions are those of companions in the derivatives of a fit, (k,)."""
-    fit = templates.fit
-    roll = fit.frames[0].observation.roll_from(templates.origin.observation)
-    turned = offsets @ torch.from_numpy(rotation_matrix(roll)).T
-    companions = torch.from_numpy(fit.bright_companions[:, 1:])
-    near = torch.cdist(turned, companions) < SAME_SOURCE * fit.model.resolution
-    return near.any(dim=1)
 
 
 def _rates(groups: Sequence[Group], offset: Tensor) -> list[Tensor]:

@@ -6,23 +6,27 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import has_only_reference_stars
+from pyklip_diffrender.detection.templates import Templates
+from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.refinement import Refinement, refine_again
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
-    "SAME_SOURCE",
+    "in_derivatives",
     "lacks_candidates",
     "unconfirmed_companions",
     "with_companions",
     "without_light",
 ]
 
-SAME_SOURCE = 0.25
+_NEAR = 0.25
 """lambda/D between a companion of a fit and a candidate that are the same source. Positions of
 sources above the threshold are known to a tenth of it."""
 
@@ -49,6 +53,26 @@ def lacks_candidates(fits: Sequence[Refinement], candidates: Candidates) -> bool
         for fit in fits
         if not has_only_reference_stars(fit)
     )
+
+
+def in_derivatives(templates: Templates, offsets: Tensor) -> Tensor:
+    """Which sources are companions whose light counts in the derivatives of a fit, (k,).
+
+    Errors of such a source from the linear model contain those of the star and of the source's
+    image already.
+
+    Parameters
+    ----------
+    templates : Templates
+    offsets : Tensor, (k, 2)
+        x, y of the sources from the star, arcsec.
+    """
+    fit = templates.fit
+    roll = fit.frames[0].observation.roll_from(templates.origin.observation)
+    turned = offsets @ torch.from_numpy(rotation_matrix(roll)).T
+    companions = torch.from_numpy(fit.bright_companions[:, 1:])
+    near = torch.cdist(turned, companions) < _NEAR * fit.model.resolution
+    return near.any(dim=1)
 
 
 def unconfirmed_companions(
@@ -87,7 +111,7 @@ def _confirmed(
     near = np.hypot(*np.moveaxis(fit.companions[:, None, 1:] - places, -1, 0))
     difference = np.abs(fit.companions[:, None, 0] - contrasts)
     allowed = np.hypot(_SIMILAR * contrasts, _SIGMAS * fit.companion_errors[:, None, 0])
-    same = (near < SAME_SOURCE * fit.model.resolution) & (difference < allowed)
+    same = (near < _NEAR * fit.model.resolution) & (difference < allowed)
     return np.asarray(same.any(axis=1))
 
 

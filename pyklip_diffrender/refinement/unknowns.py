@@ -145,7 +145,8 @@ class FrameUnknowns:
 
     def bright_sources(self, vector: Tensor) -> Tensor:
         """Those of `sources` whose light counts in the derivatives by the star, (k, 3)."""
-        return brightest(self.sources(vector)) if self.shows_companions else torch.zeros(0, 3)
+        sources = self.sources(vector)
+        return brightest(sources) if self.shows_companions else sources[:0]
 
     @property
     def turn(self) -> Tensor:
