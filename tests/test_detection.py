@@ -479,7 +479,7 @@ def test_a_wavefront_that_is_known_adds_nothing_to_a_bright_contrasts_error(worl
     assert row["snr"] > 100
     # The fit's own error of the flux knows of the companion beside it, the map's does not.
     assert row["contrast_error"] == pytest.approx(expected, rel=2e-3)
-    assert row["contrast_error"] > 1.02 * row["contrast"] / row["snr"]
+    assert row["contrast_error"] > 1.01 * row["contrast"] / row["snr"]
     assert abs(row["contrast"] - 4e-4) < 4 * expected
 
 
@@ -489,9 +489,11 @@ def test_errors_of_a_companion_in_the_derivatives_count_star_and_image_once(larg
     (row,) = found.candidates
     assert len(found.fits[0].bright_companions) == 1
     assert row["contrast_error"] == pytest.approx(row["contrast"] / row["snr"])
-    # They are in the error of the linear model: photon noise alone is smaller by far.
-    photon = float(found.measure([WHERE.offset])["contrast_error"][0])
-    assert row["contrast_error"] > 1.5 * photon
+    # They are in the error of the linear model, which is larger than for a source whose image and
+    # star are known.
+    distance = np.hypot(*np.moveaxis(found.grid - WHERE.offset, -1, 0))
+    known = float(found.photon_error[np.unravel_index(distance.argmin(), distance.shape)])
+    assert row["contrast_error"] > 1.2 * known
     assert abs(row["contrast"] - 1e-3) < 4 * row["contrast_error"]
 
 
