@@ -196,7 +196,7 @@ class Refinement:
 
     @property
     def bright_companions(self) -> Image:
-        """Those of `companions` whose light counts in the derivatives by the star, (k, 3)."""
+        """Companions whose light counts in the derivatives by the star, (k, 3) as `companions`."""
         return brightest(torch.from_numpy(self.companions)).numpy()
 
     @property

@@ -28,7 +28,7 @@ _LINEAR = tuple(p.name for p in LEVELS)
 _BRIGHT = 5e-4
 """Contrast of a companion whose light counts in derivatives by optics, flux and wavefront. A change
 of the wavefront by 10 nm moves 1 % of it. Without these derivatives, companions of 1e-3 have false
-candidates beside them; with them, steps of the fit take twice as long."""
+candidates beside them. They take as long as those of the star."""
 
 COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 """Prior standard deviations of a companion's contrast, x and y (arcsec) about its start."""
@@ -144,7 +144,7 @@ class FrameUnknowns:
         return vector[self.where("companions")].reshape(-1, 3)
 
     def bright_sources(self, vector: Tensor) -> Tensor:
-        """Those of `sources` whose light counts in the derivatives by the star, (k, 3)."""
+        """Companions whose light counts in the derivatives by the star, (k, 3) as `sources`."""
         sources = self.sources(vector)
         return brightest(sources) if self.shows_companions else sources[:0]
 
