@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,8 @@ from pyklip_diffrender.detection import Candidates
 from pyklip_diffrender.detection.candidates import refine_candidates
 from pyklip_diffrender.detection.groups import groups_of
 from pyklip_diffrender.detection.position_errors import with_position_of_star
+from pyklip_diffrender.detection.relinearise import in_derivatives
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.optics import PupilGrid
 
 BRIGHT, FAINT = (0.45, 0.5), (-0.6, 0.2)
@@ -106,3 +110,19 @@ def test_candidates_have_the_error_of_the_star(fit: dr.Refinement) -> None:
     factor = search.error_factor.of(search.sources.offsets)
     stated = search.candidates["x_error"].to_value("arcsec")
     np.testing.assert_allclose(stated, factor * search.sources.errors[:, 1].numpy())
+
+
+def test_companions_of_a_fit_are_known_in_the_orientation_of_another(fit: dr.Refinement) -> None:
+    frame = replace(
+        fit.frames[0],
+        observation=replace(fit.frames[0].observation, position_angles=np.array([20.0])),
+    )
+    origin = replace(
+        frame, observation=replace(frame.observation, position_angles=np.array([50.0]))
+    )
+    templates = Templates(replace(fit, frames=(frame,)), origin)
+    # In the fit the sky is turned by 50 - 20 degrees counter-clockwise, here back.
+    there = dr.Planet.from_offset(1.0, *BRIGHT).rotated(-30.0).offset
+    wrong = dr.Planet.from_offset(1.0, *BRIGHT).rotated(30.0).offset
+    places = torch.tensor([there, wrong, BRIGHT, FAINT], dtype=torch.float64)
+    assert in_derivatives(templates, places).tolist() == [True, False, False, False]

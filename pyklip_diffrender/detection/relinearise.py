@@ -14,7 +14,6 @@ from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.field import Image
 from pyklip_diffrender.detection.groups import has_only_reference_stars
 from pyklip_diffrender.detection.templates import Templates
-from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.refinement import Refinement, refine_again
 from pyklip_diffrender.scene.observation import Observation
 
@@ -68,11 +67,10 @@ def in_derivatives(templates: Templates, offsets: Tensor) -> Tensor:
         x, y of the sources from the star, arcsec.
     """
     fit = templates.fit
-    roll = fit.frames[0].observation.roll_from(templates.origin.observation)
-    turned = offsets @ torch.from_numpy(rotation_matrix(roll)).T
+    first = fit.frames[0].observation
+    places = torch.from_numpy(first.turned(offsets.numpy(), templates.origin.observation))
     companions = torch.from_numpy(fit.bright_companions[:, 1:])
-    near = torch.cdist(turned, companions) < _NEAR * fit.model.resolution
-    return near.any(dim=1)
+    return (torch.cdist(places, companions) < _NEAR * fit.model.resolution).any(dim=1)
 
 
 def unconfirmed_companions(
