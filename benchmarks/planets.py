@@ -2,7 +2,7 @@
 
 Run from the root of the project:
 
-    python -m benchmarks.planets --scenes 200
+    python -m benchmarks.planets --scenes 200 [--processes N]
 
 Single frames through F444W and MASK335R, 36 pixels, photon noise of a bright star, a wavefront that
 has drifted since its map. Each has one companion: of contrast 1e-5 to 1e-2 at .1 to 2 arcsec (at
@@ -17,11 +17,13 @@ from __future__ import annotations
 
 import argparse
 import math
+import multiprocessing
 from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 
 import pyklip_diffrender as dr
 from pyklip_diffrender.instrument.nircam import NIRCAM_LW_PIXELSCALE
@@ -89,17 +91,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=200)
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
+    parser.add_argument("--processes", type=int, default=1)
     options = parser.parse_args()
     counts: Counter[str] = Counter()
     pulls = []
-    for seed in range(options.first, options.first + options.scenes):
-        outcome = searched(seed)
-        counts[outcome.verdict] += 1
-        counts["false candidates"] += len(outcome.false)
-        pulls.append(outcome.pull)
-        if outcome.verdict != "found" or outcome.false:
-            others = f", others of S/N {np.round(outcome.false, 1).tolist()}" * bool(outcome.false)
-            print(f"{outcome.scene}: {outcome.verdict}{others}", flush=True)
+    seeds = range(options.first, options.first + options.scenes)
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(options.processes, torch.set_num_threads, (1,)) as pool:
+        for outcome in pool.imap_unordered(searched, seeds):
+            counts[outcome.verdict] += 1
+            counts["false candidates"] += len(outcome.false)
+            pulls.append(outcome.pull)
+            if outcome.verdict != "found" or outcome.false:
+                others = f", others of S/N {np.round(outcome.false, 1).tolist()}"
+                print(
+                    f"{outcome.scene}: {outcome.verdict}{others * bool(outcome.false)}", flush=True
+                )
     print(dict(counts))
     print(f"pulls of contrast: median {np.nanmedian(pulls):+.2f}, "
           f"rms {np.sqrt(np.nanmean(np.square(pulls))):.2f}, "

@@ -415,6 +415,17 @@ def test_no_candidate_is_nearer_than_the_smallest_separation(world: World) -> No
     assert len(beyond.candidates) == 0
 
 
+@pytest.mark.parametrize(("inner", "candidates"), [(0.695, 1), (0.72, 0)])
+def test_the_place_of_a_source_counts_and_not_that_of_its_pixel(
+    world: World, inner: float, candidates: int
+) -> None:
+    """The source is measured at 0.705 arcsec. The centre of its pixel is at 0.685."""
+    found = dr.detect(world.fitted(5, FAINT), inner=inner)
+    peak = np.unravel_index(np.nanargmax(found.snr), found.snr.shape)
+    assert radius(found)[peak] == pytest.approx(0.685, abs=1e-3)
+    assert len(found.candidates) == candidates
+
+
 def test_the_planet_is_gone_from_the_map_without_candidates(one: Detection) -> None:
     near = np.hypot(one.grid[..., 0] - WHERE.offset[0], one.grid[..., 1] - WHERE.offset[1]) < 0.15
     assert one.snr[near].max() > 8

@@ -159,6 +159,20 @@ def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames: int) ->
             np.testing.assert_allclose(float(each @ direction), slope, rtol=2e-3, err_msg=name)
 
 
+def test_the_exact_gradient_has_the_light_of_all_companions() -> None:
+    """The Jacobian has that of the brightest only, so the minimum must not depend on it."""
+    solver, state = solver_of(2)
+    solver = of_the_model_itself(solver)
+    companions = [dr.Planet(0.05, 0.5, 20.0), dr.Planet(0.03, 0.4, 200.0)]
+    state = solver.objective.at(*state.unknowns.with_companions(companions, state.vector))
+    exact, copied = (gradient(solver, state, exact=value) for value in (True, False))
+    errors = []
+    for name, direction, slope in slopes_by_name(solver, state):
+        np.testing.assert_allclose(float(exact @ direction), slope, rtol=2e-3, err_msg=name)
+        errors.append(abs(float(copied @ direction) / slope - 1))
+    assert max(errors) > 0.02
+
+
 def test_where_the_copy_is_the_model_both_gradients_are_the_same() -> None:
     """But for single precision, in which the derivatives of the copy are stored."""
     solver, state = solver_of(1)

@@ -98,6 +98,15 @@ def test_a_bright_companion_of_the_fit_keeps_its_core() -> None:
     assert fit.companions[0, 0] == pytest.approx(1e-4, rel=0.1)
 
 
+def test_a_hot_pixel_on_a_planet_is_left_out() -> None:
+    """It would make the planet brighter and move it."""
+    planet = here(row=PIXEL[0] + 0.3, column=PIXEL[1] - 0.2, contrast=4e-6)
+    frames = [shot(planet), spoiled(shot(planet, seed=SCENE + 1), 25.0)]
+    fit = fitted(*frames, companions=(planet,))
+    assert (left_out(fit, 0), left_out(fit, 1)) == ([], [PIXEL])
+    assert fit.companions[0, 0] == pytest.approx(4e-6, abs=4 * fit.companion_errors[0, 0])
+
+
 @pytest.mark.parametrize(
     ("name", "shift", "contrast"),
     [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
@@ -14,6 +16,7 @@ __all__ = [
     "far_from",
     "pixel_width",
     "pixels_of",
+    "reaching",
     "require_inside",
     "ring_pixels",
     "separation_of",
@@ -33,6 +36,14 @@ def far_from(grid: Image, offsets: Tensor | Image, distance: float) -> NDArray[n
     for offset in np.asarray(offsets):
         far &= separation_of(grid - offset) >= distance
     return far
+
+
+def reaching(grid: Image, inner: float) -> NDArray[np.bool_]:
+    """Pixels that reach beyond a separation, arcsec, though their centre may be within it.
+
+    A source beyond it has its maximum in one of them.
+    """
+    return np.asarray(separation_of(grid) >= inner - pixel_width(grid) / math.sqrt(2))
 
 
 def pixel_width(grid: Image) -> float:

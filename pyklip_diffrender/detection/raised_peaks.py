@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pyklip_diffrender.detection.candidates import Candidates
-from pyklip_diffrender.detection.field import separation_of
+from pyklip_diffrender.detection.field import reaching
 from pyklip_diffrender.detection.groups import has_only_reference_stars
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.relinearise import with_companions
@@ -63,7 +63,7 @@ def with_raised_peaks(
     if not _unexplained(fits):
         return None
     snr = maps.snr()
-    allowed = separation_of(maps.grid) > inner
+    allowed = reaching(maps.grid, inner)
     best, least = None, _BETTER * _chi2(fits)
     for peak in local_maxima(snr, allowed, _LOWEST, size=7)[:_PEAKS]:
         contrast = float(maps.numerator[peak] / maps.information[peak])

@@ -369,15 +369,20 @@ def _search(
         candidates = refine_candidates(groups, candidates.without(weakest), pixel / 2, _STEPS)
     # A peak that is no candidate once its position is fitted would be the highest one for ever.
     dismissed = torch.zeros(0, 2, dtype=torch.float64)
+    within = np.zeros(grid.shape[:2], dtype=bool)
     while True:
         snr = maps.snr(maps.without(candidates))
         significance = significance_of(fits, maps, candidates.offsets, inner, scatter)
-        allowed = far_from(grid, dismissed, 2 * pixel)
+        allowed = far_from(grid, dismissed, 2 * pixel) & ~within
         peak = significance.next_peak(snr, candidates.offsets, threshold, allowed)
         if peak is not None and max(len(candidates), len(dismissed)) < _MAX_CANDIDATES:
             contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
             candidates = candidates.with_one_more(grid[peak], contrast)
             candidates = refine_candidates(groups, candidates, pixel / 2, _STEPS)
+            if separation_of(candidates.offsets.numpy())[-1] < inner:
+                within[peak] = True
+                candidates = candidates.without(len(candidates) - 1)
+                candidates = refine_candidates(groups, candidates, pixel / 2, _STEPS)
             _log.info("candidates at %s arcsec", candidates.offsets.tolist())
             continue
         factor = significance.factor(snr, candidates.offsets)

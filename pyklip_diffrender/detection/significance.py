@@ -14,7 +14,13 @@ from scipy import stats
 from torch import Tensor
 
 from pyklip_diffrender.detection.error_factor import CLIP, ErrorFactor, Scatter
-from pyklip_diffrender.detection.field import Image, far_from, pixel_width, separation_of
+from pyklip_diffrender.detection.field import (
+    Image,
+    far_from,
+    pixel_width,
+    reaching,
+    separation_of,
+)
 from pyklip_diffrender.refinement.companions import local_maxima
 
 __all__ = ["Significance"]
@@ -100,7 +106,7 @@ class Significance:
         # A source raises the scatter by which it is measured: it counts for a position or two.
         raised = np.sqrt(1 + _POSITIONS * CLIP**2 / factor.freedom)
         scaled = raised * snr / factor.factors
-        allowed = allowed & (separation_of(self.grid) >= self.inner)
+        allowed = allowed & reaching(self.grid, self.inner)
         allowed &= far_from(self.grid, sources, pixel_width(self.grid))
         peaks = local_maxima(scaled, allowed, threshold, size=3)[:_JUDGED]
         alone = (

@@ -43,7 +43,7 @@ class ModelDerivatives:
     def __init__(self, objective: Objective, state: State, noise: Noise) -> None:
         self._objective, self._state, self._noise = objective, state, noise
         self._levels = [
-            forward.levels(point).double()
+            forward.levels(point, point.unknowns.visible_sources(point.vector)).double()
             for forward, point in zip(objective.forwards, state.points, strict=True)
         ]
 

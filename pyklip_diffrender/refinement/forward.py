@@ -107,9 +107,8 @@ class Forward:
         light = flux * gain * image + unknowns.level("pedestal", vector) * (gain - 1)
         star = light + unknowns.level("background", vector)
         total = star
-        if unknowns.shows_companions and len(unknowns.companions):
-            for source in unknowns.sources(vector):
-                total = total + flux * self._companion(unknowns, values, source, opd)
+        for source in unknowns.visible_sources(vector):
+            total = total + flux * self._companion(unknowns, values, source, opd)
         return Point(unknowns, vector, opd, fields, image, light, star, total)
 
     def _companion(
@@ -145,7 +144,8 @@ class Forward:
         Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront. The
         light of faint companions counts as independent of optics and wavefront.
         """
-        unknowns, levels = point.unknowns, self.levels(point)
+        unknowns, bright = point.unknowns, point.unknowns.bright_sources(point.vector)
+        levels = self.levels(point, bright)
         count = unknowns.where("companions").stop
         if modes:
             count = unknowns.where("modes").start + modes
@@ -154,16 +154,18 @@ class Forward:
         first = unknowns.where("companions").stop - len(levels)
         rows[first : first + len(levels)] = levels
         rows[:first], rows[unknowns.where("companions").stop :] = 0.0, 0.0
-        for fields, values, level in self._lights(point):
-            self._add_slopes(rows, point, fields, values, level, modes)
+        for light in self._lights(point, bright):
+            self._add_slopes(rows, point, *light, modes)
         return rows
 
-    def _lights(self, point: Point) -> Iterator[tuple[list[Tensor], dict[str, Tensor], Tensor]]:
-        """Fields, parameters, and level of the star and of bright companions."""
+    def _lights(
+        self, point: Point, companions: Tensor
+    ) -> Iterator[tuple[list[Tensor], dict[str, Tensor], Tensor]]:
+        """Fields, parameters, and level of the star and of companions (k, 3)."""
         unknowns, vector = point.unknowns, point.vector
         values, flux = unknowns.values(vector), unknowns.level("flux", vector)
         yield point.fields, values, flux * self.problem.gain
-        for source in unknowns.bright_sources(vector):
+        for source in companions:
             towards = self._towards(values, unknowns.turn @ source[1:])
             with torch.no_grad():
                 fields = self.model.fields(point.opd, **towards)
@@ -191,10 +193,11 @@ class Forward:
             rows[amplitude] += slopes[modes:].cpu()
             rows[amplitude.stop :] += slopes[:modes].cpu()
 
-    def levels(self, point: Point) -> Tensor:
+    def levels(self, point: Point, companions: Tensor) -> Tensor:
         """Derivative of `total` by levels and companions, (unknowns, ny, nx), float32, on the CPU.
 
-        Those by companions are of the coarse copy.
+        Those by companions are of the coarse copy. That by the flux has the light of `companions`,
+        (k, 3), besides the star's.
         """
         unknowns, vector = point.unknowns, point.vector
         flux, gain = unknowns.level("flux", vector), self.problem.gain
@@ -203,7 +206,7 @@ class Forward:
             "background": torch.ones_like(point.image),
             "pedestal": gain - 1,
         }
-        for source in unknowns.bright_sources(vector):
+        for source in companions:
             light = self._companion(unknowns, unknowns.values(vector), source, point.opd)
             by_level["flux"] = by_level["flux"] + light
         rows = [by_level[name].float().cpu() for name in unknowns.linear]
@@ -225,8 +228,8 @@ class Forward:
 
         They take as long as two or three images, by reverse mode at one wavelength after the other.
         `jacobian` has those of a coarse copy at fewer wavelengths, with an error that exceeds a
-        gradient near its zero. The light of faint companions counts as independent of optics and
-        wavefront in both, and `levels` has the derivatives by the other unknowns.
+        gradient near its zero, and without the light of faint companions. `levels` has the
+        derivatives by the other unknowns.
 
         Parameters
         ----------
@@ -241,11 +244,11 @@ class Forward:
         """
         unknowns = point.unknowns
         names = unknowns.optical
+        lights = self._lights(point, unknowns.visible_sources(point.vector))
         totals = [
             torch.stack(parts).sum(dim=0)
             for parts in zip(
-                *(self._source_slopes(point, *light, pixels) for light in self._lights(point)),
-                strict=True,
+                *(self._source_slopes(point, *light, pixels) for light in lights), strict=True
             )
         ]
         by_name = dict(zip(names, totals[1:], strict=True))

@@ -3,7 +3,8 @@
 A hot pixel that stands out of the star's image looks like a point source to a matched filter, and
 in one roll nothing else tells them apart. Its neighbours do: a point source lights several pixels.
 Two hypotheses are therefore compared for every pixel that deviates, with the star marginalised in
-both: that it alone is wrong, and that a point source is near it.
+both: that it alone is wrong, and that a point source is near it. Near a companion of the fit they
+are compared twice: in place of the companion, which may be the bad pixel itself, and beside it.
 """
 
 from __future__ import annotations
@@ -32,6 +33,11 @@ fit has taken a part of it."""
 
 _NEAR = 2.0
 """Pixels between an outlier and a companion that may be nothing else."""
+
+_WRONG = 0.3
+"""Smallest deviation of an outlier beside such a companion, relative to the companion's brightest
+pixel. The model of the companion's image may be wrong by more than the noise, and a second source
+would explain that no better than a single pixel."""
 
 _BATCH = 256
 """Number of pixels whose deviations are computed at a time."""
@@ -69,12 +75,17 @@ def isolated_outliers(objective: Objective, state: State, linear: LinearModel) -
         for row, column in _deviating(linear, k):
             place = grid[row, column]
             distances = ((companions_at - place) / scale).norm(dim=1)
-            # A fit may have taken an outlier for a companion, whose light then counts as well.
-            model = star_only if bool((distances < _NEAR).any()) else linear
             pixel = _single_pixels(mask.shape, torch.tensor([[row, column]]))
             sources = forward.sources(point, place + beside).cpu()
-            by_source = _explained(model, k, sources).max()
-            mask[row, column] = bool(_explained(model, k, pixel) > _BETTER * by_source)
+            models = [linear]
+            if bool((distances < _NEAR).any()):
+                light = companions[k][max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
+                exceeds = float(_amplitude(linear, k, pixel).abs()) > _WRONG * float(light.max())
+                models = [star_only, linear] if exceeds else [star_only]
+            mask[row, column] = any(
+                bool(_explained(model, k, pixel) > _BETTER * _explained(model, k, sources).max())
+                for model in models
+            )
         outliers.append(mask)
     return outliers
 
@@ -97,6 +108,12 @@ def _single_pixels(shape: torch.Size, places: Tensor) -> Tensor:
     images = torch.zeros(len(places), *shape)
     images[torch.arange(len(places)), places[:, 0], places[:, 1]] = 1.0
     return images
+
+
+def _amplitude(linear: LinearModel, k: int, templates: Tensor) -> Tensor:
+    """Most probable amplitude of each template in frame k, (templates,)."""
+    products = linear.weigh({k: templates})
+    return products.numerator / products.information.clamp(min=1e-300)
 
 
 def _explained(linear: LinearModel, k: int, templates: Tensor) -> Tensor:

@@ -25,10 +25,11 @@ __all__ = ["COMPANION_PRIOR", "FrameUnknowns", "Unknowns", "brightest"]
 
 _LINEAR = tuple(p.name for p in LEVELS)
 
-_BRIGHT = 5e-4
-"""Contrast of a companion whose light counts in derivatives by optics, flux and wavefront. A change
-of the wavefront by 10 nm moves 1 % of it. Without these derivatives, companions of 1e-3 have false
-candidates beside them. They take as long as those of the star."""
+_BRIGHT = 1e-4
+"""Contrast of a companion whose light counts in the Jacobian by optics, flux and wavefront. A
+change of the wavefront by 10 nm moves 1 % of it. Without these derivatives, companions of 1e-3 have
+false candidates beside them, and errors of a S/N above 30 are too small. They take as long as
+those of the star."""
 
 COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 """Prior standard deviations of a companion's contrast, x and y (arcsec) about its start."""
@@ -143,10 +144,14 @@ class FrameUnknowns:
         """Contrast, x and y of companions in the first frame, (companions, 3)."""
         return vector[self.where("companions")].reshape(-1, 3)
 
-    def bright_sources(self, vector: Tensor) -> Tensor:
-        """Companions whose light counts in the derivatives by the star, (k, 3) as `sources`."""
+    def visible_sources(self, vector: Tensor) -> Tensor:
+        """Companions that this frame shows, (k, 3) as `sources`."""
         sources = self.sources(vector)
-        return brightest(sources) if self.shows_companions else sources[:0]
+        return sources if self.shows_companions else sources[:0]
+
+    def bright_sources(self, vector: Tensor) -> Tensor:
+        """Companions whose light counts in the Jacobian by the star, (k, 3) as `sources`."""
+        return brightest(self.visible_sources(vector))
 
     @property
     def turn(self) -> Tensor:
