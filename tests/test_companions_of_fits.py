@@ -83,6 +83,8 @@ def test_nothing_is_tried_where_the_data_are_explained() -> None:
         # Bright companions show finer modes than the star, whose light they would move off the
         # frame.
         pytest.param(34, (24,), id="1e-2 at 1 arcsec, brighter than the star's residual"),
+        pytest.param(38, (16,), id="3e-4 at 0.21 arcsec, behind a spurious candidate"),
+        pytest.param(183, (24,), id="7e-3 at 1 arcsec, which outshines a star at the wrong place"),
         pytest.param(74, (24,), id="0.08 at 0.48 arcsec, brighter than the star behind the mask"),
     ],
 )

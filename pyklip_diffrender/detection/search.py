@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -60,6 +61,17 @@ settle in these; parts of something extended do not, and would take most of the 
 
 _SOURCE = 5.0
 """S/N above which `measure` removes a source before it computes the default `scatter`."""
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """Candidates of one search, in the order in which they were found, and the maps of the fits."""
+
+    fits: Sequence[Refinement]
+    maps: Maps
+    candidates: Candidates
+    factor: ErrorFactor
+    significance: Significance
 
 
 def detect(
@@ -123,31 +135,33 @@ def detect(
     fits = _checked(fits)
     inner = float(to_arcsec(inner, "inner"))
     require_positive(threshold=threshold, inner=inner, scatter=scatter)
-    maps = Maps(groups_of(fits), progress)
-    known = Candidates.of_fit(fits[0])
-    candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
-    if not len(candidates):
-        better = with_raised_peaks(fits, maps, inner, progress)
-        if better is not None:
-            fits = better
-            maps = Maps(groups_of(fits), progress)
-            known = Candidates.of_fit(fits[0])
-            candidates, factor, significance = _search(maps, fits, known, threshold, inner, scatter)
-    if not all(fit.status.calibrated for fit in fits):
+
+    def look(fits: Sequence[Refinement], known: Candidates) -> _Outcome:
+        maps = Maps(groups_of(fits), progress)
+        return _Outcome(fits, maps, *_search(maps, fits, known, threshold, inner, scatter))
+
+    def look_again(last: _Outcome) -> _Outcome:
+        """Look again with the highest peaks as companions, if nothing explains the data."""
+        if len(last.candidates):
+            return last
+        better = with_raised_peaks(last.fits, last.maps, inner, progress)
+        return last if better is None else look(better, Candidates.of_fit(better[0]))
+
+    last = look_again(look(fits, Candidates.of_fit(fits[0])))
+    if not all(fit.status.calibrated for fit in last.fits):
         relinearise = min(relinearise, threshold)
-    bright = candidates.snr(factor) > relinearise
-    if len(candidates) >= _MAX_CANDIDATES:
+    bright = last.candidates.snr(last.factor) > relinearise
+    if len(last.candidates) >= _MAX_CANDIDATES:
         _log.warning(
             "%d candidates, the most that are looked for: parts of something extended? The star is "
             "not refined with them in the model",
-            len(candidates),
+            len(last.candidates),
         )
-    elif bright.any() and lacks_candidates(fits, candidates):
-        fits = with_companions(fits, candidates, progress)
-        maps = Maps(groups_of(fits), progress)
-        candidates, factor, significance = _search(
-            maps, fits, candidates, threshold, inner, scatter
-        )
+    elif bright.any() and lacks_candidates(last.fits, last.candidates):
+        fits = with_companions(last.fits, last.candidates, progress)
+        last = look_again(look(fits, last.candidates))
+    fits, maps, candidates = last.fits, last.maps, last.candidates
+    factor, significance = last.factor, last.significance
     if not candidates.converged:
         _log.warning(
             "the positions of %d candidates did not settle; two of them may be one source, or the "

@@ -42,6 +42,11 @@ class State:
         """Flux of the star in the first frame."""
         return self.points[0].unknowns.level("flux", self.points[0].vector)
 
+    @property
+    def has_star(self) -> bool:
+        """Whether all frames have starlight; without it, no derivative leads back to a star."""
+        return all(point.unknowns.level("flux", point.vector) > 0 for point in self.points)
+
 
 class Objective:
     """Compares states with the data of all frames.

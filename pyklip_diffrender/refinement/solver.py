@@ -184,7 +184,7 @@ class Solver:
                 expected = self._predicted_gain(unknowns, equations, update.step)
             trial = self._moved(state, update.step - equations.current)
             after = self._cost(trial, noise)
-            if after < before:
+            if after < before and trial.has_star:
                 ratio = (before - after) / expected
                 if is_stale and ratio < _POOR:
                     self._needs_accurate = True
@@ -219,7 +219,7 @@ class Solver:
             for part in _PARTS:
                 trial = self._moved(state, part * step)
                 after = self._cost(trial, noise)
-                if after < before:
+                if after < before and trial.has_star:
                     return trial, (before - after) / objective.pixels
             if equations.state is state:
                 break
