@@ -184,9 +184,10 @@ def conjugate_gradients(
     direction = precondition(remaining)
     power, total = float(remaining @ direction), 0.0
     for _ in range(iterations):
-        # The decrease if the preconditioner were right; it understates the curvature, if anything.
-        if power <= enough:
+        if power <= 0:
             return x, True
+        # What the preconditioner expects does not tell the decrease. Errors of its Jacobian count
+        # as curvature along a direction in which the effects of unknowns cancel.
         pulled = product(direction)
         curvature = float(direction @ pulled)
         if curvature <= 0:  # By rounding errors.
