@@ -338,7 +338,9 @@ class GaussNewton:
             max_iterations=40,
             relinearise=0.1,
             accurate_steps=True,
-            tolerance=5e-4,
+            # Of 6,400 pixels, less than one unit of chi-squared. With 5e-4, fits of a star behind
+            # MASK210R stop 50 to 100 units above the minimum, at a flux that is 20 % too low.
+            tolerance=1e-4,
         )
         # Parameters that are not free need no prior.
         free = changes.get("free", preset.free)
