@@ -283,6 +283,14 @@ def test_conjugate_gradients_lower_the_function_however_poor_the_preconditioner(
     assert not x.any()
 
 
+def test_conjugate_gradients_do_not_end_by_what_the_preconditioner_expects() -> None:
+    """It expects a decrease of 1 where there is one of 100, of which 5 would matter."""
+    gradient = torch.tensor([10.0])
+    x, settled = conjugate_gradients(lambda x: x, lambda x: x / 100, gradient, enough=5.0)
+    assert settled
+    torch.testing.assert_close(x, gradient)
+
+
 def test_accurate_steps_keep_their_equations() -> None:
     """Until conjugate gradients need more iterations than there are, and until a companion."""
     solver, state = solver_of(1, relinearise=0.1, accurate_steps=True, robust=4.0)
