@@ -456,7 +456,7 @@ def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world: World) -> N
 @pytest.mark.slow
 def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(large: World) -> None:
     """As far as wavefronts that are as probable as the one that was found change its light."""
-    found = large.detected(7, replace(WHERE, contrast=4e-4))
+    found = large.detected(7, replace(WHERE, contrast=8e-5))
     (linear, templates), fit = found.groups[0], found.fits[0]
     row = found.candidates[0]
     own = row["contrast"] / row["snr"]
@@ -477,21 +477,20 @@ def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(large: W
     # 250 draws know their deviation to 4.5 %.
     assert stated == pytest.approx(float(np.std(changes)), rel=0.12)
     # The star's flux alone would not do.
-    assert stated > 1.15 * fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
+    assert stated > 1.1 * fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
 
 
 @pytest.mark.slow
 def test_a_wavefront_that_is_known_adds_nothing_to_a_bright_contrasts_error(world: World) -> None:
     known = replace(world, opd=world.later)
-    found = dr.detect(known.fitted(14, replace(WHERE, contrast=4e-4), wavefront=False))
+    found = dr.detect(known.fitted(14, replace(WHERE, contrast=9e-5), wavefront=False))
     fit, row = found.fits[0], found.candidates[0]
     relative = found.scatter * fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
     expected = row["contrast"] * math.hypot(relative, 1 / row["snr"])
-    assert row["snr"] > 100
-    # The fit's own error of the flux knows of the companion beside it, the map's does not.
-    assert row["contrast_error"] == pytest.approx(expected, rel=2e-3)
-    assert row["contrast_error"] > 1.01 * row["contrast"] / row["snr"]
-    assert abs(row["contrast"] - 4e-4) < 4 * expected
+    assert row["snr"] > 400
+    assert row["contrast_error"] == pytest.approx(expected, rel=1e-4)
+    assert row["contrast_error"] > 1.001 * row["contrast"] / row["snr"]
+    assert abs(row["contrast"] - 9e-5) < 4 * expected
 
 
 @pytest.mark.slow

@@ -829,7 +829,7 @@ def test_files_with_and_without_a_planet(tmp_path: Path) -> None:
         "options": {
             "size": 24, "systematics": "off",
             "settings": {
-                "cycles": [4.0], "max_iterations": 10, "response_npix": 64,
+                "cycles": [4.0], "max_iterations": 20, "response_npix": 64,
                 "response_wavelengths": 1, "accurate_steps": False,
             },
         },
