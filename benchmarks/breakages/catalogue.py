@@ -262,8 +262,9 @@ def _fits() -> list[Breakage]:
         ),
         Breakage(
             "outliers", "hot pixels are left out, planets are not",
-            "_explained(model, k, pixel) > _BETTER * by_source)",
-            "_explained(model, k, pixel) < _BETTER * by_source)", "outliers",
+            "_explained(model, k, pixel) > _BETTER * _explained(model, k, sources).max()",
+            "_explained(model, k, pixel) < _BETTER * _explained(model, k, sources).max()",
+            "outliers",
         ),
         Breakage(
             "no-map", "without a map the star's flux is uncertain by 40 %",
@@ -305,9 +306,9 @@ def _detection() -> list[Breakage]:
             "return np.asarray(sigmas + 0 * freedom)", "error_factor detection",
         ),
         Breakage(
-            "inner", "nothing is searched inside the smallest separation",
-            "allowed = allowed & (separation_of(self.grid) >= self.inner)",
-            "allowed = allowed.copy()", "detection search",
+            "inner", "no candidate is inside the smallest separation",
+            "if separation_of(candidates.offsets.numpy())[-1] < inner:",
+            "if len(candidates) > 10:", "detection search",
         ),
         Breakage(
             "inflation", "errors grow with the square root of chi-squared",
