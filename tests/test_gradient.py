@@ -161,7 +161,7 @@ def test_the_light_of_a_bright_companion_depends_on_all_unknowns(frames: int) ->
 
 def test_the_exact_gradient_has_the_light_of_all_companions() -> None:
     """The Jacobian has that of the brightest only, so the minimum must not depend on it."""
-    solver, state = solver_of(2)
+    solver, state = solver_of(1)
     solver = of_the_model_itself(solver)
     companions = [dr.Planet(0.05, 0.5, 20.0), dr.Planet(0.03, 0.4, 200.0)]
     state = solver.objective.at(*state.unknowns.with_companions(companions, state.vector))
