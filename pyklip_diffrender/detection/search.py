@@ -383,6 +383,7 @@ def _search(
         candidates = refine_candidates(groups, candidates.without(weakest), pixel / 2, _STEPS)
     # A peak that is no candidate once its position is fitted would be the highest one for ever.
     dismissed = torch.zeros(0, 2, dtype=torch.float64)
+    # Pixels whose sources are nearer to the star than the search goes.
     within = np.zeros(grid.shape[:2], dtype=bool)
     while True:
         snr = maps.snr(maps.without(candidates))
