@@ -3,7 +3,7 @@
 Run from the root of the project, with stpsf installed and its data named by STPSF_PATH::
 
     STPSF_PATH=... python -m benchmarks.stpsf_sequences --output FOLDER [--cases NAME ...]
-        [--repeat N]
+        [--repeat N] [--size PIXELS]
 
 Each case has two rolls of a star with two planets, as calints files with the headers of MAST. The
 images are stpsf's, with its internal wavefront errors, jitter, distortion, charge diffusion and
@@ -12,7 +12,7 @@ and from roll to roll; the star is a few milliarcseconds from the middle of the 
 has an error of 2 % in every pixel, which nobody tells the reduction; pixels are bad, some of them
 without a flag; and there are photon and read noise. With ``--references`` a second, brighter star
 was observed at small dithers. Other numbers of ``--repeat`` have other wavefronts, flat fields,
-bad pixels and noise.
+bad pixels and noise, and ``--size`` is the side of the fitted square.
 
 Prints a row for each case: planets that were found and missed, false candidates, pulls of flux and
 position, scatter of the S/N without the candidates, limits over those for a known star beyond 0.5
@@ -30,7 +30,7 @@ import resource
 import time
 import warnings
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,9 @@ FLAT_ERROR = 0.02
 FLAGGED, UNFLAGGED = 0.005, 4
 """Fraction of the pixels with a flag, and number of bad ones without one near the star."""
 
-SIDE = 96
+MARGIN = 8
+"""Pixels of the frames beyond the fitted square, on each side."""
+
 OVERSAMPLE = 4
 """Samples per pixel of stpsf's images."""
 
@@ -85,6 +87,11 @@ class Case:
     @property
     def name(self) -> str:
         return f"{self.filter} {self.mask}"
+
+    @property
+    def side(self) -> int:
+        """Side of the frames, pixels."""
+        return self.size + 2 * MARGIN
 
 
 def _planets(*places: tuple[float, float, float]) -> tuple[Planet, ...]:
@@ -154,10 +161,14 @@ def image(
     nircam.pupilopd = fits.HDUList([fits.PrimaryHDU(opd, header)])
     nircam.options["source_offset_x"], nircam.options["source_offset_y"] = place
     psf = nircam.calc_psf(
-        nlambda=nlambda, fft_oversample=OVERSAMPLE, detector_oversample=OVERSAMPLE, fov_pixels=SIDE
+        nlambda=nlambda,
+        fft_oversample=OVERSAMPLE,
+        detector_oversample=OVERSAMPLE,
+        fov_pixels=case.side,
     )
     fine, scale = psf["OVERSAMP"].data, psf["OVERSAMP"].header["PIXELSCL"]
-    middle = (SIDE * OVERSAMPLE - 1) / 2
+    side = case.side
+    middle = (side * OVERSAMPLE - 1) / 2
     y, x = (np.indices(fine.shape) - middle) / OVERSAMPLE
     aperture = stpsf.stpsf_core.get_siaf_with_caching("NIRCam")[case.aperture]
     sky = np.stack(aperture.sci_to_idl(x + aperture.XSciRef, y + aperture.YSciRef)[::-1])
@@ -167,7 +178,7 @@ def image(
     diffusion = stpsf.constants.INSTRUMENT_DETECTOR_CHARGE_DIFFUSION_DEFAULT_PARAMETERS[channel]
     light = gaussian_filter(light, diffusion / scale)
     detected = psf["DET_DIST"]
-    detected.data = light.reshape(SIDE, OVERSAMPLE, SIDE, OVERSAMPLE).sum(axis=(1, 3))
+    detected.data = light.reshape(side, OVERSAMPLE, side, OVERSAMPLE).sum(axis=(1, 3))
     del detected.header["IPCINST"]  # With it stpsf would take the pixels as coupled already.
     stpsf.detectors.apply_detector_ipc(psf)
     return np.array(detected.data, dtype=float)
@@ -184,9 +195,10 @@ def write_frames(case: Case, folder: Path, references: int = 0, repeat: int = 0)
     # Of its own for every case: errors of planets at the same place are independent.
     rng = np.random.default_rng([*case.name.encode(), *([repeat] if repeat else [])])
     seeds = rng.integers(2**31, size=1 + len(ROLLS) + references)
-    flat = 1 + FLAT_ERROR * rng.normal(size=(SIDE, SIDE))
-    flagged = rng.random((SIDE, SIDE)) < FLAGGED
-    hot = rng.integers(SIDE // 2 - 15, SIDE // 2 + 15, (UNFLAGGED, 2))
+    side = case.side
+    flat = 1 + FLAT_ERROR * rng.normal(size=(side, side))
+    flagged = rng.random((side, side)) < FLAGGED
+    hot = rng.integers(side // 2 - 15, side // 2 + 15, (UNFLAGGED, 2))
     changed = opd + _change(int(seeds[0]), DRIFT, opd)
     for k, (roll, star) in enumerate(zip(ROLLS, STARS, strict=True), 1):
         now = changed + _change(int(seeds[k]), BETWEEN, opd)
@@ -214,7 +226,7 @@ def _write(
 ) -> None:  # fmt: skip
     place = detector_place(case.mask, case.filter, case.aperture.rpartition("_")[2]
                            if case.mask.endswith("WB") else None)  # fmt: skip
-    middle = (SIDE - 1) / 2
+    middle = (case.side - 1) / 2
     corner = np.round(np.add(place.center, filter_shift(case.filter)) - middle).astype(int) + 1
     pixel = place.siaf_pixelscale
     cards = {
@@ -233,7 +245,7 @@ def _write(
         for row, column in hot:
             arrays["SCI"][:, row, column] += 20 * arrays["ERR"][:, row, column]
 
-    minute = list(CASES.values()).index(case)  # The noise is drawn by the date.
+    minute = list(CASES).index(case.name)  # The noise is drawn by the date.
     name = f"jw01184{k:03d}001_03106_00001_{place.header_detector.lower()}_calints.fits"
     path = folder / "frames" / name
     path.unlink(missing_ok=True)
@@ -350,9 +362,9 @@ def pulls(results: list[dict[str, Any]]) -> str:
     return f"pulls of {len(planets)} planets, mean and rms: {'; '.join(words)}"
 
 
-def _run(name: str, folder: Path, references: int, repeat: int) -> dict[str, Any]:
+def _run(name: str, size: int, folder: Path, references: int, repeat: int) -> dict[str, Any]:
     warnings.simplefilter("ignore")
-    return reduced(CASES[name], folder, references, repeat)
+    return reduced(replace(CASES[name], size=size), folder, references, repeat)
 
 
 def main() -> None:
@@ -362,6 +374,7 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
     parser.add_argument("--references", type=int, default=0, choices=range(len(DITHERS) + 1))
     parser.add_argument("--repeat", type=int, default=0, choices=range(60))
+    parser.add_argument("--size", type=int, default=Case.size)
     options = parser.parse_args()
     columns = ["case", "found", "false", "S/N", "flux / truth", "pull of flux", "of separation",
                "of angle", "away, mas", "S/N scatter", "limits / known star", "status", "CPU s",
@@ -370,10 +383,11 @@ def main() -> None:
     context = multiprocessing.get_context("spawn")
     for name in options.cases:
         again = f"_{options.repeat}" if options.repeat else ""
-        folder = options.output / f"{name.replace(' ', '_')}_{options.references}{again}"
+        larger = f"_size{options.size}" if options.size != Case.size else ""
+        folder = options.output / f"{name.replace(' ', '_')}_{options.references}{again}{larger}"
         with ProcessPoolExecutor(1, mp_context=context) as pool:
             try:
-                about = (name, folder, options.references, options.repeat)
+                about = (name, options.size, folder, options.references, options.repeat)
                 result = pool.submit(_run, *about).result()
             except Exception as error:
                 print(f"| {name} | {type(error).__name__}: {error} |", flush=True)
