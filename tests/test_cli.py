@@ -813,7 +813,11 @@ def test_the_rules_are_those_of_the_package() -> None:
     assert tuple(option.type.choices) == RULES
 
 
-def test_the_shell_completes_commands_and_options() -> None:
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [("--opd-", "plain,--opd-date"), ("--star-sed star", "file,star")],
+)
+def test_the_shell_completes_options_and_files(words: str, completed: str) -> None:
     """What the shell's completion function calls."""
     done = subprocess.run(
         [sys.executable, "-m", "pyklip_diffrender.cli"],
@@ -824,11 +828,11 @@ def test_the_shell_completes_commands_and_options() -> None:
             **os.environ,
             "PYTHONPATH": str(ROOT),
             "_PYKLIP_DIFFRENDER_COMPLETE": "bash_complete",
-            "COMP_WORDS": "pyklip-diffrender reduce --opd-",
-            "COMP_CWORD": "2",
+            "COMP_WORDS": f"pyklip-diffrender reduce {words}",
+            "COMP_CWORD": str(1 + len(words.split())),
         },
     )
-    assert done.stdout.splitlines() == ["plain,--opd-date"], done.stderr
+    assert done.stdout.splitlines() == [completed], done.stderr
 
 
 # -- doctor --------------------------------------------------------------------------------------

@@ -253,14 +253,15 @@ search = _all(
     option("--star-flux", metavar="FLUX", section="Fit and search",
            help='Flux density of the star in the filter, such as "0.45 Jy", to which contrasts '
                 "refer; default: what diffracted light says, to 10 %."),
-    option("--star-sed", metavar="FILE", section="Fit and search",
+    # A path that is not converted: shells complete files, and a name stays as it is.
+    option("--star-sed", type=click.Path(), metavar="FILE", section="Fit and search",
            help="Spectrum or photometry of the star, in place of --star-flux: two columns in "
                 "micron and Jy, a table with units, or a VOTable of VizieR's photometry viewer. "
                 'Or a dwarf\'s spectral type and K magnitude, such as "A2V, K=6.77".'),
     option("--star-flux-error", type=float, default=0.05, show_default=True, metavar="FRACTION",
            section="Fit and search", help="Relative error of --star-flux, at most 1."),
-    option("--systematics", default="auto", show_default=True, metavar="CHOICE",
-           section="Fit and search",
+    option("--systematics", type=click.Path(), default="auto", show_default=True,
+           metavar="CHOICE", section="Fit and search",
            help="Flat-field pattern: auto (the package's library, else the reference "
            "stars), references (both), off, a folder or file of patterns to search besides the "
            "package's (command learn), or a systematics.fits of an earlier reduction."),
