@@ -26,7 +26,7 @@ SIZE, NPIX = 32, 64
 ALIGNED = GaussNewton(free=("flux", "background"), wavefront=False, companions_if_stalled=False)
 OPD = dr.random_opd(1, npix=NPIX)
 LIBRARY = {"INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "CORONMSK": "MASKA335R"}
-ELSEWHERE = {**LIBRARY, "DETECTOR": "NRCBLONG"}
+ELSEWHERE = {**LIBRARY, "DETECTOR": "NRCA2"}
 PLACE = (625, 1659)
 """Pixels in the middle of those that the library has."""
 STARS = "HIP17695, G-7-34"

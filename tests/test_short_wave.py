@@ -1,4 +1,4 @@
-"""The short-wave arm: frames like those of MAST, from reading to the planet."""
+"""The short-wave arm and module B: frames like those of MAST, from reading to the planet."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ import torch
 from astropy import units as u
 from astropy.io import fits
 
-from pyklip_diffrender.errors import IncompatibleSetupError, NoValidPixelsError
+from pyklip_diffrender.errors import (
+    CorruptFileError,
+    IncompatibleSetupError,
+    NoValidPixelsError,
+)
 from pyklip_diffrender.instrument import detector_place, filter_shift, nircam_coronagraph
 from pyklip_diffrender.reduction import reduce
 from pyklip_diffrender.refinement import GaussNewton, Status, refine, settings_for
@@ -24,6 +28,7 @@ from pyklip_diffrender.scene import (
     model_for,
     simulate,
 )
+from pyklip_diffrender.scene.detector_pixels import mask_place
 from pyklip_diffrender.wavefront import random_opd
 
 SIZE = 36
@@ -34,14 +39,16 @@ STAR = (0.002, -0.002)  # arcsec from the middle of the mask.
 
 
 def calints(
-    folder: Path, roll: float, *, filter: str = "F210M", mask: str = "MASK335R", seed: int = 0
+    folder: Path, roll: float, *, filter: str = "F210M", module: str = "A", seed: int = 0
 ) -> Path:
-    """A simulated frame of 64 x 64 pixels of NRCA2, with a planet, as MAST delivers it."""
-    place = detector_place(mask, filter)
+    """A simulated frame of 64 x 64 pixels, with a planet behind MASK335R, as MAST delivers it."""
+    mask = "MASK335R"
+    place = detector_place(mask, filter, module=module)
     star = np.array([31.3, 32.6])
     model = nircam_coronagraph(
         filter,
         image_mask=mask,
+        module=module,
         npix=256,
         nlambda=5,
         fov_pixels=64,
@@ -61,9 +68,9 @@ def calints(
     counts = counts + sigma * np.random.default_rng(seed).normal(size=sigma.shape)
     corner = np.round(np.add(place.center, filter_shift(filter)) - star) + 1
     primary = {
-        "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON", "CHANNEL": "SHORT",
-        "DETECTOR": place.detector, "MODULE": "A", "FILTER": filter, "PUPIL": "MASKRND",
-        "CORONMSK": mask.replace("MASK", "MASKA"), "SUBARRAY": f"SUB320A{mask[4:]}",
+        "TELESCOP": "JWST", "INSTRUME": "NIRCAM", "EXP_TYPE": "NRC_CORON",
+        "DETECTOR": place.header_detector, "MODULE": module, "FILTER": filter, "PUPIL": "MASKRND",
+        "CORONMSK": f"MASK{module}335R", "SUBARRAY": f"SUB320{module}335R",
         "APERNAME": f"{place.detector}_{mask}", "TARGPROP": "HD 1",
         "SUBSTRT1": int(corner[0]), "SUBSTRT2": int(corner[1]),
         "DATE-BEG": f"2024-03-0{seed + 1}T00:00:00",
@@ -82,16 +89,18 @@ def calints(
             fits.ImageHDU(np.zeros((1, 64, 64), "i4"), name="DQ"),
         ]
     )
-    path = folder / f"jw01000001001_03106_0000{seed + 1}_{place.detector.lower()}_calints.fits"
+    detector = place.header_detector.lower()
+    path = folder / f"jw01000001001_03106_0000{seed + 1}_{detector}_calints.fits"
     hdus.writeto(path)
     return path
 
 
 @pytest.mark.slow
-def test_a_planet_is_where_it_is_and_nothing_else(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("filter", "module"), [("F210M", "A"), ("F444W", "B")])
+def test_a_planet_is_where_it_is_and_nothing_else(tmp_path: Path, filter: str, module: str) -> None:
     """A map that is 5 nm rms off, a star and a stop off their places, and no flat-field pattern."""
-    settings = GaussNewton.nircam("F210M", cycles=(7.0,), max_iterations=10)
-    frame, opd = calints(tmp_path, 0.0), random_opd(1, npix=256)
+    settings = GaussNewton.nircam(filter, module=module, cycles=(7.0,), max_iterations=10)
+    frame, opd = calints(tmp_path, 0.0, filter=filter, module=module), random_opd(1, npix=256)
     result = reduce([frame], opd, size=SIZE, settings=settings)
     assert result.systematics is None
     assert result.fit is result.detection.fits[0]
@@ -125,11 +134,40 @@ def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path: Path) ->
     assert settings_for(wide).cycles == (32.0,)
 
 
-def test_other_instruments_and_module_b_are_refused(tmp_path: Path) -> None:
+def test_frames_of_module_b_have_its_model(tmp_path: Path) -> None:
+    """Nothing that was measured in flight with module A is taken for it."""
+    path = calints(tmp_path, 0.0, filter="F444W", module="B")
+    (frame,) = Sequence.from_files([path]).science
+    assert frame.header["DETECTOR"] == "NRCBLONG"
+    model = model_for(frame, SIZE)
+    assert model.setup["module"] == "B"
+    place = detector_place("MASK335R", "F444W", module="B")
+    assert model.detector.pixelscale == place.siaf_pixelscale
+    assert not model.defaults
+    assert mask_place(frame.header, frame.name) is None
+    known = GaussNewton.nircam("F444W").deviations["lyot_shift"]
+    assert settings_for(frame).deviations["lyot_shift"] > 2 * known
+    with pytest.raises(IncompatibleSetupError, match="have module B, the model A"):
+        refine(nircam_coronagraph("F444W", npix=128, fov_pixels=64), [frame], "flat")
+    for key in ("DETECTOR", "MODULE", "SUBARRAY"):
+        del frame.header[key]
+    # The archive's name of the file names the detector, CORONMSK the module.
+    assert model_for(frame, SIZE) is model
+    named = replace(frame, name="a frame")
+    assert model_for(named, SIZE) is model
+
+
+def test_what_is_not_modelled_is_refused(tmp_path: Path) -> None:
     path = calints(tmp_path, 0.0)
     (frame,) = Sequence.from_files([path]).science
+    frame.header["DETECTOR"] = "NRCA4"
+    with pytest.raises(IncompatibleSetupError, match=r"detector NRCA4, expected NRCA2"):
+        model_for(frame, SIZE)
     frame.header["DETECTOR"] = "NRCB1"
-    with pytest.raises(IncompatibleSetupError, match=r"detector NRCB1, expected NRCA2"):
+    with pytest.raises(CorruptFileError, match=r"NRCB1, MODULE A.* name different modules"):
+        model_for(frame, SIZE)
+    frame.header.update({"MODULE": "B", "CORONMSK": "MASKB335R", "SUBARRAY": "SUB320B335R"})
+    with pytest.raises(IncompatibleSetupError, match=r"B does not have MASK335R in F210M.*NRCB5"):
         model_for(frame, SIZE)
     fits.setval(path, "INSTRUME", value="MIRI")
     with pytest.raises(NoValidPixelsError, match="taken with MIRI; only NIRCam"):

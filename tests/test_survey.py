@@ -755,12 +755,14 @@ def test_a_disk_and_the_whole_frames_are_part_of_the_job(tmp_path: Path) -> None
     config = inputs(tmp_path, 1)
     # Other fields than those asked for are those of the preset in the filter of the frames.
     settings = GaussNewton.nircam("F356W", max_iterations=7)
+    ones = np.ones((4, 4))
+    frame = dr.Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F356W")
     for name in ("wide", "disk"):
         options = {name: True, "star_flux": 0.4, "settings": {"max_iterations": 7}}
         (job,) = planned({**config, "options": options})
         expected = ReduceOptions(size=40, star_flux=0.4, settings=settings, **{name: True})
-        assert work._options(job, "F356W") == expected
-        assert work._options(job, "F356W", wide=False).wide is False
+        assert work._options(job, frame) == expected
+        assert work._options(job, frame, wide=False).wide is False
 
 
 def test_the_result_of_a_job_is_that_of_the_largest_field() -> None:

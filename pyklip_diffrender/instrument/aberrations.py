@@ -35,6 +35,9 @@ _WEDGE_TILT = (
 _TABULATED_AT = (2.12, 3.23)
 """Wavelengths of the tabulated wavefront error, micron."""
 
+_MIRRORED = {"MASKSWB": "MASKLWB", "MASKLWB": "MASKSWB"}
+"""Masks of module A whose place is the mirror image of another mask's in module B."""
+
 
 class ChromaticAberration:
     """Focus and wedge tilt in addition to the tabulated wavefront error.
@@ -65,7 +68,7 @@ class ChromaticAberration:
 
 
 def internal_wavefront_error(
-    mask: str = "MASK335R", flip: bool = True, *, short_wave: bool = False
+    mask: str = "MASK335R", flip: bool = True, *, short_wave: bool = False, module: str = "A"
 ) -> Tensor:
     """NIRCam's internal wavefront error at a mask.
 
@@ -78,12 +81,17 @@ def internal_wavefront_error(
         better. False uses the tabulated orientation, that of the exit pupil, as stpsf did before.
     short_wave : bool
         In the short-wave channel, otherwise in the long-wave one.
+    module : "A" or "B"
+        STScI's table has the same values for B as for A, at places mirrored in V2. There the two
+        bars change places.
 
     Returns
     -------
     Tensor, (36,), float64
         Noll coefficients in m, for the entrance-pupil orientation used here.
     """
+    if module == "B":
+        mask = _MIRRORED.get(mask, mask)
     exit_pupil = torch.tensor(_table(mask, short_wave), dtype=torch.float64) * 1e-9
     return exit_pupil if flip else exit_pupil * parity_in_y(len(exit_pupil))
 

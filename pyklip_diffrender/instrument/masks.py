@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Self
@@ -192,10 +193,11 @@ class DetectorPlace:
     place : str
         Place along a bar: a filter, at whose fiducial it is, or "NARROW"; "-" is the middle.
     detector : str
-        As SIAF names it: NRCA2 or NRCA4 (short wave) or NRCA5 (long wave).
+        As SIAF names it: NRCA2, NRCA4, NRCB1 or NRCB3 (short wave), NRCA5 or NRCB5 (long wave).
     center : tuple of float
         x, y of the mask on the full detector in F335M (short wave: F210M), pixels of the science
         frame counted from 0 at the middle of the first one. In another filter add `filter_shift`.
+        In module B it is that of the SIAF, which in module A is up to 3.4 pixels away.
     siaf_pixelscale : tuple of float
         arcsec per pixel in x and y (SIAF, PRDOPSSOC-075).
     siaf_shear : float
@@ -234,16 +236,21 @@ class DetectorPlace:
     @property
     def header_detector(self) -> str:
         """The detector as headers name it (DETECTOR)."""
-        return "NRCALONG" if self.detector == "NRCA5" else self.detector
+        return self.detector.replace("5", "LONG")
+
+    @property
+    def module(self) -> str:
+        """NIRCam's module, A or B."""
+        return self.detector[3]
 
     @property
     def short_wave(self) -> bool:
         """Whether the detector is one of the short-wave channel."""
-        return self.detector != "NRCA5"
+        return not self.detector.endswith("5")
 
 
 @lru_cache(maxsize=1)
-def _places() -> dict[tuple[str, str, bool], DetectorPlace]:
+def _places() -> dict[tuple[str, str, bool, str], DetectorPlace]:
     places = (
         DetectorPlace(
             str(row["mask"]),
@@ -256,7 +263,7 @@ def _places() -> dict[tuple[str, str, bool], DetectorPlace]:
         )
         for row in embedded_table("nircam_masks")
     )
-    return {(each.mask, each.place, each.short_wave): each for each in places}
+    return {(each.mask, each.place, each.short_wave, each.module): each for each in places}
 
 
 def is_short_wave(filter: str) -> bool:
@@ -290,7 +297,9 @@ def require_mask(mask: str) -> RoundMask | BarMask:
     return MASKS[mask]
 
 
-def detector_place(mask: str | None, filter: str, place: str | None = None) -> DetectorPlace:
+def detector_place(
+    mask: str | None, filter: str, place: str | None = None, module: str = "A"
+) -> DetectorPlace:
     """Where a mask is imaged in a filter, and the pixels there.
 
     Parameters
@@ -303,11 +312,15 @@ def detector_place(mask: str | None, filter: str, place: str | None = None) -> D
     place : str, optional
         Place of the star along a bar: a filter of its channel, at whose fiducial it is, "NARROW",
         or "-", the middle. Default the fiducial of `filter`, or the middle if it has none.
+    module : "A" or "B"
+        In B there are MASK210R and MASKSWB in the short-wave channel, MASK335R, MASK430R and
+        MASKLWB in the long-wave one, and no place along a bar but the middle.
 
     Raises
     ------
     IncompatibleSetupError
-        For an unknown mask, filter or place.
+        For an unknown mask, filter, place or module, or a mask that the module does not have in
+        the filter's channel.
 
     Examples
     --------
@@ -319,13 +332,22 @@ def detector_place(mask: str | None, filter: str, place: str | None = None) -> D
     if mask is None:
         mask = "MASK210R" if short_wave else "MASK335R"
     require_mask(mask)
+    if module not in ("A", "B"):
+        raise IncompatibleSetupError(f"module: got {module!r}, expected 'A' or 'B'")
     places = _places()
-    own = filter.upper() if (mask, filter.upper(), short_wave) in places else "-"
-    key = (mask, own if place is None else place.upper(), short_wave)
-    if key not in places:
-        known = [each.place for each in places.values() if each.mask == mask]
+    if (mask, "-", short_wave, module) not in places:
+        there = [f"{each.mask} ({each.detector})" for each in places.values() if each.module == "B"]
         raise IncompatibleSetupError(
-            f"bar_place: got {place!r}, expected a place along {mask}: "
+            f"module: B does not have {mask} in {filter}, only {', '.join(there)}"
+        )
+    own = filter.upper() if (mask, filter.upper(), short_wave, module) in places else "-"
+    key = (mask, own if place is None else place.upper(), short_wave, module)
+    if key not in places:
+        known = [
+            each.place for each in places.values() if (each.mask, each.module) == (mask, module)
+        ]
+        raise IncompatibleSetupError(
+            f"bar_place: got {place!r}, expected a place along {mask} in module {module}: "
             f"{', '.join(dict.fromkeys(known))}"
         )
     return places[key]
@@ -334,13 +356,13 @@ def detector_place(mask: str | None, filter: str, place: str | None = None) -> D
 def mask_of_header(value: object) -> str:
     """Return the name of an image mask, as ``CORONMSK`` has it, without the module: MASK335R.
 
-    Headers name NIRCam's module A with the mask: MASKA335R.
+    Headers name NIRCam's module with the mask: MASKA335R.
     """
-    return str(value).strip().upper().replace("MASKA", "MASK")
+    return re.sub(r"^MASK[AB](?=\d|[LS]WB)", "MASK", str(value).strip().upper())
 
 
-# J. Leisenring's measurements in flight, as in spaceKLIP's resources filter_shifts_jarron.json
-# (commit 07eaf7d).
+# J. Leisenring's measurements in flight with module A, as in spaceKLIP's resources
+# filter_shifts_jarron.json (commit 07eaf7d).
 _SHIFTS = {
     "F182M": (-0.071, -1.365),
     "F187N": (-0.108, -1.216),
@@ -364,7 +386,8 @@ _SHIFTS = {
 def filter_shift(name: str) -> tuple[float, float]:
     """How far the image of the mask, and of the sky with it, lies from where it is in F335M.
 
-    The filters' substrates and the coronagraph's wedge displace the image by up to two pixels.
+    The filters' substrates and the coronagraph's wedge displace the image by up to two pixels. It
+    was measured in module A.
 
     Parameters
     ----------

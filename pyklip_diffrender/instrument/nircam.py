@@ -90,6 +90,7 @@ def nircam_coronagraph(
     shear: float = 0.0,
     crosstalk: bool = False,
     image_mask: str | None = "MASK335R",
+    module: str = "A",
     bar_place: str | None = None,
     pupil_mask: str | None = "auto",
     pupil: str = "design",
@@ -138,6 +139,8 @@ def nircam_coronagraph(
     image_mask : str or None
         "MASK210R", "MASK335R", "MASK430R", or the bars "MASKSWB" and "MASKLWB", each with the
         filters of both channels, or None for no occulter (a planet far from the star).
+    module : "A" or "B"
+        JWST observes with A. For what there is in B see `detector_place`.
     bar_place : str, optional
         Where along a bar the star is: at the fiducial of a filter, such as "F460M", at the
         "NARROW" end, or in the middle, "-". Default the fiducial of `filter`, or the middle if
@@ -191,7 +194,7 @@ def nircam_coronagraph(
     (24, 24)
     """
     recipe = _in_plain_numbers(dict(locals()))
-    place = detector_place(image_mask, filter, bar_place)
+    place = detector_place(image_mask, filter, bar_place, module)
     if pupil_mask == "auto":
         recipe["pupil_mask"] = require_mask(place.mask).stop
     _require_supported(place, recipe)
@@ -239,10 +242,10 @@ def _require_supported(place: DetectorPlace, recipe: Mapping[str, Any]) -> None:
             f"pupil_mask: got {recipe['pupil_mask']!r}, expected 'auto', 'MASKRND', 'MASKBAR' or "
             "None"
         )
-    if recipe["crosstalk"] and place.short_wave:
+    if recipe["crosstalk"] and place.detector != "NRCA5":
         raise IncompatibleSetupError(
-            f"crosstalk: the embedded kernels are those of the long-wave detector NRCA5, and "
-            f"{recipe['filter']} is a short-wave filter; use crosstalk=False"
+            f"crosstalk: the embedded kernels are those of the detector NRCA5, and "
+            f"{recipe['filter']} is imaged on {place.detector}; use crosstalk=False"
         )
     if recipe["dtype"] not in (torch.float32, torch.float64):
         raise IncompatibleSetupError(
@@ -334,7 +337,9 @@ def _planes(place: DetectorPlace, bandpass: Bandpass, recipe: Mapping[str, Any])
 
 def _internal_coefficients(place: DetectorPlace, si_wfe: bool | ArrayLike, flip: bool) -> Tensor:
     if si_wfe is True:
-        return internal_wavefront_error(place.mask, flip, short_wave=place.short_wave)
+        return internal_wavefront_error(
+            place.mask, flip, short_wave=place.short_wave, module=place.module
+        )
     coefficients = torch.as_tensor(si_wfe, dtype=torch.float64)
     return coefficients if flip else coefficients * parity_in_y(len(coefficients))
 

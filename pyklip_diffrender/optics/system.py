@@ -138,10 +138,8 @@ class OpticalSystem(Propagation):
 
         Names in the spelling of stpsf under "filter", "image_mask", "pupil_mask" and "module".
         """
-        names = ("filter", "image_mask", "pupil_mask")
-        setup = {name: self.recipe[name] for name in names if self.recipe.get(name)}
-        # The embedded masks are those of NIRCam's module A.
-        return {**setup, "module": "A"} if "image_mask" in setup else setup
+        names = ("filter", "image_mask", "pupil_mask", "module")
+        return {name: self.recipe[name] for name in names if self.recipe.get(name)}
 
     @property
     def adjustable(self) -> frozenset[str]:

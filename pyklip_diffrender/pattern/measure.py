@@ -65,7 +65,7 @@ class MeasuredPattern:
     pedestal : float
         As of `Systematics`.
     detector : str or None
-        NRCALONG, NRCA2 or NRCA4.
+        As headers name it, such as NRCALONG.
     flat : str or None
         Name of the flat field with which the frame was calibrated (R_FLAT).
     light : ndarray, (ny, nx), or None

@@ -16,6 +16,7 @@ from pyklip_diffrender.instrument.masks import mask_of_header
 from pyklip_diffrender.io.units import to_number
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import parameter
+from pyklip_diffrender.scene.exposure import module_of
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import OPDMap, resample
@@ -179,7 +180,7 @@ def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
         ("filter", setup.get("filter"), observation.filter),
         ("image mask", setup.get("image_mask"), header.get("CORONMSK")),
         ("pupil mask", setup.get("pupil_mask"), header.get("PUPIL")),
-        ("module", setup.get("module"), header.get("MODULE")),
+        ("module", setup.get("module"), module_of(header, observation.name)),
     )
     for aspect, expected, actual in setups:
         if not isinstance(expected, str) or not isinstance(actual, str):

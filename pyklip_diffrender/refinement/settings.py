@@ -14,6 +14,7 @@ from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import ARCSEC, require_positive, to_bytes, to_unit
 from pyklip_diffrender.optics.grid import JWST_DIAMETER
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
+from pyklip_diffrender.scene.exposure import module_of
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import Basis
@@ -255,7 +256,7 @@ class GaussNewton:
 
     @classmethod
     def nircam(
-        cls, filter: str | None = None, *, reach: int = _REACH, **changes: Any
+        cls, filter: str | None = None, *, reach: int = _REACH, module: str = "A", **changes: Any
     ) -> GaussNewton:
         """Return the settings for real NIRCam frames, for which the model is not exact.
 
@@ -273,12 +274,14 @@ class GaussNewton:
         Parameters
         ----------
         filter : str, optional
-            Such as "F356W"; default as in F444W. In the short-wave channel, for which no alignment
-            of the Lyot stop in flight is published, its prior is three times as wide.
+            Such as "F356W"; default as in F444W. In the short-wave channel and in module B, for
+            which no alignment of the Lyot stop in flight is published, its prior is three times as
+            wide.
         reach : int
             Pixels by which the finest modes move light, but at most with 32 cycles: by default to
             the edge of the square that `reduce` fits. These are 18 cycles in F444W and F210M, 22
             in F356W and 32 in F250M.
+        module : "A" or "B"
         **changes
             Fields with other values.
 
@@ -295,7 +298,7 @@ class GaussNewton:
         """
         wavelength = _wavelength("F444W" if filter is None else filter)
         short = wavelength <= _LONG_WAVE
-        loose = 3.0 if short else 1.0
+        loose = 3.0 if short or module == "B" else 1.0
         preset = cls(
             free=(
                 "star_offset",
@@ -353,7 +356,8 @@ def settings_for(observation: Observation) -> GaussNewton:
     if not observation.is_nircam:
         return GaussNewton()
     reach = max(_REACH, min(observation.shape) // 2)
-    return GaussNewton.nircam(observation.filter, reach=reach)
+    module = module_of(observation.header, observation.name) or "A"
+    return GaussNewton.nircam(observation.filter, reach=reach, module=module)
 
 
 def _wavelength(filter: str) -> float:

@@ -25,7 +25,7 @@ from pyklip_diffrender.instrument.masks import detector_place, filter_shift
 from pyklip_diffrender.io.headers import header_number, header_text
 from pyklip_diffrender.io.units import native_float64, require_finite
 from pyklip_diffrender.scene.archive_names import detector_of
-from pyklip_diffrender.scene.exposure import bar_place, image_mask
+from pyklip_diffrender.scene.exposure import bar_place, image_mask, module_of
 
 __all__ = [
     "SHIFTS",
@@ -142,10 +142,11 @@ def mask_place(header: fits.Header, name: str) -> NDArray[np.float64] | None:
     Returns
     -------
     ndarray, (2,), or None
-        x, y, pixels from 0; None if the header does not say, or where it was not measured.
+        x, y, pixels from 0; None if the header does not say, or where it was not measured, as in
+        module B.
     """
     detector, mask = detector_of(header, name), image_mask(header, name)
-    if detector is None or mask is None:
+    if detector is None or mask is None or module_of(header, name) == "B":
         return None
     try:
         passband = header_text(header, "FILTER", name) or ""

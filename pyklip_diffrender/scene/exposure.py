@@ -32,11 +32,15 @@ __all__ = [
     "instrument_of",
     "is_reference",
     "middle",
+    "module_of",
     "position_angle",
 ]
 
 _MASK = re.compile(r"(?<![A-Z0-9])(?:SUB\d+|MASK)?[AB]?(?:MASK)?(\d{3}R|LWB|SWB)(?![A-Z0-9])")
 """A mask in CORONMSK (MASKA335R), APERNAME (NRCA5_MASK335R) or SUBARRAY (SUB320A335R)."""
+
+_MODULE = re.compile(r"(?:NRC|MASK|SUB\d+)?([AB])(?=\d|[LS]WB|LONG|$)")
+"""NIRCam's module in a detector (NRCALONG), MODULE (A), CORONMSK or SUBARRAY."""
 
 _SAME_ANGLE = 0.1
 """Degrees by which the sum of two angles may differ from what a card says it is."""
@@ -199,6 +203,44 @@ def image_mask(header: fits.Header, name: str) -> str | None:
             "file again"
         )
     return next(iter(stated.values()), None)
+
+
+def module_of(header: fits.Header, name: str) -> str | None:
+    """NIRCam's module, from the detector, MODULE, CORONMSK or SUBARRAY.
+
+    Parameters
+    ----------
+    header : Header
+    name : str
+        The file's, for messages.
+
+    Returns
+    -------
+    str or None
+        "A" or "B"; None where the header does not say.
+
+    Raises
+    ------
+    CorruptFileError
+        If two of the cards name different modules.
+
+    Examples
+    --------
+    >>> from astropy.io import fits
+    >>> module_of(fits.Header({"DETECTOR": "NRCBLONG", "CORONMSK": "MASKB335R"}), "a.fits")
+    'B'
+    """
+    texts = {key: header_text(header, key, name) for key in ("MODULE", "CORONMSK", "SUBARRAY")}
+    texts = {"DETECTOR": detector_of(header, name), **texts}
+    stated = {key: _MODULE.match((text or "").upper()) for key, text in texts.items()}
+    modules = {match[1] for match in stated.values() if match}
+    if len(modules) > 1:
+        listed = ", ".join(f"{key} {texts[key]}" for key, match in stated.items() if match)
+        raise CorruptFileError(
+            f"{name}: {listed}: the cards name different modules. Correct the header, or fetch the "
+            "file again"
+        )
+    return next(iter(modules), None)
 
 
 def bar_place(header: fits.Header, name: str) -> str | None:

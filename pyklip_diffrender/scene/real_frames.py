@@ -13,7 +13,7 @@ from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.optics.grid import samples_for_field
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.scene.archive_names import detector_of
-from pyklip_diffrender.scene.exposure import bar_place, image_mask
+from pyklip_diffrender.scene.exposure import bar_place, image_mask, module_of
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["model_for"]
@@ -34,8 +34,8 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
     """Make the model of the coronagraph for an observation.
 
     Frames whose header says NIRCam get the detector's scale and shear from the SIAF and the Lyot
-    stop where it is in flight (short wave: where it should be), which is where a fit starts. A
-    model that was made before is used again.
+    stop where it is in flight (short wave and module B: where it should be), which is where a fit
+    starts. A model that was made before is used again.
 
     Parameters
     ----------
@@ -96,13 +96,13 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
                 f"{', '.join(MASKS)}"
             )
         along = bar_place(observation.header, observation.name)
-        place = detector_place(name, observation.filter, along)
+        module = module_of(observation.header, observation.name) or "A"
+        place = detector_place(name, observation.filter, along, overrides.get("module", module))
         detector = detector_of(observation.header, observation.name)
         if detector not in (None, place.header_detector):
             raise IncompatibleSetupError(
                 f"{observation.name}: these frames are of the detector {detector}, expected "
-                f"{place.header_detector}, on which {name} is imaged in {observation.filter}. "
-                "Module B, whose coronagraph is not used, is not modelled"
+                f"{place.header_detector}, on which {name} is imaged in {observation.filter}"
             )
         shortest = float(filter_throughput(observation.filter)[0][0])
         (ny, nx), (x, y) = observation.shape, place.siaf_pixelscale
@@ -111,14 +111,15 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
             npix *= 2
         arguments |= {
             "image_mask": name,
+            "module": place.module,
             "bar_place": place.place,
             "pixelscale": place.siaf_pixelscale,
             "shear": place.siaf_shear,
             "nlambda": 7,
             "npix": npix,
             "occulter_sampling": _CELLS,
-            # That of the stop of the short-wave channel is not published.
-            "defaults": None if place.short_wave else FLIGHT_ALIGNMENT,
+            # The stops of the short-wave channel and of module B were not measured in flight.
+            "defaults": None if place.short_wave or place.module == "B" else FLIGHT_ALIGNMENT,
         }
     arguments |= overrides
     defaults = arguments.pop("defaults", None)

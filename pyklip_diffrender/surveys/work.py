@@ -17,6 +17,7 @@ from pyklip_diffrender.reduction import (
     write_products,
 )
 from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement
+from pyklip_diffrender.scene.exposure import module_of
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
@@ -40,7 +41,7 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
         changes |= {"systematics": fit.systematics or "off", "wide": False}
     else:
         sequence = _sequence(job)
-    options = _options(job, sequence.science[0].filter, **changes)
+    options = _options(job, sequence.science[0], **changes)
     reduction = prepare(sequence, job.opd, options).run()
     write_products(reduction, folder, fit=job.injection is None)
     result = _result(summarise(reduction))
@@ -53,11 +54,14 @@ def _sequence(job: Job) -> Sequence:
     return Sequence.from_files(job.files, target=job.target, filter=job.filter, epoch=job.epoch)
 
 
-def _options(job: Job, filter: str | None, **changes: Any) -> ReduceOptions:
+def _options(job: Job, frames: Observation, **changes: Any) -> ReduceOptions:
     """Options of a job's reduction; settings that it does not name are those of the preset."""
     keywords = {**job.options.keywords, **changes}
     if job.options.settings:
-        keywords["settings"] = GaussNewton.nircam(filter, **job.options.settings)
+        module = module_of(frames.header, frames.name) or "A"
+        keywords["settings"] = GaussNewton.nircam(
+            frames.filter, module=module, **job.options.settings
+        )
     return ReduceOptions(**keywords)
 
 
