@@ -42,7 +42,10 @@ def main() -> None:
             f"contrast {row['contrast']:.3e}, {row['flux_density']:.3e}, S/N {row['snr']:.1f}"
             for row in dr.detect(fit).candidates
         ]
-        print(f"{share or 'fitted'}  {fit.chi2_per_pixel:.4f}  {'; '.join(seen) or 'none'}", flush=True)
+        print(
+            f"{share or 'fitted'}  {fit.chi2_per_pixel:.4f}  {'; '.join(seen) or 'none'}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

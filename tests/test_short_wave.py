@@ -182,6 +182,9 @@ def test_the_place_along_a_bar_is_that_of_the_header() -> None:
     frame = Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F335M", header=header)
     model = model_for(frame, monochromatic=3.35e-6)
     assert model.setup["pupil_mask"] == "MASKBAR"
+    assert not model.defaults  # This stop was not measured in flight.
+    known = GaussNewton.nircam("F335M").deviations["lyot_rotation"]
+    assert settings_for(frame).deviations["lyot_rotation"] > 2 * known
     # The narrow end is 8.3 arcsec from the middle of a bar of 20.
     assert model.planes[0].reach[0] == pytest.approx(18.30, abs=0.01)
     # With fewer samples a copy of the star would be hidden as well, and be taken off twice.

@@ -28,6 +28,7 @@ __all__ = [
     "is_short_wave",
     "mask_of_header",
     "require_mask",
+    "stop_is_measured",
 ]
 
 _SECOND_ZERO_OF_J1 = 7.015586669815619
@@ -351,6 +352,23 @@ def detector_place(
             f"{', '.join(dict.fromkeys(known))}"
         )
     return places[key]
+
+
+def stop_is_measured(mask: str | None, short_wave: bool, module: str | None = None) -> bool:
+    """Whether the alignment of the Lyot stop was measured in flight.
+
+    That of MASKRND was, in the long-wave channel of module A.
+
+    Parameters
+    ----------
+    mask : str or None
+        Image mask; default a round one.
+    short_wave : bool
+    module : "A" or "B", optional
+        Default A.
+    """
+    is_round = mask is None or isinstance(require_mask(mask), RoundMask)
+    return is_round and not short_wave and module != "B"
 
 
 def mask_of_header(value: object) -> str:

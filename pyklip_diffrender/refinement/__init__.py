@@ -13,7 +13,7 @@ from pyklip_diffrender.refinement.flux_scale import (
     with_star_flux,
 )
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
+from pyklip_diffrender.refinement.settings import GaussNewton, nircam_settings, settings_for
 from pyklip_diffrender.refinement.status import Status
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "Refinement",
     "Status",
     "jansky_per_unit",
+    "nircam_settings",
     "refine",
     "refine_again",
     "require_calibrated",

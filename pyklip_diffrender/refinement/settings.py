@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.instrument.masks import stop_is_measured
 from pyklip_diffrender.io.units import ARCSEC, require_positive, to_bytes, to_unit
 from pyklip_diffrender.optics.grid import JWST_DIAMETER
 from pyklip_diffrender.parameters import OPTICAL_PARAMETERS
-from pyklip_diffrender.scene.exposure import module_of
+from pyklip_diffrender.scene.exposure import image_mask, module_of
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.bases import Basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["GaussNewton", "settings_for"]
+__all__ = ["GaussNewton", "nircam_settings", "settings_for"]
 
 _REACH = 40
 """Pixels from the star to the edge of the square that `reduce` fits."""
@@ -256,7 +257,13 @@ class GaussNewton:
 
     @classmethod
     def nircam(
-        cls, filter: str | None = None, *, reach: int = _REACH, module: str = "A", **changes: Any
+        cls,
+        filter: str | None = None,
+        *,
+        reach: int = _REACH,
+        image_mask: str | None = None,
+        module: str | None = None,
+        **changes: Any,
     ) -> GaussNewton:
         """Return the settings for real NIRCam frames, for which the model is not exact.
 
@@ -274,14 +281,16 @@ class GaussNewton:
         Parameters
         ----------
         filter : str, optional
-            Such as "F356W"; default as in F444W. In the short-wave channel and in module B, for
-            which no alignment of the Lyot stop in flight is published, its prior is three times as
-            wide.
+            Such as "F356W"; default as in F444W.
         reach : int
             Pixels by which the finest modes move light, but at most with 32 cycles: by default to
             the edge of the square that `reduce` fits. These are 18 cycles in F444W and F210M, 22
             in F356W and 32 in F250M.
-        module : "A" or "B"
+        image_mask : str, optional
+            Default a round one.
+        module : "A" or "B", optional
+            Default A. In B, in the short-wave channel and behind bars, the alignment of the Lyot
+            stop was not measured in flight, and its prior is three times as wide.
         **changes
             Fields with other values.
 
@@ -298,7 +307,7 @@ class GaussNewton:
         """
         wavelength = _wavelength("F444W" if filter is None else filter)
         short = wavelength <= _LONG_WAVE
-        loose = 3.0 if short or module == "B" else 1.0
+        loose = 1.0 if stop_is_measured(image_mask, short, module) else 3.0
         preset = cls(
             free=(
                 "star_offset",
@@ -355,9 +364,23 @@ def settings_for(observation: Observation) -> GaussNewton:
     """Return the default settings for an observation: the NIRCam preset for real NIRCam frames."""
     if not observation.is_nircam:
         return GaussNewton()
-    reach = max(_REACH, min(observation.shape) // 2)
-    module = module_of(observation.header, observation.name) or "A"
-    return GaussNewton.nircam(observation.filter, reach=reach, module=module)
+    return nircam_settings(observation, reach=max(_REACH, min(observation.shape) // 2))
+
+
+def nircam_settings(observation: Observation, **changes: Any) -> GaussNewton:
+    """Return the NIRCam preset for an observation's filter, mask and module.
+
+    Parameters
+    ----------
+    observation : Observation
+    **changes
+        See `GaussNewton.nircam`.
+    """
+    header, name = observation.header, observation.name
+    mask = image_mask(header, name)
+    return GaussNewton.nircam(
+        observation.filter, image_mask=mask, module=module_of(header, name), **changes
+    )
 
 
 def _wavelength(filter: str) -> float:

@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.instrument.masks import MASKS, detector_place
+from pyklip_diffrender.instrument.masks import MASKS, detector_place, stop_is_measured
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.io.headers import header_text
@@ -34,8 +34,8 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
     """Make the model of the coronagraph for an observation.
 
     Frames whose header says NIRCam get the detector's scale and shear from the SIAF and the Lyot
-    stop where it is in flight (short wave and module B: where it should be), which is where a fit
-    starts. A model that was made before is used again.
+    stop where it is in flight, or where it should be if that was not measured (short wave, bars
+    and module B). This is where a fit starts. A model that was made before is used again.
 
     Parameters
     ----------
@@ -118,8 +118,9 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
             "nlambda": 7,
             "npix": npix,
             "occulter_sampling": _CELLS,
-            # The stops of the short-wave channel and of module B were not measured in flight.
-            "defaults": None if place.short_wave or place.module == "B" else FLIGHT_ALIGNMENT,
+            "defaults": FLIGHT_ALIGNMENT
+            if stop_is_measured(name, place.short_wave, place.module)
+            else None,
         }
     arguments |= overrides
     defaults = arguments.pop("defaults", None)

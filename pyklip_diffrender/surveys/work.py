@@ -16,8 +16,7 @@ from pyklip_diffrender.reduction import (
     summarise,
     write_products,
 )
-from pyklip_diffrender.refinement import FrameFit, GaussNewton, Refinement
-from pyklip_diffrender.scene.exposure import module_of
+from pyklip_diffrender.refinement import FrameFit, Refinement, nircam_settings
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
@@ -58,10 +57,7 @@ def _options(job: Job, frames: Observation, **changes: Any) -> ReduceOptions:
     """Options of a job's reduction; settings that it does not name are those of the preset."""
     keywords = {**job.options.keywords, **changes}
     if job.options.settings:
-        module = module_of(frames.header, frames.name) or "A"
-        keywords["settings"] = GaussNewton.nircam(
-            frames.filter, module=module, **job.options.settings
-        )
+        keywords["settings"] = nircam_settings(frames, **job.options.settings)
     return ReduceOptions(**keywords)
 
 
