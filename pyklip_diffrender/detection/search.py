@@ -39,6 +39,7 @@ from pyklip_diffrender.detection.relinearise import (
     with_companions,
 )
 from pyklip_diffrender.detection.search_result import Detection
+from pyklip_diffrender.detection.side_lobes import side_lobes
 from pyklip_diffrender.detection.significance import Significance
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -385,6 +386,7 @@ def _search(
     dismissed = torch.zeros(0, 2, dtype=torch.float64)
     # Pixels whose sources are nearer to the star than the search goes.
     within = np.zeros(grid.shape[:2], dtype=bool)
+    hidden = False
     while True:
         snr = maps.snr(maps.without(candidates))
         significance = significance_of(fits, maps, candidates.offsets, inner, scatter)
@@ -403,9 +405,18 @@ def _search(
         factor = significance.factor(snr, candidates.offsets)
         margin = candidates.snr(factor) - factor.threshold(threshold, candidates.offsets)
         if not len(candidates) or margin.min() >= 0:
-            if not candidates.converged:
-                candidates = refine_candidates(groups, candidates, reach=pixel / 2)
-            return candidates, factor, significance
+            lobes = side_lobes(maps, candidates, factor, threshold, inner)
+            if not lobes.any():
+                if not candidates.converged:
+                    candidates = refine_candidates(groups, candidates, reach=pixel / 2)
+                return candidates, factor, significance
+            margin = np.where(lobes, margin, np.inf)
+            if not hidden:
+                _log.warning(
+                    "light within %.2f arcsec is not the star's; peaks that it explains elsewhere "
+                    "are no candidates", inner
+                )  # fmt: skip
+            hidden = True
         # The factor may have grown since a candidate was accepted.
         weakest = int(margin.argmin())
         dismissed = torch.cat([dismissed, candidates.offsets[weakest, None]])

@@ -66,6 +66,9 @@ _BRIGHT = 8.0
 Without companions, peaks reached 6 (drifts of 40 to 400 h); companions that stalled a fit had 12.
 """
 
+_FAINT = 5.0
+"""S/N of a companion below which the last steps of a fit do without it."""
+
 _MOST_BRIGHT = 8
 """Largest number of companions that a fit may add in this way."""
 
@@ -205,6 +208,8 @@ class Annealing:
             self._restart(course, bright)
             return False
         is_last = course.kappa <= floor and course.modes == len(self.basis)
+        if is_last and self._drop_faint(course):
+            return False
         if gain < self.settings.tolerance and is_last:
             return True
         course.kappa = min(_ANNEALING * course.kappa, course.error / 2)
@@ -222,7 +227,7 @@ class Annealing:
         is_close = course.error < _NEAR
         course.state = self._with_companions(course.state if is_close else course.aligned, added)
         course.least, course.remaining = NOTHING, self.settings.max_iterations
-        self.solver.damping = 0.0
+        course.may_drop, self.solver.damping = False, 0.0
         if is_close:
             # Images are less linear in positions than in the wavefront, and steps of these few
             # unknowns are cheap.
@@ -233,6 +238,22 @@ class Annealing:
             floor = self.settings.min_model_error
             course.kappa = max(self.objective.model_error(course.state), floor)
         course.best = course.state
+
+    def _drop_faint(self, course: Course) -> bool:
+        """Go on without companions of the alignment that were errors of the wavefront.
+
+        They would double the time of every step. The search finds a faint source without them.
+        """
+        snr = self.solver.companion_snr(course.state)
+        faint = snr < _FAINT
+        faint[: len(self._begin.unknowns.frames[0].companions)] = False
+        if not (course.may_drop and bool(faint.any())):
+            return False
+        _log.info("companions of S/N %s are dropped", snr[faint].tolist())
+        fewer = course.state.unknowns.without_companions(faint, course.state.vector)
+        course.state = course.best = self.objective.at(*fewer)
+        course.least = NOTHING
+        return True
 
     def _finish(self, best: State, converged: bool) -> tuple[State, Status]:
         """Correct what the residual of the best iterate shows to be wrong."""

@@ -31,6 +31,9 @@ class Course:
         Model error and chi-squared per pixel of `state`.
     least : (float, float)
         Model error and chi-squared per pixel of `best`.
+    may_drop : bool
+        Whether companions may be dropped. They may not after some were added to a fit that had
+        stalled, or it might add and drop them for ever.
     """
 
     state: State
@@ -42,3 +45,4 @@ class Course:
     error: float = math.inf
     chi2: float = math.inf
     least: tuple[float, float] = NOTHING
+    may_drop: bool = True

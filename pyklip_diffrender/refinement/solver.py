@@ -321,6 +321,20 @@ class Solver:
         assert self._equations.state is state
         return self._solve(state.unknowns, self._equations, errors=True)
 
+    def companion_snr(self, state: State) -> Tensor:
+        """S/N of the companions of a state, (companions,).
+
+        The errors are those of the last linearisation; infinite S/N if it had other companions.
+        """
+        equations, unknowns = self._equations, state.unknowns
+        where = unknowns.where("companions")
+        contrasts = state.vector[where][::3]
+        if not len(contrasts) or equations is None or equations.state.unknowns is not unknowns:
+            return torch.full_like(contrasts, math.inf)
+        variance = self._solve(unknowns, equations, errors=True).variance
+        assert variance is not None
+        return contrasts / variance[where][::3].sqrt()
+
     def _solve(
         self,
         unknowns: Unknowns,

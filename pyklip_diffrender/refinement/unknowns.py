@@ -315,3 +315,13 @@ class Unknowns:
         moved[:before] = vector[:before]
         moved[after:] = vector[before:]
         return grown, moved
+
+    def without_companions(self, dropped: Tensor, vector: Tensor) -> tuple[Unknowns, Tensor]:
+        """Return unknowns without some companions, a mask (companions,), and their vector."""
+        stays = torch.ones(self.size, dtype=torch.bool)
+        stays[self.where("companions")] = ~dropped.repeat_interleave(3)
+        frames = [
+            replace(each, companions=tuple(itertools.compress(each.companions, ~dropped)))
+            for each in self.frames
+        ]
+        return replace(self, frames=tuple(frames)), vector[stays]

@@ -1,0 +1,51 @@
+"""Candidates that are side lobes of a source nearer to the star than the search goes.
+
+Such a source can end a fit at a wrong wavefront, whose residuals elsewhere look like planets.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
+from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.field import pixel_width, separation_of
+from pyklip_diffrender.detection.maps import Maps
+
+__all__ = ["side_lobes"]
+
+
+def side_lobes(
+    maps: Maps, candidates: Candidates, factor: ErrorFactor, threshold: float, inner: float
+) -> Tensor:
+    """Which candidates are not significant beside a source within the inner limit, (k,).
+
+    The source is the highest peak there, and is fitted together with the candidates. A planet keeps
+    its S/N, because the two images differ.
+
+    Parameters
+    ----------
+    maps : Maps
+    candidates : Candidates
+    factor : ErrorFactor
+        By which the errors are multiplied.
+    threshold : float
+        S/N of a source in Gaussian noise.
+    inner : float
+        Smallest separation of candidates, arcsec.
+    """
+    none = torch.zeros(len(candidates), dtype=torch.bool)
+    within = separation_of(maps.grid) < inner
+    snr = np.where(within, maps.snr(maps.without(candidates)) / factor.of(maps.grid), -np.inf)
+    if not len(candidates) or not np.nanmax(snr) >= threshold:
+        return none
+    peak = np.unravel_index(np.nanargmax(snr), snr.shape)
+    contrast = float(maps.numerator[peak] / maps.information[peak])
+    both = candidates.with_one_more(maps.grid[peak], contrast)
+    both = refine_candidates(maps.groups, both, pixel_width(maps.grid) / 2)
+    if separation_of(both.offsets.numpy())[-1] >= inner:
+        return none
+    needed = factor.threshold(threshold, candidates.offsets)
+    return torch.from_numpy(both.snr(factor)[:-1] < needed)

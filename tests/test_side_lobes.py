@@ -1,0 +1,63 @@
+"""Candidates beside a source that is nearer to the star than the search goes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import pyklip_diffrender as dr
+from benchmarks.planets import searched
+from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.groups import groups_of
+from pyklip_diffrender.detection.maps import Maps
+from pyklip_diffrender.detection.side_lobes import side_lobes
+
+HIDDEN, PLANET, LOBE = (0.1, -0.08), (-0.3, 0.5), (0.22, 0.3)
+UNIT = ErrorFactor.constant(1.0)
+
+
+def maps_of(light: dict[tuple[float, float], float]) -> Maps:
+    """Maps of frames with sources, x, y to S/N, about whose star everything is known."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=128, fov_pixels=28)
+    opd = dr.random_opd(1, npix=128)
+    frame = dr.simulate(model, dr.Scene(), opd, seed=2)
+    fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=5))
+    ((linear, templates),) = groups_of([fit])
+    images = templates.at(torch.tensor(list(light), dtype=torch.float64))
+    errors = linear.weigh(images).information.rsqrt()
+    contrasts = errors * torch.tensor(list(light.values()))
+    added = torch.tensordot(contrasts, images[0].double(), dims=1)
+    changed = replace(linear.frames[0], residual=added)
+    return Maps([(replace(linear, frames=(changed,)), templates)], False)
+
+
+def candidates_of(maps: Maps, light: dict[tuple[float, float], float]) -> Candidates:
+    """Candidates at x, y with the S/N that they would have alone."""
+    ((linear, templates),) = maps.groups
+    images = templates.at(torch.tensor(list(light), dtype=torch.float64))
+    errors = linear.weigh(images).information.rsqrt()
+    return Candidates.at(list(light), errors * torch.tensor(list(light.values())))
+
+
+def test_a_planet_stays_and_a_peak_that_a_hidden_source_explains_does_not() -> None:
+    maps = maps_of({HIDDEN: 60.0, PLANET: 30.0})
+    candidates = candidates_of(maps, {PLANET: 30.0, LOBE: 6.0})
+    assert side_lobes(maps, candidates, UNIT, 5.0, 0.2).tolist() == [False, True]
+
+
+def test_without_a_hidden_source_nothing_is_explained() -> None:
+    maps = maps_of({PLANET: 30.0, LOBE: 6.0})
+    assert not side_lobes(maps, candidates_of(maps, {PLANET: 30.0}), UNIT, 5.0, 0.2).any()
+
+
+@pytest.mark.slow
+def test_no_candidate_beside_a_planet_behind_the_mask() -> None:
+    """A planet of 9e-5 at 0.11 arcsec ends a fit as CONVERGED, with a peak of 5.1 at 0.35."""
+    outcome = searched(60)
+    assert outcome.false == ()
+    assert outcome.verdict == "fainter than the curve"
+    assert np.isnan(outcome.pull)
