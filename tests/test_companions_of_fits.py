@@ -120,6 +120,41 @@ def test_a_step_is_linear_in_the_light_of_a_companion() -> None:
     assert moved[place + 1 : place + 3].tolist() == pytest.approx([0.4, 0.3])
 
 
+def test_companions_are_taken_from_all_frames() -> None:
+    start = {"flux": torch.tensor([2e5])}
+    planets = [dr.Planet.from_offset(contrast, 0.4, 0.3) for contrast in (0.1, 0.2, 0.3)]
+    frames = tuple(FrameUnknowns(("flux",), start, modes=2, amplitude_modes=1) for _ in range(2))
+    unknowns = Unknowns(frames, own=("flux",), drift=1)
+    vector = torch.arange(unknowns.size, dtype=torch.float64)
+    more, longer = unknowns.with_companions(planets, vector)
+    fewer, shorter = more.without_companions(torch.tensor([True, False, True]), longer)
+    assert fewer.frames[1].companions == (planets[1],)
+    assert shorter[fewer.where("companions")].tolist() == pytest.approx([0.2, 0.4, 0.3])
+    again, same = fewer.without_companions(torch.tensor([True]), shorter)
+    assert again == unknowns
+    assert same.tolist() == vector.tolist()
+
+
+@pytest.mark.parametrize("contrast", [0.0, 1e-3])
+def test_a_companion_that_was_an_error_of_the_wavefront_is_dropped(
+    contrast: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The alignment alone leaves peaks, which the wavefront explains; a planet stays."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=128, fov_pixels=28)
+    before, change = (dr.random_opd(k, npix=128) for k in (8, 9))
+    now = replace(before, data=before.data + 0.2 * change.data)
+    scene = dr.Scene(planets=(dr.Planet(contrast, 0.6, 70.0),))
+    frame = dr.simulate(model, scene, now, seed=5)
+    preset = dr.GaussNewton.nircam(
+        "F444W", cycles=(9.0,), max_iterations=12, companion_threshold=2.0
+    )
+    with caplog.at_level("INFO", logger="pyklip_diffrender"):
+        fit = dr.refine(model, frame, before, settings=preset)
+    assert "possible sources" in caplog.text
+    assert ("are dropped" in caplog.text) == (contrast == 0)
+    assert fit.companions[:, 0].tolist() == pytest.approx([contrast] if contrast else [], rel=0.05)
+
+
 def test_a_companion_that_outshines_the_star_is_fitted_with_it() -> None:
     """Fitted alone, the star's flux would be negative. Few modes leave an error of 2 %."""
     model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=128, fov_pixels=28)

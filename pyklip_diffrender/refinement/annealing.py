@@ -244,6 +244,8 @@ class Annealing:
 
         They would double the time of every step. The search finds a faint source without them.
         """
+        if course.error > max(_NEAR, self.settings.min_model_error):
+            return False
         snr = self.solver.companion_snr(course.state)
         faint = snr < _FAINT
         faint[: len(self._begin.unknowns.frames[0].companions)] = False
