@@ -8,8 +8,10 @@ The rolls of a target are reduced with KLIP (ADI+RDI, all other stars as referen
 and with this package (images "cleaned" and "flux"). The noise of each product is that
 of `pyklip.klip.meas_contrast`; its throughput is that of planets injected with
 `fakes.inject_planet`, a few times brighter than the noise so that both algorithms are linear, and
-measured with `fakes.retrieve_planet_flux`. It prints 5-sigma limits in the unit of the injected
-peaks, raw and after the Gaussian filter of `meas_contrast`, which both products get then.
+measured with `fakes.retrieve_planet_flux`. They have the image of a point source behind the Lyot
+stop, or with ``--gaussian`` pyKLIP's Gaussian of width lambda/D. It prints 5-sigma limits in the
+unit of the injected peaks, raw and after the Gaussian filter of `meas_contrast`, which both
+products get then.
 """
 
 from __future__ import annotations
@@ -38,6 +40,9 @@ SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])
 ANGLES = np.arange(20.0, 380.0, 60.0)
 MODES = [1, 2, 3, 4, 5]
 OURS = ("cleaned", "flux")
+STAMP = 41
+"""Side of the image of a planet, pixels."""
+
 STRENGTH = 8.0
 """Peaks of the injected planets over the standard deviation of the pixels of the ring."""
 
@@ -70,9 +75,20 @@ def limits(image: Image, center: Image, scale: float, fwhm: float, smooth: bool)
     return np.interp(SEPARATIONS, seps * scale, contrast)
 
 
+def point_source(passband: str, like: dr.OpticalSystem) -> Image:
+    """Image of a source far from the mask, with a peak of 1."""
+    model = dr.nircam_coronagraph(
+        passband, image_mask=None, pupil_mask="MASKRND", pixelscale=like.detector.pixelscale,
+        npix=256, nlambda=5, fov_pixels=STAMP,
+    )  # fmt: skip
+    image = np.asarray(model().numpy(), dtype=float)
+    return image / image.max()
+
+
 def main() -> None:
     """Compare the depths at several separations."""
     parser = real_frames_parser(__doc__)
+    parser.add_argument("--gaussian", action="store_true")
     options = parser.parse_args()
     sequence = dr.Sequence.from_files(options.frames, target=options.target, filter=options.filter)
     names = [
@@ -94,6 +110,7 @@ def main() -> None:
     center = np.asarray(plain["KLIP"].output_centers[0], dtype=float)
     print(f"{options.target} {options.filter}: {fit!r}")
     kept = {name: np.zeros((len(each), len(SEPARATIONS))) for name, each in images.items()}
+    stamp = None if options.gaussian else point_source(options.filter, model)
     noise = limits(images["KLIP"][0], center, scale, fwhm, False) / 5
     for angle in ANGLES:
         for k, separation in enumerate(SEPARATIONS):
@@ -103,10 +120,10 @@ def main() -> None:
                 copied = copy.deepcopy(dataset)
                 if name in OURS:
                     copied.diffrender = dr.DiffrenderSettings(image=name, injected_into=plain[name])
+                planets = [peak if stamp is None else peak * stamp] * len(copied.input)
                 fakes.inject_planet(
-                    copied.input, copied.centers, [peak] * len(copied.input), copied.wcs,
-                    *place, fwhm=fwhm,
-                )  # fmt: skip
+                    copied.input, copied.centers, planets, copied.wcs, *place, fwhm=fwhm
+                )
                 algo, modes = ("klip", MODES) if name == "KLIP" else ("diffrender", [1])
                 for m, image in enumerate(reduced(copied, algo, modes) - images[name]):
                     flux = fakes.retrieve_planet_flux(
