@@ -130,6 +130,9 @@ def test_the_model_and_the_settings_are_those_of_the_detector(tmp_path: Path) ->
         np.ones((160, 160)), np.ones((160, 160)), pixelscale=0.031, filter="F182M",
         header=fits.Header({"INSTRUME": "NIRCAM"}),
     )  # fmt: skip
+    # A model that is given needs no mask in the header.
+    frame.header.update({"CORONMSK": "NONE", "APERNAME": "NRCA2_FULL", "SUBARRAY": "FULL"})
+    assert settings_for(frame).deviations == short.deviations
     # 44 cycles reach the edge; memory and time set the bound.
     assert settings_for(wide).cycles == (32.0,)
 

@@ -405,7 +405,7 @@ def _search(
         factor = significance.factor(snr, candidates.offsets)
         margin = candidates.snr(factor) - factor.threshold(threshold, candidates.offsets)
         if not len(candidates) or margin.min() >= 0:
-            lobes = side_lobes(maps, candidates, factor, threshold, inner)
+            lobes = side_lobes(maps, snr, candidates, factor, threshold, inner)
             if not lobes.any():
                 if not candidates.converged:
                     candidates = refine_candidates(groups, candidates, reach=pixel / 2)

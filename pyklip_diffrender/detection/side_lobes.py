@@ -11,14 +11,19 @@ from torch import Tensor
 
 from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import pixel_width, separation_of
+from pyklip_diffrender.detection.field import Image, pixel_width, separation_of
 from pyklip_diffrender.detection.maps import Maps
 
 __all__ = ["side_lobes"]
 
 
 def side_lobes(
-    maps: Maps, candidates: Candidates, factor: ErrorFactor, threshold: float, inner: float
+    maps: Maps,
+    snr: Image,
+    candidates: Candidates,
+    factor: ErrorFactor,
+    threshold: float,
+    inner: float,
 ) -> Tensor:
     """Which candidates are not significant beside a source within the inner limit, (k,).
 
@@ -28,6 +33,8 @@ def side_lobes(
     Parameters
     ----------
     maps : Maps
+    snr : ndarray, (ny, nx)
+        Without the candidates, before errors are multiplied.
     candidates : Candidates
     factor : ErrorFactor
         By which the errors are multiplied.
@@ -37,12 +44,13 @@ def side_lobes(
         Smallest separation of candidates, arcsec.
     """
     none = torch.zeros(len(candidates), dtype=torch.bool)
-    within = separation_of(maps.grid) < inner
-    snr = np.where(within, maps.snr(maps.without(candidates)) / factor.of(maps.grid), -np.inf)
-    if not len(candidates) or not np.nanmax(snr) >= threshold:
+    if not len(candidates):
         return none
-    peak = np.unravel_index(np.nanargmax(snr), snr.shape)
-    contrast = float(maps.numerator[peak] / maps.information[peak])
+    scaled = np.where(separation_of(maps.grid) < inner, snr / factor.of(maps.grid), -np.inf)
+    peak = np.unravel_index(np.nanargmax(scaled), scaled.shape)
+    if scaled[peak] < threshold:
+        return none
+    contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
     both = candidates.with_one_more(maps.grid[peak], contrast)
     both = refine_candidates(maps.groups, both, pixel_width(maps.grid) / 2)
     if separation_of(both.offsets.numpy())[-1] >= inner:

@@ -362,13 +362,13 @@ def stop_is_measured(mask: str | None, short_wave: bool, module: str | None = No
     Parameters
     ----------
     mask : str or None
-        Image mask; default a round one.
+        Image mask; the stop is MASKRND but for a bar.
     short_wave : bool
     module : "A" or "B", optional
         Default A.
     """
-    is_round = mask is None or isinstance(require_mask(mask), RoundMask)
-    return is_round and not short_wave and module != "B"
+    is_bar = isinstance(MASKS.get(mask or ""), BarMask)
+    return not is_bar and not short_wave and module != "B"
 
 
 def mask_of_header(value: object) -> str:

@@ -67,7 +67,8 @@ Without companions, peaks reached 6 (drifts of 40 to 400 h); companions that sta
 """
 
 _FAINT = 5.0
-"""S/N of a companion below which the last steps of a fit do without it."""
+"""S/N of a companion below which the last steps of a fit do without it, that of a candidate. Errors
+of the wavefront had less than 1 in real frames."""
 
 _MOST_BRIGHT = 8
 """Largest number of companions that a fit may add in this way."""
@@ -244,12 +245,13 @@ class Annealing:
 
         They would double the time of every step. The search finds a faint source without them.
         """
-        if course.error > max(_NEAR, self.settings.min_model_error):
+        is_close = course.error <= max(_NEAR, self.settings.min_model_error)
+        if not (course.may_drop and is_close):
             return False
         snr = self.solver.companion_snr(course.state)
         faint = snr < _FAINT
         faint[: len(self._begin.unknowns.frames[0].companions)] = False
-        if not (course.may_drop and bool(faint.any())):
+        if not bool(faint.any()):
             return False
         _log.info("companions of S/N %s are dropped", snr[faint].tolist())
         fewer = course.state.unknowns.without_companions(faint, course.state.vector)

@@ -6,7 +6,9 @@ No card has a default here: a value that is not stated is None, and whoever need
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from astropy import units as u
 from astropy.io import fits
@@ -196,11 +198,18 @@ def image_mask(header: fits.Header, name: str) -> str | None:
         elif key == "CORONMSK" and text:
             # Of other instruments, or none.
             stated[key] = text
+    return _agreed(stated, header, "masks", name)
+
+
+def _agreed(
+    stated: Mapping[str, str], texts: Mapping[str, Any], aspect: str, name: str
+) -> str | None:
+    """The value that all cards state, or None; raise an exception if they differ."""
     if len(set(stated.values())) > 1:
-        listed = ", ".join(f"{key} {header[key]}" for key in stated)
+        listed = ", ".join(f"{key} {texts[key]}" for key in stated)
         raise CorruptFileError(
-            f"{name}: {listed}: the cards name different masks. Correct the header, or fetch the "
-            "file again"
+            f"{name}: {listed}: the cards name different {aspect}. Correct the header, or fetch "
+            "the file again"
         )
     return next(iter(stated.values()), None)
 
@@ -232,15 +241,9 @@ def module_of(header: fits.Header, name: str) -> str | None:
     """
     texts = {key: header_text(header, key, name) for key in ("MODULE", "CORONMSK", "SUBARRAY")}
     texts = {"DETECTOR": detector_of(header, name), **texts}
-    stated = {key: _MODULE.match((text or "").upper()) for key, text in texts.items()}
-    modules = {match[1] for match in stated.values() if match}
-    if len(modules) > 1:
-        listed = ", ".join(f"{key} {texts[key]}" for key, match in stated.items() if match)
-        raise CorruptFileError(
-            f"{name}: {listed}: the cards name different modules. Correct the header, or fetch the "
-            "file again"
-        )
-    return next(iter(modules), None)
+    matches = {key: _MODULE.match((text or "").upper()) for key, text in texts.items()}
+    stated = {key: match[1] for key, match in matches.items() if match}
+    return _agreed(stated, texts, "modules", name)
 
 
 def bar_place(header: fits.Header, name: str) -> str | None:
