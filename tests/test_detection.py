@@ -404,6 +404,16 @@ def test_a_planet_is_found_where_it_is(one: Detection) -> None:
     assert row["snr"] > 8
 
 
+def test_a_candidate_has_the_signal_to_noise_of_the_map_where_it_is(world: World) -> None:
+    """Near the mask, the uncertain position adds to the error of the contrast, but not here."""
+    near = dr.Planet(6e-5, 0.3, 60.0)
+    found = world.detected(5, near)
+    assert len(found.sources) == 1
+    snr = found.candidates["snr"][0]
+    assert snr == pytest.approx(found.measure(found.sources.offsets)["snr"][0], rel=1e-3)
+    assert found.candidates["contrast"][0] / own_error(found) < 0.95 * snr
+
+
 def test_no_candidate_is_nearer_than_the_smallest_separation(world: World) -> None:
     """The same S/N, by which the planet was found, counts for nothing inside it."""
     found = world.detected(5, FAINT)
@@ -453,14 +463,19 @@ def test_the_error_of_a_contrast_knows_that_of_the_stars_flux(world: World) -> N
     assert scaled["contrast_error"] == pytest.approx(2 * row["contrast_error"], rel=1e-8)
 
 
+def own_error(found: Detection) -> float:
+    """The error of the first candidate's contrast without that of the calibration."""
+    factor = found.error_factor.of(found.sources.offsets)
+    return float(factor[0] * found.sources.errors[0, 0])
+
+
 @pytest.mark.slow
 def test_the_error_of_a_bright_contrast_knows_that_of_the_sources_image(large: World) -> None:
     """As far as wavefronts that are as probable as the one that was found change its light."""
     found = large.detected(7, replace(WHERE, contrast=8e-5))
     (linear, templates), fit = found.groups[0], found.fits[0]
     row = found.candidates[0]
-    own = row["contrast"] / row["snr"]
-    stated = math.sqrt((row["contrast_error"] ** 2 - own**2).item()) / row["contrast"]
+    stated = math.sqrt(row["contrast_error"] ** 2 - own_error(found) ** 2) / row["contrast"]
     deviation = linear.covariance.diagonal().sqrt()
     factor = torch.linalg.cholesky(linear.covariance / deviation[:, None] / deviation)
     generator = torch.Generator().manual_seed(2)
@@ -486,10 +501,10 @@ def test_a_wavefront_that_is_known_adds_nothing_to_a_bright_contrasts_error(worl
     found = dr.detect(known.fitted(14, replace(WHERE, contrast=9e-5), wavefront=False))
     fit, row = found.fits[0], found.candidates[0]
     relative = found.scatter * fit.frames[0].errors["flux"][0] / fit.frames[0].values["flux"][0]
-    expected = row["contrast"] * math.hypot(relative, 1 / row["snr"])
+    expected = math.hypot(relative * row["contrast"], own_error(found))
     assert row["snr"] > 400
     assert row["contrast_error"] == pytest.approx(expected, rel=1e-4)
-    assert row["contrast_error"] > 1.001 * row["contrast"] / row["snr"]
+    assert row["contrast_error"] > 1.001 * own_error(found)
     assert abs(row["contrast"] - 9e-5) < 4 * expected
 
 
@@ -498,7 +513,7 @@ def test_errors_of_a_companion_in_the_derivatives_count_star_and_image_once(larg
     found = large.detected(7, replace(WHERE, contrast=1e-3))
     (row,) = found.candidates
     assert len(found.fits[0].bright_companions) == 1
-    assert row["contrast_error"] == pytest.approx(row["contrast"] / row["snr"])
+    assert row["contrast_error"] == pytest.approx(own_error(found))
     # They are in the error of the linear model, which is larger than for a source whose image and
     # star are known.
     distance = np.hypot(*np.moveaxis(found.grid - WHERE.offset, -1, 0))

@@ -9,11 +9,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+import torch
 from astropy import units as u
 from astropy.table import QTable
 
 import pyklip_diffrender as dr
-from pyklip_diffrender.detection import measured_planet, recover_planets, with_planets
+from pyklip_diffrender.detection import (
+    Candidates,
+    measured_planet,
+    recover_planets,
+    with_planets,
+)
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.detection.recovery import TOGETHER, _free_place
 from pyklip_diffrender.errors import IncompatibleSetupError
 
@@ -59,12 +66,24 @@ def searched(science: tuple[dr.Observation, ...] | None = None, **changes: Any) 
         return table(np.zeros((len(places), 2)), values)
 
     curve = QTable({"separation": [0.2, 1.0] * u.arcsec, "small_sample": [2 * LIMIT, LIMIT]})
+    changes.setdefault("candidates", table(np.zeros((0, 2)), []))
     values = {
         "fits": [SimpleNamespace(frames=[Frame(1.0), Frame(2.0)])],
         "grid": grid, "snr": snr, "north": NORTH, "contrast_curve": curve, "measure": measure,
-        "candidates": table(np.zeros((0, 2)), []),
+        "sources": sources(changes["candidates"]), "error_factor": ErrorFactor.constant(1.0),
     }  # fmt: skip
     return SimpleNamespace(**{**values, **changes})
+
+
+def sources(candidates: QTable) -> Candidates:
+    """Errors of contrasts are 1.5 times those for a known position."""
+    places = np.stack([candidates["x"].value, candidates["y"].value], axis=-1)
+    errors = torch.full((len(candidates),), 0.1 * LIMIT, dtype=torch.float64)
+    return replace(
+        Candidates.at(places, candidates["contrast"]),
+        covariance=torch.diag((1.5 * errors).repeat(3) ** 2),
+        detection_errors=errors,
+    )
 
 
 def table(places: Any, contrasts: Any) -> QTable:
@@ -122,10 +141,10 @@ def test_sets_have_at_most_seven_planets_in_a_wide_field() -> None:
 
 
 @pytest.mark.parametrize(
-    ("away", "expected"), [((0.05, 0.0), (7e-4, True)), ((0.5, 0.5), (1e-4, False))]
+    ("away", "expected"), [((0.05, 0.0), (7e-4, 1.5, True)), ((0.5, 0.5), (1e-4, 1.0, False))]
 )
 def test_a_planet_is_its_candidate_or_what_is_measured_at_its_place(
-    away: tuple[float, float], expected: tuple[float, bool]
+    away: tuple[float, float], expected: tuple[float, float, bool]
 ) -> None:
     place = (0.3, -0.6)
     data = np.zeros((SIZE, SIZE))
@@ -135,9 +154,11 @@ def test_a_planet_is_its_candidate_or_what_is_measured_at_its_place(
     )
     candidates = table(np.array([[1.0, 1.0], np.add(place, away)]), [1e-3, 7e-4])
     measured = measured_planet(searched(frames, candidates=candidates), place)
-    assert (measured.contrast, measured.detected) == (pytest.approx(expected[0]), expected[1])
+    contrast, error, detected = expected
+    assert (measured.contrast, measured.detected) == (pytest.approx(contrast), detected)
     # Noise alone, without what the table's error has of the star's flux.
-    assert measured.contrast_error == pytest.approx(measured.contrast / measured.snr)
+    assert measured.contrast_error == pytest.approx(error * 0.1 * LIMIT)
+    assert measured.snr == pytest.approx(10 * contrast / LIMIT)
 
 
 def covered(keep: Callable[[Any, Any], Any]) -> Any:

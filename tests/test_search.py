@@ -55,7 +55,7 @@ def test_a_dismissed_peak_is_not_taken_again(monkeypatch: pytest.MonkeyPatch) ->
         # The fit moves a source by half a pixel.
         places = [maps.grid[pixel] + 0.03 for pixel in nearest]
         made = Candidates.at(np.reshape(places, (-1, 2)), [FITTED[pixel] for pixel in nearest])
-        return replace(made, covariance=torch.eye(3 * len(places), dtype=torch.float64))
+        return replace(made, detection_errors=torch.ones(len(places), dtype=torch.float64))
 
     monkeypatch.setattr(search, "refine_candidates", refine)
     observation = SimpleNamespace(is_nircam=False)

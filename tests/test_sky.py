@@ -68,7 +68,7 @@ def candidates(offsets: list[list[float]], contrasts: list[float]) -> Candidates
         covariance[1:, k, 1:, k] = COVARIANCE
     start = Candidates.at(offsets, contrasts)
     flat = torch.from_numpy(covariance.reshape(3 * count, 3 * count))
-    return Candidates(start.offsets, start.contrasts, flat)
+    return Candidates(start.offsets, start.contrasts, flat, 0.08 * start.contrasts)
 
 
 def table(sky: Sky = SKY) -> QTable:

@@ -30,7 +30,7 @@ def candidate_errors(
 ) -> NDArray[np.float64]:
     """Relative calibration errors of candidates, (2, k), see `calibration_errors`."""
     factors = torch.from_numpy(factor.of(candidates.offsets))
-    snr = candidates.contrasts / (factors * candidates.errors[:, 0])
+    snr = torch.from_numpy(candidates.snr(factor))
     return calibration_errors(groups, candidates.offsets, snr, factors).numpy()
 
 

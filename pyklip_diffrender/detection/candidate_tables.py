@@ -19,7 +19,7 @@ __all__ = ["candidate_table", "in_words", "magnitudes", "measured_table"]
 Column = tuple[str, Any, Any, str, str]
 """Name, values, unit, format and description."""
 
-_SNR = "contrast over its error without calibration errors"
+_SNR = "contrast over its error for a known position, without calibration errors"
 
 _AB_ZERO = float(u.AB.to(u.Jy))
 """Flux density of AB magnitude 0, Jy."""
@@ -56,7 +56,7 @@ def candidate_table(
     columns: list[Column] = [
         *_place(positions, sky),
         *_photometry(contrast, contrast_error, np.hypot(error, contrast * calibration[1]), sky),
-        ("snr", contrast / error, None, ".1f", _SNR),
+        ("snr", candidates.snr(factor), None, ".1f", _SNR),
         ("separation_error", separation_error, u.arcsec, ".4f", "standard deviation"),
         ("position_angle_error", angle_error, u.deg, ".2f", "standard deviation"),
         ("seppa_corr", polar, None, ".3f", "correlation of separation and position angle"),

@@ -39,17 +39,26 @@ class Candidates:
     contrasts : Tensor, (k,)
     covariance : Tensor, (3 k, 3 k)
         Of all contrasts, then all x, then all y, with the star marginalised; 0 where not known.
+    detection_errors : Tensor, (k,)
+        Standard deviations of the contrasts for known positions, as in a map of S/N; 0 where not
+        known. Those in `covariance` include what the uncertain positions add.
     converged : bool
     """
 
     offsets: Tensor
     contrasts: Tensor
     covariance: Tensor
+    detection_errors: Tensor
     converged: bool = True
 
     def snr(self, factor: ErrorFactor) -> Image:
-        """S/N of the candidates, (k,), with their errors multiplied by the factor."""
-        errors = self.errors[:, 0].numpy() * factor.of(self.offsets)
+        """S/N of the candidates, (k,), with their errors multiplied by the factor.
+
+        Its square is the difference in chi-squared that a candidate makes. It is what a map of S/N
+        shows at the fitted position, so that thresholds and false-alarm probabilities of the map's
+        maximum apply.
+        """
+        errors = self.detection_errors.numpy() * factor.of(self.offsets)
         return np.asarray(self.contrasts.numpy() / errors)
 
     def __len__(self) -> int:
@@ -64,6 +73,7 @@ class Candidates:
             places,
             torch.from_numpy(np.asarray(contrasts, dtype=float)),
             torch.zeros(count, count, dtype=torch.float64),
+            torch.zeros(len(places), dtype=torch.float64),
         )
 
     @classmethod
@@ -126,6 +136,7 @@ def refine_candidates(
     offsets, contrasts = candidates.offsets.clone(), candidates.contrasts.clone()
     identity = torch.eye(3 * count, dtype=torch.float64)
     covariance, converged = identity, False
+    detection_errors = torch.ones(count, dtype=torch.float64)
     for _ in range(iterations):
         # The model is linear in contrasts. The column of a position is slope times contrast.
         matrix = torch.zeros(3 * count, 3 * count, dtype=torch.float64)
@@ -143,6 +154,8 @@ def refine_candidates(
         ridge = 1e-9 * identity
         system = matrix / scale[:, None] / scale + ridge
         covariance = torch.linalg.inv(system) / scale[:, None] / scale
+        of_contrasts = torch.linalg.inv(system[:count, :count])
+        detection_errors = of_contrasts.diagonal().clamp(min=0).sqrt() / scale[:count]
         step = covariance @ vector
         contrasts = contrasts + step[:count]
         is_settled = (step.abs() < _SETTLED * covariance.diagonal().sqrt()).reshape(3, count)
@@ -155,4 +168,4 @@ def refine_candidates(
         offsets = offsets + torch.where(is_settled[1:].all(dim=0)[:, None], 0.0, moves)
     if not converged:
         _log.info("positions did not settle, number of candidates: %d", count)
-    return Candidates(offsets, contrasts, covariance, converged)
+    return Candidates(offsets, contrasts, covariance, detection_errors, converged)

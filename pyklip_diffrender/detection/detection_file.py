@@ -177,7 +177,12 @@ def _computed_of(hdus: fits.HDUList, facts: dict[str, Any]) -> dict[str, Any]:
 def _candidates_of(facts: dict[str, Any]) -> Candidates:
     """Make candidates from their attributes."""
     count = len(facts["contrasts"])
-    shapes = {"offsets": (count, 2), "contrasts": (count,), "covariance": (3 * count, 3 * count)}
+    shapes = {
+        "offsets": (count, 2),
+        "contrasts": (count,),
+        "covariance": (3 * count, 3 * count),
+        "detection_errors": (count,),
+    }
     arrays = {
         name: torch.from_numpy(np.array(facts[name], dtype=np.float64).reshape(shape))
         for name, shape in shapes.items()

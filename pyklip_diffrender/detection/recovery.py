@@ -179,13 +179,18 @@ def measured_planet(detection: Detection, place: tuple[float, float]) -> Measure
     -------
     MeasuredPlanet
     """
-    table = detection.candidates
-    distances = np.hypot(table["x"].value - place[0], table["y"].value - place[1])
-    detected = len(table) > 0 and bool(distances.min() < _SAME)
-    row = table[int(distances.argmin())] if detected else detection.measure([place])[0]
+    sources, factor = detection.sources, detection.error_factor
+    distances = np.hypot(*(sources.offsets.numpy() - place).T)
+    if len(sources) and distances.min() < _SAME:
+        k = int(distances.argmin())
+        error = float(factor.of(sources.offsets)[k] * sources.errors[k, 0])
+        return MeasuredPlanet(
+            float(sources.contrasts[k]), error, float(sources.snr(factor)[k]), True
+        )
+    row = detection.measure([place])[0]
     contrast, snr = float(row["contrast"]), float(row["snr"])
     error = contrast / snr if snr else float(row["contrast_error"])
-    return MeasuredPlanet(contrast, error, snr, detected)
+    return MeasuredPlanet(contrast, error, snr, False)
 
 
 def _free_place(detection: Detection, separation: float, angle: float) -> NDArray[np.float64]:

@@ -313,6 +313,8 @@ def _candidates(sources: Sequence[_Measurement]) -> Candidates:
     return replace(
         Candidates.at(places, contrasts),
         covariance=torch.diag(torch.from_numpy(variance.T.flatten())),
+        # Flux and position of a symmetric image hardly depend on each other.
+        detection_errors=torch.from_numpy(np.sqrt(variance[:, 0])),
     )
 
 

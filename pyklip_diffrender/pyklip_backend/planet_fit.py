@@ -80,7 +80,7 @@ def planet_cards(
         error_factor = default_factor([part.result], groups, sources)
     factor = float(error_factor.of(sources.offsets[-1:])[0])
     error = factor * np.sqrt(covariance[0, 0])
-    snr = sources.contrasts[-1:] / error
+    snr = sources.contrasts.new_tensor(sources.snr(error_factor)[-1:])
     factors = snr.new_full(snr.shape, factor)
     calibration = float(calibration_errors(groups, sources.offsets[-1:], snr, factors)[1, 0])
     detector = part.frame.model.detector
