@@ -157,7 +157,8 @@ def fit_gradient(device: Any, **changes: object) -> list[Array]:
     unknowns = solver.first_unknowns()
     (point,) = solver.objective.at(unknowns, unknowns.initial()).points
     pixels = solver.objective.residual(0, point)
-    return [each.numpy() for each in solver.objective.forwards[0].slopes(point, pixels).values()]
+    slopes = solver.objective.forwards[0].slopes(point, pixels, torch.zeros(0, 3))
+    return [each.numpy() for each in slopes.values()]
 
 
 def response(device: Any, **changes: object) -> list[Array]:

@@ -204,6 +204,39 @@ def test_the_curvature_is_that_of_the_model_whatever_the_copy(frames: int) -> No
     assert (products[0] - expected).norm() > 0.1 * expected.norm()
 
 
+def test_the_light_of_a_faint_companion_is_linear_in_the_curvature() -> None:
+    """As in the Jacobian: it depends on contrast, position and flux, and not on the wavefront."""
+    solver, state = solver_of(2)
+    solver = of_the_model_itself(solver)
+    companions = [dr.Planet(9e-5, 0.5, 20.0), dr.Planet(0.03, 0.4, 200.0)]
+    state = solver.objective.at(*state.unknowns.with_companions(companions, state.vector))
+    weights = solver.objective.errors(state, 0.01, 4.0)
+    equations = linearise(solver.objective, state, 0.01, len(BASIS), 4.0)
+    derivatives = ModelDerivatives(solver.objective, state, weights)
+    unit = units(solver, state)
+    where = state.unknowns.where("companions")
+    # By one unknown at a time, because those of the faint companion change little of the whole.
+    for place in (*range(where.start, where.stop), 0, state.unknowns.size - 1):
+        step = torch.zeros_like(unit)
+        step[place] = 0.01 * unit[place]
+        product, expected = unit * derivatives.product(step), unit * (equations.curvature @ step)
+        assert (product - expected).norm() < 2e-3 * expected.norm()
+
+
+def test_a_companion_that_the_model_error_outweighs_counts_in_the_last_derivatives_only() -> None:
+    solver, state = solver_of(1, relinearise=0.1, accurate_steps=True)
+    companion = dr.Planet(0.01, 0.5, 20.0)
+    state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
+    modes, kappas = state.unknowns.where("modes"), (0.1, 0.0)
+    early, late, same = (
+        solver.linear_model(state, kappa, len(BASIS), math.inf, final=False).frames[0].jacobian
+        for kappa in (*kappas, 0.001)
+    )
+    assert (early[modes] - late[modes]).norm() > 0.01 * late[modes].norm()
+    assert same is late
+    assert solver.linear_model(state, 0.1, len(BASIS), math.inf).frames[0].jacobian is late
+
+
 @pytest.mark.slow
 def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
     """In as many iterations as are needed, whatever the coarse copy that preconditions them."""

@@ -256,7 +256,7 @@ def test_candidates_in_line_suggest_a_disk() -> None:
     whole = reduction()
     places = np.array([[0.5, 0.0], [-0.5, 0.02], [0.3, 0.01]])
     three = Candidates.at(places, np.full(3, 1e-5))
-    three = replace(three, covariance=1e-12 * torch.eye(9, dtype=torch.float64))
+    three = replace(three, detection_errors=torch.full((3,), 1e-6, dtype=torch.float64))
     crowded = replace(
         whole, detection=replace(whole.detection, sources=three, false_alarm=np.zeros(3))
     )

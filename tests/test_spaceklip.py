@@ -117,6 +117,7 @@ def fake_detection(offset: tuple[float, float], north: float) -> Any:
     candidates = replace(
         Candidates.at([offset, (0.5, 0.6)], [1e-5, 2e-5]),
         covariance=torch.diag(torch.tensor([1e-6, 1e-6, 1e-2, 2e-2, 3e-2, 4e-2])**2).double(),
+        detection_errors=torch.full((2,), 1e-6, dtype=torch.float64),
     )  # fmt: skip
     curve = Table({"separation": [0.3, 0.5], "small_sample": [1e-4, 1e-5], "contrast": [0.0, 0.0]})
     curve["separation"].unit = "arcsec"

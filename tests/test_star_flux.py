@@ -45,7 +45,7 @@ def test_contrasts_of_real_frames_have_the_error_of_the_stars_flux(fit: Refineme
     # An injected planet is as bright as it is in units of the same star.
     injected = measured_planet(detection, PLANET.offset)
     assert injected.detected
-    assert injected.contrast_error / injected.contrast == pytest.approx(1 / injected.snr)
+    assert 1 < injected.contrast_error * injected.snr / injected.contrast < 1.5
 
 
 def test_simulated_frames_have_no_such_error(fit: Refinement) -> None:

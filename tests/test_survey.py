@@ -20,7 +20,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from astropy import units as u
+import torch
 from astropy.io import fits
 from astropy.table import QTable, Table
 from survey_stubs import HOSTILE, configuration, inputs, result, stub
@@ -28,7 +28,8 @@ from survey_stubs import HOSTILE, configuration, inputs, result, stub
 import pyklip_diffrender as dr
 from benchmarks.calints_files import CENTER, SIDE, calints
 from pyklip_diffrender.cli import main
-from pyklip_diffrender.detection import with_planets
+from pyklip_diffrender.detection import Candidates, with_planets
+from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.errors import (
     CorruptFileError,
     IncompatibleSetupError,
@@ -793,26 +794,33 @@ def test_a_planet_is_injected_into_the_frames_with_their_disk() -> None:
 def test_what_is_recovered_is_the_candidate_at_the_place() -> None:
     planet = Injection(1e-4, 0.6, 100.0)
     x, y = dr.Planet(1e-4, 0.6, 100.0 - 20.0).offset
-    measured = {"contrast": 9e-5, "contrast_error": 1e-5, "snr": 9.0}
 
-    class Found:
-        north = 20.0
-        candidates = QTable({"x": [0.5, x + 0.03] * u.arcsec, "y": [0.5, y] * u.arcsec,
-                        **{key: [7.0, value] for key, value in measured.items()}})  # fmt: skip
+    def searched(*rows: tuple[float, float, float]) -> Any:
+        """Candidates of x, y and contrast, with an error of 1e-5."""
+        table = np.reshape(rows, (-1, 3))
+        errors = torch.full((len(table),), 1e-5, dtype=torch.float64)
+        sources = replace(
+            Candidates.at(table[:, :2], table[:, 2]),
+            covariance=torch.diag(errors.repeat(3) ** 2),
+            detection_errors=errors,
+        )
 
-        def measure(self, offsets: list[Any]) -> QTable:
+        def measure(offsets: list[Any]) -> QTable:
             np.testing.assert_allclose(offsets, [[x, y]])
-            return QTable({key: [value / 2] for key, value in measured.items()})
+            return QTable({"contrast": [4.5e-5], "contrast_error": [2e-5], "snr": [4.5]})
 
-    class Whole:
-        detection = Found()
+        detection = SimpleNamespace(
+            north=20.0, sources=sources, error_factor=ErrorFactor.constant(1.0), measure=measure
+        )
+        return SimpleNamespace(detection=detection)
 
-    assert work._recovered(Whole(), planet) == {**measured, "detected": True}
-    Found.candidates = Found.candidates[:1]
-    assert work._recovered(Whole(), planet)["snr"] == 4.5
-    assert work._recovered(Whole(), planet)["detected"] is False
-    Found.candidates = Found.candidates[:0]
-    assert work._recovered(Whole(), planet)["detected"] is False
+    other = (0.5, 0.5, 7e-5)
+    recovered = work._recovered(searched(other, (x + 0.03, y, 9e-5)), planet)
+    expected = {"contrast": 9e-5, "contrast_error": 1e-5, "snr": 9.0, "detected": True}
+    assert recovered == pytest.approx(expected)
+    for rows in ((other,), ()):
+        recovered = work._recovered(searched(*rows), planet)
+        assert (recovered["snr"], recovered["detected"]) == (4.5, False)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ of an earlier step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -32,6 +32,10 @@ than the rounding errors of single precision."""
 class ModelDerivatives:
     """Gradient and curvature of chi-squared, by derivatives of the model itself.
 
+    The gradient is that of all light. In the curvature, which determines the path to the minimum
+    and not its place, the light of faint companions is linear: it depends on their contrasts and
+    positions and on the star's flux, and not on the wavefront.
+
     Parameters
     ----------
     objective : Objective
@@ -46,23 +50,50 @@ class ModelDerivatives:
             forward.levels(point, point.unknowns.visible_sources(point.vector)).double()
             for forward, point in zip(objective.forwards, state.points, strict=True)
         ]
+        self._bright = [point.unknowns.are_bright(point.vector) for point in state.points]
+        self._without_faint = [
+            point if bool(bright.all()) else forward.at(point.unknowns, point.vector, bright)
+            for forward, point, bright in zip(
+                objective.forwards, state.points, self._bright, strict=True
+            )
+        ]
 
     def gradient(self) -> Tensor:
         """Minus half the derivative of chi-squared, (unknowns,)."""
-        return self._pull(dict(enumerate(self._objective.residuals(self._state))))
+        sources = [point.unknowns.visible_sources(point.vector) for point in self._state.points]
+        return self._pull(dict(enumerate(self._objective.residuals(self._state))), sources)
 
     def product(self, step: Tensor) -> Tensor:
         """Product of the curvature with a step, (unknowns,)."""
-        state = self._state
-        ahead = self._objective.at(state.unknowns, state.vector + _DIFFERENCE * step)
-        images = {
-            k: (after.total - before.total) / _DIFFERENCE
-            for k, (after, before) in enumerate(zip(ahead.points, state.points, strict=True))
-        }
-        return self._pull(images)
+        vector, images, sources = self._state.vector + _DIFFERENCE * step, {}, []
+        for k, before in enumerate(self._without_faint):
+            rows, bright = self._state.unknowns.rows[k], self._bright[k]
+            after = self._objective.forwards[k].at(
+                before.unknowns, rows.of_unknowns(vector), bright
+            )
+            images[k] = (after.total - before.total) / _DIFFERENCE
+            if not bool(bright.all()):
+                images[k] = images[k] + self._change_of_faint(k, rows.of_unknowns(step))
+            sources.append(before.unknowns.visible_sources(before.vector)[bright])
+        return self._pull(images, sources)
 
-    def _pull(self, images: Mapping[int, Tensor]) -> Tensor:
-        """Product of the whitened Jacobian with images of all frames, which it whitens as well."""
+    def _change_of_faint(self, k: int, step: Tensor) -> Tensor:
+        """Change of the light of faint companions in a frame by a step of its unknowns."""
+        point = self._state.points[k]
+        unknowns, faint = point.unknowns, ~self._bright[k]
+        of_companions = step[unknowns.where("companions")]
+        rows = self._levels[k][-len(of_companions) :].unflatten(0, (-1, 3))[faint].flatten(0, 1)
+        change = torch.tensordot(of_companions.reshape(-1, 3)[faint].flatten(), rows, dims=1)
+        light = point.total - self._without_faint[k].total
+        change_of_flux = unknowns.level("flux", step) if "flux" in unknowns.linear else 0.0
+        relative = change_of_flux / unknowns.level("flux", point.vector)
+        return relative * light + change.to(light.device)
+
+    def _pull(self, images: Mapping[int, Tensor], sources: Sequence[Tensor]) -> Tensor:
+        """Product of the whitened Jacobian with images of all frames, which it whitens as well.
+
+        The Jacobian by optics and wavefront is that of the star and of `sources`, (k, 3) by frame.
+        """
         objective, unknowns = self._objective, self._state.unknowns
         total = torch.zeros(unknowns.size, dtype=torch.float64)
         whitened = self._noise.inverse(images)
@@ -74,7 +105,7 @@ class ModelDerivatives:
             of_frame = torch.zeros(len(point.vector), dtype=torch.float64)
             last = where["companions"].stop
             of_frame[last - len(levels) : last] = levels.flatten(1) @ pixels.cpu().flatten()
-            for name, slopes in forward.slopes(point, pixels).items():
+            for name, slopes in forward.slopes(point, pixels, sources[k]).items():
                 of_frame[where[name]] = slopes
             total += unknowns.rows[k].onto_unknowns(of_frame, unknowns.size)
         return total

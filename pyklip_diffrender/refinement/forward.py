@@ -96,8 +96,16 @@ class Forward:
         """The wavefront on the coarse copy's grid."""
         return downsample(point.opd, self.coarse.npix)
 
-    def at(self, unknowns: FrameUnknowns, vector: Tensor) -> Point:
-        """Render a point."""
+    def at(self, unknowns: FrameUnknowns, vector: Tensor, rendered: Tensor | None = None) -> Point:
+        """Render a point.
+
+        Parameters
+        ----------
+        unknowns : FrameUnknowns
+        vector : Tensor
+        rendered : Tensor of bool, (companions,), optional
+            Which of the companions are part of `total`; default those that the frame shows.
+        """
         values, opd = unknowns.values(vector), self.opd(unknowns, vector)
         flux = unknowns.level("flux", vector)
         with torch.no_grad():
@@ -106,8 +114,9 @@ class Forward:
         gain = self.problem.gain
         light = flux * gain * image + unknowns.level("pedestal", vector) * (gain - 1)
         star = light + unknowns.level("background", vector)
+        sources = unknowns.visible_sources(vector)
         total = star
-        for source in unknowns.visible_sources(vector):
+        for source in sources if rendered is None else sources[rendered]:
             total = total + flux * self._companion(unknowns, values, source, opd)
         return Point(unknowns, vector, opd, fields, image, light, star, total)
 
@@ -138,13 +147,14 @@ class Forward:
         star = values.get("star_offset", torch.zeros(2, dtype=torch.float64))
         return {**values, "star_offset": star + offset.to(star.device)}
 
-    def jacobian(self, point: Point, modes: int) -> Tensor:
+    def jacobian(self, point: Point, modes: int, kappa: float = 0.0) -> Tensor:
         """Derivative of `total`, (unknowns, ny, nx), float32, on the CPU.
 
         Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront. The
-        light of faint companions counts as independent of optics and wavefront.
+        light of companions that are faint, or that an error `kappa` of the star model outweighs,
+        counts as independent of optics and wavefront.
         """
-        unknowns, bright = point.unknowns, point.unknowns.bright_sources(point.vector)
+        unknowns, bright = point.unknowns, point.unknowns.bright_sources(point.vector, kappa)
         levels = self.levels(point, bright)
         count = unknowns.where("companions").stop
         if modes:
@@ -223,8 +233,8 @@ class Forward:
             rows += list((flux * source[0] * turned).float())
         return torch.stack(rows) if rows else torch.zeros(0, *point.image.shape)
 
-    def slopes(self, point: Point, pixels: Tensor) -> dict[str, Tensor]:
-        """Derivatives of ``(pixels * total).sum()`` through the model itself.
+    def slopes(self, point: Point, pixels: Tensor, companions: Tensor) -> dict[str, Tensor]:
+        """Derivatives of ``(pixels * image).sum()`` through the model itself.
 
         They take as long as two or three images, by reverse mode at one wavelength after the other.
         `jacobian` has those of a coarse copy at fewer wavelengths, with an error that exceeds a
@@ -235,6 +245,8 @@ class Forward:
         ----------
         point : Point
         pixels : Tensor, (ny, nx)
+        companions : Tensor, (k, 3)
+            Those that the image shows besides the star.
 
         Returns
         -------
@@ -244,7 +256,7 @@ class Forward:
         """
         unknowns = point.unknowns
         names = unknowns.optical
-        lights = self._lights(point, unknowns.visible_sources(point.vector))
+        lights = self._lights(point, companions)
         totals = [
             torch.stack(parts).sum(dim=0)
             for parts in zip(

@@ -35,6 +35,8 @@ class NormalEquations:
     current : Tensor, (unknowns,)
         Unknowns of the state minus their starting values.
     frames : tuple of LinearFrame
+    bright_companions : int
+        Number of companions, over all frames, that count in the Jacobians.
     """
 
     state: State
@@ -44,6 +46,7 @@ class NormalEquations:
     gradient: Tensor
     current: Tensor
     frames: tuple[LinearFrame, ...]
+    bright_companions: int
 
 
 def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -74,6 +77,7 @@ def linearise(
     modes: int,
     robust: float,
     jacobians: Sequence[Tensor] = (),
+    outweighing: float = 0.0,
 ) -> NormalEquations:
     """Linearise all frames about a state.
 
@@ -90,6 +94,9 @@ def linearise(
         Residual, in standard deviations, of half weight; inf for least squares.
     jacobians : sequence of Tensor, optional
         Jacobians of all frames at this state, if they are known.
+    outweighing : float
+        Error of the star model, as a fraction of the star, that decides which companions count in
+        the Jacobians, see `brightest`.
     """
     size = state.unknowns.with_modes(modes)
     current = (state.vector - state.unknowns.initial())[:size]
@@ -103,7 +110,7 @@ def linearise(
         residual, weight, common = (
             each.cpu() for each in (residuals[k], noise.weight[k], noise.common[k])
         )
-        rendered = jacobians[k] if jacobians else forward.jacobian(point, modes)
+        rendered = jacobians[k] if jacobians else forward.jacobian(point, modes, outweighing)
         part = state.unknowns.rows[k]
         rows, drift = part.rows[: len(rendered)], part.drift if modes else part.drift[:0]
         first = part.first_mode
@@ -124,4 +131,7 @@ def linearise(
         ones = torch.ones(rows.shape[1], dtype=torch.float64)
         curvature -= _accumulate(rows, ones, ones)[0]
     gradient = gradient + curvature @ current
-    return NormalEquations(state, kappa, robust, curvature, gradient, current, tuple(frames))
+    return NormalEquations(
+        state, kappa, robust, curvature, gradient, current, tuple(frames),
+        state.bright_companions(outweighing),
+    )  # fmt: skip

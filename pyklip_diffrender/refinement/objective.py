@@ -42,6 +42,10 @@ class State:
         """Flux of the star in the first frame."""
         return self.points[0].unknowns.level("flux", self.points[0].vector)
 
+    def bright_companions(self, kappa: float = 0.0) -> int:
+        """Number of companions, over all frames, that count in Jacobians; see `brightest`."""
+        return sum(len(p.unknowns.bright_sources(p.vector, kappa)) for p in self.points)
+
     @property
     def has_star(self) -> bool:
         """Whether all frames have starlight; without it, no derivative leads back to a star."""

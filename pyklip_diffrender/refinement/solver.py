@@ -238,9 +238,18 @@ class Solver:
         )
 
     def _linearise(
-        self, state: State, kappa: float, modes: int, robust: float, allowed: float
+        self,
+        state: State,
+        kappa: float,
+        modes: int,
+        robust: float,
+        allowed: float,
+        *,
+        final: bool = False,
     ) -> NormalEquations:
         """Linearise about a state, with derivatives whose error is at most `allowed`."""
+        outweighing = 0.0 if final else kappa
+        bright = state.bright_companions(outweighing)
         jacobians: list[Tensor] = []
         equations = self._equations
         if (
@@ -248,15 +257,16 @@ class Solver:
             and equations.state is state
             and self._responses.farthest <= allowed
             and len(equations.current) == state.unknowns.with_modes(modes)
+            and equations.bright_companions == bright
         ):
             jacobians = [frame.jacobian for frame in equations.frames]
         else:
             self._responses.relinearise, self._responses.farthest = allowed, 0.0
-            self._responses.keep = sum(
-                1 + len(point.unknowns.bright_sources(point.vector)) for point in state.points
-            )
+            self._responses.keep = len(state.points) + bright
         equations = self._equations = None  # The next ones are as large.
-        self._equations = linearise(self.objective, state, kappa, modes, robust, jacobians)
+        self._equations = linearise(
+            self.objective, state, kappa, modes, robust, jacobians, outweighing
+        )
         self._has_poor_equations = False
         return self._equations
 
@@ -303,9 +313,10 @@ class Solver:
             or equations.state is not state
             or (equations.kappa, equations.robust) != (kappa, robust)
             or len(equations.current) != count
+            or (final and equations.bright_companions != state.bright_companions())
         ):
             del equations
-            equations = self._linearise(state, kappa, modes, robust, allowed)
+            equations = self._linearise(state, kappa, modes, robust, allowed, final=final)
         return LinearModel(
             unknowns=unknowns.labels()[:count],
             frames=equations.frames,

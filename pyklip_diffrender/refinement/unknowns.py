@@ -31,11 +31,14 @@ change of the wavefront by 10 nm moves 1 % of it. Without these derivatives, com
 false candidates beside them, and errors of a S/N above 30 are too small. They take as long as
 those of the star."""
 
+_OUTWEIGHED = 0.3
+"""Contrast over the error of the star's model below which these derivatives do not matter yet."""
+
 COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 """Prior standard deviations of a companion's contrast, x and y (arcsec) about its start."""
 
 
-def brightest(sources: Tensor) -> Tensor:
+def brightest(sources: Tensor, kappa: float = 0.0) -> Tensor:
     """The brightest of companions, if its light depends noticeably on the wavefront.
 
     One, because its derivatives take as long as those of the star.
@@ -44,13 +47,15 @@ def brightest(sources: Tensor) -> Tensor:
     ----------
     sources : Tensor, (companions, 3)
         Contrast, x and y.
+    kappa : float
+        Assumed error of the star model, as a fraction of the star.
 
     Returns
     -------
     Tensor, (0, 3) or (1, 3)
     """
     first = sources[sources[:, 0].argsort(descending=True)[:1]]
-    return first[first[:, 0] > _BRIGHT]
+    return first[first[:, 0] > max(_BRIGHT, _OUTWEIGHED * kappa)]
 
 
 @dataclass(frozen=True)
@@ -149,9 +154,13 @@ class FrameUnknowns:
         sources = self.sources(vector)
         return sources if self.shows_companions else sources[:0]
 
-    def bright_sources(self, vector: Tensor) -> Tensor:
-        """Companions whose light counts in the Jacobian by the star, (k, 3) as `sources`."""
-        return brightest(self.visible_sources(vector))
+    def are_bright(self, vector: Tensor) -> Tensor:
+        """Which visible companions have light that depends noticeably on the wavefront, (k,)."""
+        return self.visible_sources(vector)[:, 0] > _BRIGHT
+
+    def bright_sources(self, vector: Tensor, kappa: float = 0.0) -> Tensor:
+        """Companions whose light counts in the Jacobian by the star, (k, 3), see `brightest`."""
+        return brightest(self.visible_sources(vector), kappa)
 
     @property
     def turn(self) -> Tensor:
