@@ -72,7 +72,7 @@ def test_fits_of_reference_stars_have_no_candidates() -> None:
 
 def test_nothing_is_tried_where_the_data_are_explained() -> None:
     explained = SimpleNamespace(status=dr.Status.CONVERGED)
-    assert with_raised_peaks([explained], None, 0.2) is None  # type: ignore[list-item, arg-type]
+    assert with_raised_peaks([explained], None, FOUND, 0.2) is None  # type: ignore[list-item, arg-type]
 
 
 @pytest.mark.slow

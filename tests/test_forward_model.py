@@ -179,7 +179,7 @@ def test_the_forward_model_is_what_a_planet_adds_to_the_product(
 ) -> None:
     """The fit of flux and background is linear, so that the forward model is exact."""
     difference, of_planet, planet, made = added(model, OLD.data, tmp_path, flipx)
-    assert away(difference, of_planet) < 0.01
+    assert away(difference, of_planet) < 0.015
     assert away(difference, planet) > 0.1
     assert np.shape(made.fmout) == np.shape(made.output) == (2, 2, SIDE, SIDE)
     assert np.shape(made.perturbmag) == (2, 2)
@@ -272,7 +272,7 @@ def test_a_planet_of_the_fit_loses_no_light(model: OpticalSystem, tmp_path: Path
     made = dataset(star + planet, model, np.sqrt(star), fit=known)
     of_planet, product = modelled(made, planet_psf(OLD.data, made), tmp_path, algo="diffrender")
     turned = [rotate(*each, CENTER) for each in zip(planet, ANGLES, strict=True)]
-    assert away(of_planet[0], np.nanmean(turned, axis=0)) < 0.01
+    assert away(of_planet[0], np.nanmean(turned, axis=0)) < 0.015
     assert away(of_planet[0], product[0] - np.nanmedian(product[0] - of_planet[0])) < 0.02
 
 

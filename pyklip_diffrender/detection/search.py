@@ -141,26 +141,27 @@ def detect(
         maps = Maps(groups_of(fits), progress)
         return _Outcome(fits, maps, *_search(maps, fits, known, threshold, inner, scatter))
 
-    def look_again(last: _Outcome) -> _Outcome:
-        """Look again with the highest peaks as companions, if nothing explains the data."""
-        if len(last.candidates):
+    def look_and_refine(fits: Sequence[Refinement], known: Candidates) -> _Outcome:
+        """Look again with the candidates as companions, if some are bright."""
+        last = look(fits, known)
+        if len(last.candidates) >= _MAX_CANDIDATES:
+            _log.warning(
+                "%d candidates, the most that are looked for: parts of something extended? The "
+                "star is not refined with them in the model",
+                len(last.candidates),
+            )
             return last
-        better = with_raised_peaks(last.fits, last.maps, inner, progress)
-        return last if better is None else look(better, Candidates.of_fit(better[0]))
+        is_calibrated = all(fit.status.calibrated for fit in last.fits)
+        least = relinearise if is_calibrated else min(relinearise, threshold)
+        bright = last.candidates.snr(last.factor) > least
+        if not (bright.any() and lacks_candidates(last.fits, last.candidates)):
+            return last
+        return look(with_companions(last.fits, last.candidates, progress), last.candidates)
 
-    last = look_again(look(fits, Candidates.of_fit(fits[0])))
-    if not all(fit.status.calibrated for fit in last.fits):
-        relinearise = min(relinearise, threshold)
-    bright = last.candidates.snr(last.factor) > relinearise
-    if len(last.candidates) >= _MAX_CANDIDATES:
-        _log.warning(
-            "%d candidates, the most that are looked for: parts of something extended? The star is "
-            "not refined with them in the model",
-            len(last.candidates),
-        )
-    elif bright.any() and lacks_candidates(last.fits, last.candidates):
-        fits = with_companions(last.fits, last.candidates, progress)
-        last = look_again(look(fits, last.candidates))
+    last = look_and_refine(fits, Candidates.of_fit(fits[0]))
+    better = with_raised_peaks(last.fits, last.maps, last.candidates, inner, progress)
+    if better is not None:
+        last = look_and_refine(better, Candidates.of_fit(better[0]))
     fits, maps, candidates = last.fits, last.maps, last.candidates
     factor, significance = last.factor, last.significance
     if not candidates.converged:
