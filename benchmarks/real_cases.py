@@ -37,6 +37,9 @@ from pyklip_diffrender.reduction import summarise
 
 SEPARATIONS = np.array([0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 2.3])
 SIZE = 80
+NEAR = 0.45
+"""arcsec within which detections of injected planets are counted on their own."""
+
 STARS = {"G-7-34": "star", "HIP17695": "star", "V-AU-MIC": "disk"}
 FILTERS = ("F444W", "F356W")
 
@@ -48,8 +51,16 @@ def cases() -> list[tuple[str, str, str]]:
     return [*pairs, ("HIP-65426", "F444W", "roll 1"), *alone]
 
 
-def reduce_case(star: str, band: str, rolls: str, data: Path, planets: int, folder: Path) -> None:
-    """Reduce one case and write its products and row."""
+def reduce_case(
+    star: str,
+    band: str,
+    rolls: str,
+    data: Path,
+    planets: int,
+    folder: Path,
+    start: str | None = None,
+) -> None:
+    """Reduce one case and write its products and row; `start` may be a map other than the usual."""
     torch.set_num_threads(1)
     began = time.process_time()
     pair = rolls == "pair"
@@ -63,7 +74,7 @@ def reduce_case(star: str, band: str, rolls: str, data: Path, planets: int, fold
     science = sequence.science if pair else sequence.science[int(rolls[-1]) - 1 :][:1]
     result = dr.reduce(
         replace(sequence, science=science, references=()),
-        opd,
+        start or opd,
         disk=STARS.get(star) == "disk",
         injections=injections,
     )
@@ -109,7 +120,13 @@ def reduce_case(star: str, band: str, rolls: str, data: Path, planets: int, fold
         row["modes"] = np.asarray(klip["modes"]).tolist()
     if result.injections is not None:
         about = summarise(result)["injections"]
-        row["injections"] = {key: each for key, each in about.items() if key != "planets"}
+        near = np.asarray(result.injections["separation"].to_value("arcsec")) < NEAR
+        detected = np.asarray(result.injections["detected"])
+        row["injections"] = {
+            **{key: each for key, each in about.items() if key != "planets"},
+            f"detected within {NEAR} arcsec": f"{detected[near].sum()} of {near.sum()}",
+            "detected beyond": f"{detected[~near].sum()} of {(~near).sum()}",
+        }
     result.write(folder / "products", overwrite=True)
     # With the derivatives, for `benchmarks.false_alarms`.
     result.fit.write(folder / "fit.fits", overwrite=True)
@@ -166,14 +183,17 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--planets", type=int, default=28)
     parser.add_argument("--case", nargs=3, metavar=("STAR", "FILTER", "ROLLS"))
+    parser.add_argument("--opd", help="map to start from; flat for none")
+    parser.add_argument("--tables", action="store_true", help="only print those of earlier runs")
     options = parser.parse_args()
-    for case in [tuple(options.case)] if options.case else cases():
+    chosen = [tuple(options.case)] if options.case else cases()
+    for case in [] if options.tables else chosen:
         folder = options.output / "_".join(case).replace(" ", "")
         if (folder / "row.json").exists():
             continue
         folder.mkdir(parents=True, exist_ok=True)
         if options.case:
-            reduce_case(*case, options.data, options.planets, folder)
+            reduce_case(*case, options.data, options.planets, folder, options.opd)
         else:  # So that the peak memory is that of the case.
             rest = ["--data", options.data, "--output", options.output]
             number = ["--planets", str(options.planets)]

@@ -142,7 +142,7 @@ def detect(
         return _Outcome(fits, maps, *_search(maps, fits, known, threshold, inner, scatter))
 
     def look_and_refine(fits: Sequence[Refinement], known: Candidates) -> _Outcome:
-        """Look again with the candidates as companions, if some are bright."""
+        """Search, and search again with the candidates as companions if some are bright."""
         last = look(fits, known)
         if len(last.candidates) >= _MAX_CANDIDATES:
             _log.warning(
