@@ -145,11 +145,6 @@ def detect(
         """Search, and search again with the candidates as companions if some are bright."""
         last = look(fits, known)
         if len(last.candidates) >= _MAX_CANDIDATES:
-            _log.warning(
-                "%d candidates, the most that are looked for: parts of something extended? The "
-                "star is not refined with them in the model",
-                len(last.candidates),
-            )
             return last
         is_calibrated = all(fit.status.calibrated for fit in last.fits)
         least = relinearise if is_calibrated else min(relinearise, threshold)
@@ -159,9 +154,17 @@ def detect(
         return look(with_companions(last.fits, last.candidates, progress), last.candidates)
 
     last = look_and_refine(fits, Candidates.of_fit(fits[0]))
-    better = with_raised_peaks(last.fits, last.maps, last.candidates, inner, progress)
+    better = None
+    if len(last.candidates) < _MAX_CANDIDATES:
+        better = with_raised_peaks(last.fits, last.maps, last.candidates, inner, progress)
     if better is not None:
         last = look_and_refine(better, Candidates.of_fit(better[0]))
+    if len(last.candidates) >= _MAX_CANDIDATES:
+        _log.warning(
+            "%d candidates, the most that are looked for: parts of something extended? The star is "
+            "not refined with them in the model",
+            len(last.candidates),
+        )
     fits, maps, candidates = last.fits, last.maps, last.candidates
     factor, significance = last.factor, last.significance
     if not candidates.converged:
