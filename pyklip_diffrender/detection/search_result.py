@@ -194,11 +194,11 @@ class Detection:
 
         Errors are standard deviations, with all parameters of the star marginalised. Those of
         positions include the error of the star's position behind the mask, and do not include
-        errors of the pixel scale and of the roll angle. The error of the
-        contrast includes the errors of the star's flux (10 % for real frames, unless
-        ``reduce(star_flux=...)`` says it) and of the source's own image; that of the flux density
-        does not depend on the star's flux. The S/N includes neither, because they do not change the
-        significance of a source.
+        errors of the pixel scale and of the roll angle. The error of the contrast includes those of
+        the star's flux (10 % for real frames, unless ``reduce(star_flux=...)`` says it), of the
+        source's own image and of its position; that of the flux density does not depend on the
+        star's flux. The S/N is the contrast over its error for a known position and image, because
+        the others do not change the significance of a source.
         """
         table = candidate_table(self.sources, self.error_factor, self._calibration_errors, self.sky)
         order = np.argsort(-self.sources.snr(self.error_factor))
