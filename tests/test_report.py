@@ -12,6 +12,7 @@ from functools import cache
 from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -277,9 +278,14 @@ def test_candidates_in_line_suggest_a_disk() -> None:
     assert "the star is behind the mask where the header says" in hopeless.remark
     assert "disk=True" not in hopeless.remark
     # One candidate, an unknown pattern, or light of a disk that was fitted already.
-    fitted = [replace(each, disk=cast(dr.Disk, object())) for each in (crowded, patterned)]
+    away = SimpleNamespace(offsets=np.array([[0.0, 0.9], [0.0, -0.9]]))
+    fitted = [replace(each, disk=cast(dr.Disk, away)) for each in (crowded, patterned)]
     assert [each.remark for each in (whole, poor, *fitted)] == [""] * 4
     assert "disk" not in str(whole)
+    # Sources of the disk 0.1 arcsec from one candidate, and at another.
+    on_two = SimpleNamespace(offsets=np.array([[0.5, 0.1], [0.3, 0.01], [0.0, 0.9]]))
+    part = replace(crowded, disk=cast(dr.Disk, on_two)).remark
+    assert part.startswith("On the extended light, candidates at 0.30, 0.50 arcsec may be parts")
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,13 @@
-"""Whether candidates are arranged like extended light, such as a disk, rather than like planets."""
+"""Whether candidates are parts of extended light, such as a disk, rather than planets."""
 
 from __future__ import annotations
 
 import numpy as np
 from astropy.table import QTable
+from numpy.typing import NDArray
 from scipy import stats
 
-__all__ = ["looks_extended"]
+__all__ = ["looks_extended", "on_extended_light"]
 
 _UNLIKELY = 0.01
 """Probability below which unrelated sources are not taken to be arranged by chance."""
@@ -53,3 +54,34 @@ def looks_extended(candidates: QTable, resolution: float, edge: float) -> str:
     if stats.poisson.sf((distances < reach).sum() - 1, expected) < _UNLIKELY:
         return "Candidates are next to each other, like parts of an extended source"
     return ""
+
+
+def on_extended_light(candidates: QTable, offsets: NDArray[np.float64], resolution: float) -> str:
+    """Say which candidates lie on extended light that was fitted.
+
+    Parameters
+    ----------
+    candidates : QTable
+        Columns x, y and separation.
+    offsets : ndarray, (k, 2)
+        x, y of the sources of the extended light from the star, arcsec.
+    resolution : float
+        lambda/D, arcsec.
+
+    Returns
+    -------
+    str
+        Empty if there is none.
+    """
+    if not len(candidates) or not len(offsets):
+        return ""
+    places = np.stack([candidates["x"].value, candidates["y"].value], axis=1)
+    away = np.hypot(*np.moveaxis(places[:, None] - offsets, -1, 0)).min(axis=1)
+    near = np.sort(candidates["separation"].value[away < resolution])
+    if not len(near):
+        return ""
+    separations = ", ".join(f"{each:.2f}" for each in near)
+    return (
+        f"On the extended light, candidates at {separations} arcsec may be parts of it that its "
+        "fit has left."
+    )

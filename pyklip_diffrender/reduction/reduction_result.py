@@ -12,7 +12,7 @@ from astropy.table import QTable
 from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.io.files import require_new
 from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.reduction.extended import looks_extended
+from pyklip_diffrender.reduction.extended import looks_extended, on_extended_light
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.systematics import Systematics
@@ -85,7 +85,8 @@ class Reduction:
                 "of the header, that no frame is damaged, and the unit of the wavefront map."
             )
         if self.disk is not None:
-            return ""
+            resolution = self.detection.contrast_curve.meta["resolution_arcsec"]
+            return on_extended_light(self.detection.candidates, self.disk.offsets, resolution)
         reason = self.extended
         if not reason and self.systematics is not None and self.fit.chi2_per_pixel > _LARGE:
             reason = "The residual is far above the noise, as it is where the star has a disk"
