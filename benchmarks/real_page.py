@@ -48,12 +48,12 @@ def measurements(folder: Path) -> Iterator[tuple[str, list[str]]]:
     yield "wide", ["pyklip_diffrender.cli", *wide]
 
 
-def measure(folder: Path, about: str, task: tuple[str, list[str]]) -> None:
-    """Run one command and keep what it prints, unless that is there already."""
+def measure(folder: Path, about: str, task: tuple[str, list[str]]) -> bool:
+    """Run one command and keep what it prints, unless that is there already; False if it fails."""
     name, command = task
     path = folder / f"{name}.txt"
     if path.exists():
-        return
+        return True
     done = subprocess.run(
         [sys.executable, "-m", *command],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
@@ -61,10 +61,11 @@ def measure(folder: Path, about: str, task: tuple[str, list[str]]) -> None:
     text = f"{about}\n{' '.join(command)}\n\n{done.stdout}"
     if done.returncode:
         print(f"{name} failed: {done.stdout[-2000:]}", file=sys.stderr)
-        return
+        return False
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
     print(name, flush=True)
+    return True
 
 
 def main() -> None:
@@ -79,9 +80,10 @@ def main() -> None:
     about = f"commit {commit}, {datetime.datetime.now(datetime.UTC):%Y-%m-%d}"
     with ThreadPoolExecutor(options.processes) as pool:
         tasks = partial(measure, options.output, about)
-        list(pool.map(tasks, measurements(options.output)))
+        complete = all(list(pool.map(tasks, measurements(options.output))))
     tables = ["benchmarks.real_cases", "--output", str(options.output / "cases"), "--tables"]
-    measure(options.output, about, ("tables", tables))
+    if not (complete and measure(options.output, about, ("tables", tables))):
+        sys.exit("some measurements failed; run the command again to go on with them")
 
 
 if __name__ == "__main__":

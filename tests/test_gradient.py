@@ -223,6 +223,24 @@ def test_the_light_of_a_faint_companion_is_linear_in_the_curvature() -> None:
         assert (product - expected).norm() < 2e-3 * expected.norm()
 
 
+def test_the_light_of_a_faint_companion_follows_the_flux() -> None:
+    """Beside the star it hardly shows in products of the whole curvature."""
+    solver, state = solver_of(1)
+    companion = dr.Planet(9e-5, 0.5, 20.0)
+    state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
+    derivatives = ModelDerivatives(
+        solver.objective, state, solver.objective.errors(state, 0.01, 4.0)
+    )
+    (point,) = state.points
+    flux, step = point.unknowns.where("flux"), torch.zeros_like(point.vector)
+    step[flux] = 0.01 * point.vector[flux]
+    light = point.total - point.star
+    assert light.max() > 0
+    torch.testing.assert_close(
+        derivatives._change_of_faint(0, step), 0.01 * light, rtol=1e-6, atol=1e-6 * light.max()
+    )
+
+
 def test_a_companion_that_the_model_error_outweighs_counts_in_the_last_derivatives_only() -> None:
     solver, state = solver_of(1, relinearise=0.1, accurate_steps=True)
     companion = dr.Planet(0.01, 0.5, 20.0)
