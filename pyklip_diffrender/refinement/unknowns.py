@@ -33,8 +33,7 @@ those of the star."""
 
 _OUTWEIGHED = 0.3
 """Contrast over the error of the star's model below which these derivatives do not matter yet. Two
-rolls of G 7-34 need a quarter less memory without them and take as many steps; the last linear
-model has all of them."""
+rolls of G 7-34 need a fifth less memory without them. The last linear model has all of them."""
 
 COMPANION_PRIOR = (float("inf"), 0.1, 0.1)
 """Prior standard deviations of a companion's contrast, x and y (arcsec) about its start."""
