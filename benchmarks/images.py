@@ -11,7 +11,8 @@ of `pyklip.klip.meas_contrast`; its throughput is that of planets injected with
 measured with `fakes.retrieve_planet_flux`. They have the image of a point source behind the Lyot
 stop, or with ``--gaussian`` pyKLIP's Gaussian of width lambda/D. It prints 5-sigma limits in the
 unit of the injected peaks, raw and after the Gaussian filter of `meas_contrast`, which both
-products get then.
+products get then. With ``--disk ANGLE``, the position angle of an edge-on disk, noise and planets
+are those beside it, more than 45 degrees from either side.
 """
 
 from __future__ import annotations
@@ -42,6 +43,9 @@ MODES = [1, 2, 3, 4, 5]
 OURS = ("cleaned", "flux")
 STAMP = 41
 """Side of the image of a planet, pixels."""
+
+BESIDE = 45.0
+"""Smallest angle from the axis of a disk, degrees."""
 
 STRENGTH = 8.0
 """Peaks of the injected planets over the standard deviation of the pixels of the ring."""
@@ -75,6 +79,18 @@ def limits(image: Image, center: Image, scale: float, fwhm: float, smooth: bool)
     return np.interp(SEPARATIONS, seps * scale, contrast)
 
 
+def from_axis(angle: Image, axis: float) -> Image:
+    """Angle from the nearer side of a disk's axis, degrees."""
+    return np.abs((angle - axis + 90) % 180 - 90)
+
+
+def beside(image: Image, center: Image, axis: float) -> Image:
+    """An image with north up and east on the left, NaN but for what is beside a disk."""
+    y, x = np.indices(image.shape)
+    angle = np.degrees(np.arctan2(center[0] - x, y - center[1]))
+    return np.where(from_axis(angle, axis) > BESIDE, image, np.nan)
+
+
 def point_source(passband: str, like: dr.OpticalSystem) -> Image:
     """Image of a source far from the mask, with a peak of 1."""
     model = dr.nircam_coronagraph(
@@ -89,6 +105,7 @@ def main() -> None:
     """Compare the depths at several separations."""
     parser = real_frames_parser(__doc__)
     parser.add_argument("--gaussian", action="store_true")
+    parser.add_argument("--disk", type=float, metavar="ANGLE")
     options = parser.parse_args()
     sequence = dr.Sequence.from_files(options.frames, target=options.target, filter=options.filter)
     names = [
@@ -111,11 +128,20 @@ def main() -> None:
     print(f"{options.target} {options.filter}: {fit!r}")
     kept = {name: np.zeros((len(each), len(SEPARATIONS))) for name, each in images.items()}
     stamp = None if options.gaussian else point_source(options.filter, model)
-    noise = limits(images["KLIP"][0], center, scale, fwhm, False) / 5
-    for angle in ANGLES:
-        for k, separation in enumerate(SEPARATIONS):
+    background, angles = images, ANGLES + 137.5 * np.arange(len(SEPARATIONS))[:, None]
+    if options.disk is not None:
+        background = {
+            name: np.array([beside(image, center, options.disk) for image in each])
+            for name, each in images.items()
+        }
+        # Those of the whole ring, on the two arcs beside the disk.
+        angles = options.disk + 90 + BESIDE * (angles % 360 - 180) / 180
+        angles[:, ::2] += 180
+    noise = limits(background["KLIP"][0], center, scale, fwhm, False) / 5
+    for k, separation in enumerate(SEPARATIONS):
+        for angle in angles[k]:
             peak = STRENGTH * noise[k]
-            place = (separation / scale, angle + 137.5 * k)
+            place = (separation / scale, angle)
             for name in images:
                 copied = copy.deepcopy(dataset)
                 if name in OURS:
@@ -137,7 +163,7 @@ def main() -> None:
                  for image, left in zip(each, kept[name], strict=True)],
                 axis=0,
             )
-            for name, each in images.items()
+            for name, each in background.items()
         }  # fmt: skip
         print("after the Gaussian filter" if smooth else "raw", "image, KLIP, ours, ratio, kept")
         for name in OURS:

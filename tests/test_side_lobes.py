@@ -12,6 +12,7 @@ import pyklip_diffrender as dr
 from benchmarks.planets import searched
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.field import separation_of
 from pyklip_diffrender.detection.groups import groups_of
 from pyklip_diffrender.detection.maps import Maps
 from pyklip_diffrender.detection.side_lobes import side_lobes
@@ -58,6 +59,16 @@ def test_a_planet_stays_and_a_peak_that_a_hidden_source_explains_does_not() -> N
 def test_without_a_hidden_source_nothing_is_explained() -> None:
     maps = maps_of({PLANET: 30.0, LOBE: 6.0})
     assert lobes_of(maps, candidates_of(maps, {PLANET: 30.0})) == [False]
+
+
+def test_a_source_may_be_significant_only_beside_the_candidate() -> None:
+    """A candidate that has taken light of the hidden source leaves less than 5 sigma of it."""
+    place = (0.34, -0.09)  # The templates of the two have a correlation of 0.48.
+    maps = maps_of({HIDDEN: 5.6, place: 3.2})
+    alone = candidates_of(maps, {place: 6.0})
+    snr = maps.snr(maps.without(alone))
+    assert snr[separation_of(maps.grid) < 0.2].max() < 4.8
+    assert lobes_of(maps, alone) == [True]
 
 
 @pytest.mark.slow

@@ -27,8 +27,8 @@ def side_lobes(
 ) -> Tensor:
     """Which candidates are not significant beside a source within the inner limit, (k,).
 
-    The source is the highest peak there, and is fitted together with the candidates. A planet keeps
-    its S/N, because the two images differ.
+    The source starts at the highest peak there, is fitted together with the candidates, and must be
+    significant beside them. A planet keeps its S/N, because the two images differ.
 
     Parameters
     ----------
@@ -48,12 +48,11 @@ def side_lobes(
         return none
     scaled = np.where(separation_of(maps.grid) < inner, snr / factor.of(maps.grid), -np.inf)
     peak = np.unravel_index(np.nanargmax(scaled), scaled.shape)
-    if scaled[peak] < threshold:
-        return none
     contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
     both = candidates.with_one_more(maps.grid[peak], contrast)
     both = refine_candidates(maps.groups, both, pixel_width(maps.grid) / 2)
-    if separation_of(both.offsets.numpy())[-1] >= inner:
+    sigmas = both.snr(factor)
+    # The map has less of a source between pixels, and of one that the candidates stand for.
+    if separation_of(both.offsets.numpy())[-1] >= inner or sigmas[-1] < threshold:
         return none
-    needed = factor.threshold(threshold, candidates.offsets)
-    return torch.from_numpy(both.snr(factor)[:-1] < needed)
+    return torch.from_numpy(sigmas[:-1] < factor.threshold(threshold, candidates.offsets))

@@ -34,6 +34,9 @@ those of the whole bandpass, and their amplitudes by 2e-4. Candidates are measur
 _DIFFERENCE = 5e-4
 """arcsec between images whose difference is a derivative; accurate to 1e-4."""
 
+_BEYOND = torch.tensor([1.2, 1.2], dtype=torch.float64)
+"""x, y from the star, arcsec, where the transmission of every mask is above 0.9."""
+
 _KEPT = 200
 """Largest number of images with derivatives that are kept."""
 
@@ -208,6 +211,26 @@ class Templates:
                 parts.append(change / (2 * _DIFFERENCE))
             self._rendered[key] = torch.stack(parts)
         return self._rendered[key]
+
+    def beyond_mask(self, k: int) -> Tensor:
+        """A source that the mask does not dim, at the pixel (ny // 2, nx // 2), (ny, nx).
+
+        It is on neither of the axes, along which bars extend.
+        """
+        frame = self.frames[k]
+        place = self._star(frame) + _BEYOND
+        middle = torch.tensor(
+            [
+                0.0 if n % 2 else scale / 2
+                for n, scale in zip(
+                    frame.model.detector.shape[::-1], frame.model.detector.pixelscale, strict=True
+                )
+            ],
+            dtype=torch.float64,
+        )
+        values = {**frame.optical_values, "star_offset": place, "detector_shift": middle - place}
+        with torch.no_grad():
+            return frame.model(_as_tensor(frame.opd), **values).double().cpu()
 
     def place_of(self, k: int, offset: Tensor) -> Tensor:
         """Position of a planet from the occulter in frame k, (2,), arcsec."""

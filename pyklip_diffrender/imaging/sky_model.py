@@ -1,33 +1,41 @@
 """The posterior mean of the sky about a star, from all frames of a fit together.
 
-The frames are taken to be d = H s + star + noise. The sky s is an image with north up; H turns and
-shifts it onto the pixels of every frame. The linear model of the fit knows the covariance Sigma of
-the rest: noise, errors of the flat field, which rolls share, and all that the wavefront, the flux
-and the alignment of the star may still be. The prior of the sky is s = T g * u, point sources
-anywhere: u is white noise of unit variance, g the core of a point source with sum(g^2) = 1, and T
-a constant times the noise of the frames at each pixel. With B = H T g, the posterior mean is
+The frames are taken to be d = P * (H a) + star + noise. The sky a is an image with north up of the
+peaks of point sources; H turns and shifts it onto the pixels of every frame, and P is the image of
+a point source with its side lobes, which behind a Lyot stop have most of its light. The linear
+model of the fit knows the covariance Sigma of the rest: noise, errors of the flat field, which
+rolls share, and all that the wavefront, the flux and the alignment of the star may still be. The
+prior is a = T u, point sources anywhere: u is white noise of unit variance, and T is such that
+a source of one standard deviation has a S/N of 1. With B = P * H T, the posterior mean is
 
-    s = T g * u,    (1 + B^T Sigma^-1 B) u = B^T Sigma^-1 (d - star),
+    a = T u,    (1 + B^T Sigma^-1 B) u = B^T Sigma^-1 (d - star),
 
-which conjugate gradients solve. Rolls are weighted by their noise, nothing is interpolated before
-noise and star are known, and structure that is fixed on the detector is not taken for sky, because
-it does not turn with it. The estimate is linear in the data, and its covariance and its response to
-a source are those of a linear filter, in closed form. See section 2.7 and chapter 2 of C. E.
-Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006).
+which conjugate gradients solve. Like the components of a CLEAN map, it is shown as a Gaussian beam
+would see it, multiplied by the number with which a source in white noise keeps its peak.
+
+Rolls are weighted by their noise, nothing is interpolated before noise and star are known, and
+structure that is fixed on the detector is not taken for sky, because it does not turn with it. The
+estimate is linear in the data, and its covariance and its response to a source are those of a
+linear filter, in closed form. See section 2.7 and chapter 2 of C. E. Rasmussen and C. K. I.
+Williams, "Gaussian Processes for Machine Learning" (2006).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.ndimage import gaussian_filter
+from scipy.signal import fftconvolve
 from torch import Tensor
 
 from pyklip_diffrender.detection.groups import groups_of
+from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.imaging.interpolation import interpolation_matrix
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.refinement import Refinement
@@ -39,9 +47,16 @@ Image = NDArray[np.float64]
 Light = Sequence[Mapping[int, Tensor]]
 """Images (k, ny, nx) by frame, for every fit."""
 
-_STRENGTH = 2.0
-"""Standard deviation of the prior over the noise. Sources much fainter than the noise are
-averaged over their image, brighter ones are left as sharp as they are."""
+_STRENGTH = 0.8
+"""S/N of a source of one standard deviation of the prior. With less, the image is deeper and not as
+sharp, in the limit that of a matched filter; with more, it is sharper and noisier."""
+
+_BEAM = 0.7
+"""FWHM of the beam, lambda/D. With what the prior blurs, a point source has 1.3 to 1.4 lambda/D, as
+in the frames."""
+
+_REACH = 10.0
+"""lambda/D from the middle of a point source's image to where it is cut."""
 
 _MARGIN = 1.45
 """Side of the sky over that of the frames, which turn in it."""
@@ -105,12 +120,29 @@ class SkyModel:
         ]  # fmt: skip
         model = first.model
         self.resolution = float(model.bandpass.mean_wavelength) / model.diameter / ARCSEC
-        # The FWHM of a point source is lambda/D.
-        width = self.resolution / self.pixelscale / math.sqrt(8 * math.log(2))
-        frequency = np.fft.fftfreq(side)[:, None] ** 2 + np.fft.rfftfreq(side) ** 2
-        core = np.exp(-2 * (math.pi * width) ** 2 * frequency)
-        self._core = core / np.linalg.norm(np.fft.irfft2(core, s=self.shape))
-        self._prior = _STRENGTH * self._noise()
+        reach = math.ceil(_REACH * self.resolution / self.pixelscale)
+        self._point_sources = [self._point_source(templates, reach) for _, templates in self.groups]
+        self._prior = _STRENGTH * self._noise() / np.linalg.norm(self._point_sources[0])
+        self._beam = self._scaled_beam()
+
+    @staticmethod
+    def _point_source(templates: Templates, reach: int) -> Image:
+        """Image of a point source beyond the mask, (k, k) with k odd and a peak of 1."""
+        image = templates.beyond_mask(min(templates.frames)).numpy()
+        row, column = (n // 2 for n in image.shape)
+        reach = min(reach, *((n - 1) // 2 for n in image.shape))
+        cut = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
+        return np.asarray(cut / cut.max())
+
+    def _scaled_beam(self) -> Image:
+        """Transform of the beam with which a point source in white noise keeps its peak."""
+        width = _BEAM * self.resolution / self.pixelscale / math.sqrt(8 * math.log(2))
+        frequency = np.fft.fftfreq(self.shape[0])
+        beam = np.exp(-2 * (math.pi * width) ** 2 * (frequency[:, None] ** 2 + frequency**2))
+        source = self._point_sources[0]
+        power = np.abs(np.fft.fft2(source / np.linalg.norm(source), s=self.shape)) ** 2
+        kept = _STRENGTH**2 * power / (1 + _STRENGTH**2 * power)
+        return np.asarray(beam / (beam * kept).mean())
 
     def places(self, offsets: Image, angle: float) -> Image:
         """Place in the sky, (n, 2), of x, y in arcsec from the star in a frame.
@@ -149,40 +181,34 @@ class SkyModel:
         image = self._onto_frames[group][frame] @ sky.ravel()
         return np.asarray(image.reshape(linear.frames[frame].residual.shape))
 
-    def _blurred(self, images: Image) -> Image:
-        return np.asarray(np.fft.irfft2(np.fft.rfft2(images) * self._core, s=self.shape))
-
-    def _sky(self, white: Image) -> Image:
-        """T g * u."""
-        return np.asarray(self._prior * self._blurred(white))
-
-    def _white(self, sky: Image) -> Image:
-        """The transpose of `_sky`."""
-        return self._blurred(self._prior * sky)
-
     def _rendered(self, sky: Image) -> Light:
-        """H s."""
+        """P * (H a)."""
         flat = np.ascontiguousarray(sky.reshape(len(sky), -1).T)
         images = []
-        for (linear, _), matrices in zip(self.groups, self._onto_frames, strict=True):
+        for (linear, _), source, matrices in self._parts():
             ny, nx = linear.frames[0].residual.shape
             images.append(
                 {
-                    k: torch.from_numpy(np.ascontiguousarray((m @ flat).T)).reshape(-1, ny, nx)
+                    k: torch.from_numpy(_convolved((m @ flat).T.reshape(-1, ny, nx), source))
                     for k, m in matrices.items()
                 }
             )
         return images
 
     def _collected(self, light: Light) -> Image:
-        """H^T Sigma^-1 of images."""
+        """The transpose of `_rendered` on Sigma^-1 of images."""
         total: Image | float = 0.0
-        for g, (linear, _) in enumerate(self.groups):
-            cleaned = linear.clean(light[g])
-            for k, matrix in self._onto_frames[g].items():
-                whitened = (linear.frames[k].weight * cleaned[k]).flatten(1).numpy()
-                total = total + np.asarray(matrix.T @ whitened.T)
+        for each, ((linear, _), source, matrices) in zip(light, self._parts(), strict=True):
+            cleaned = linear.clean(each)
+            for k, matrix in matrices.items():
+                whitened = (linear.frames[k].weight * cleaned[k]).numpy()
+                matched = _convolved(whitened, source[::-1, ::-1])
+                total = total + np.asarray(matrix.T @ matched.reshape(len(matched), -1).T)
         return np.asarray(total).T.reshape(-1, *self.shape)
+
+    def _parts(self) -> Iterator[tuple[Any, Image, Mapping[int, sparse.csr_matrix]]]:
+        """Each group with its image of a point source and the matrices onto its frames."""
+        return zip(self.groups, self._point_sources, self._onto_frames, strict=True)
 
     def _solved(self, right: Image) -> Image:
         """Solve (1 + B^T Sigma^-1 B) u = b for several b, (k, ny, nx), by conjugate gradients."""
@@ -196,7 +222,8 @@ class SkyModel:
         for _ in range(_ITERATIONS):
             if (size <= enough).all():
                 break
-            product = direction + self._white(self._collected(self._rendered(self._sky(direction))))
+            seen = self._collected(self._rendered(self._prior * direction))
+            product = direction + self._prior * seen
             length = size / np.maximum((direction * product).sum(axis=(1, 2)), 1e-300)
             solution += length[:, None, None] * direction
             residual -= length[:, None, None] * product
@@ -205,7 +232,7 @@ class SkyModel:
         return solution
 
     def estimate(self, light: Light | None = None) -> Image:
-        """Posterior mean of the sky.
+        """Posterior mean of the sky, seen with the beam.
 
         Parameters
         ----------
@@ -217,7 +244,9 @@ class SkyModel:
         ndarray, (k, ny, nx)
         """
         images = self.light() if light is None else light
-        return self._sky(self._solved(self._white(self._collected(images))))
+        sources = self._prior * self._solved(self._prior * self._collected(images))
+        transform = np.fft.rfft2(sources) * self._beam[:, : self.shape[1] // 2 + 1]
+        return np.asarray(np.fft.irfft2(transform, s=self.shape))
 
     def throughput(self, seed: int = 0) -> Image:
         """Fraction of the peak of a faint point source that the estimate keeps, by separation.
@@ -245,12 +274,11 @@ class SkyModel:
         angle = first.observation.position_angle
         for some in _batches(np.unique(comb)):
             members = [np.flatnonzero(comb == each) for each in some]
-            light, peaks = self._sources(members, y, x, signs)
-            skies = self.estimate(light)
-            for sky, chosen, peak in zip(skies, members, peaks, strict=True):
+            skies = self.estimate(self._sources(members, y, x, signs))
+            for sky, chosen in zip(skies, members, strict=True):
                 places = self.places(first.grid[y[chosen], x[chosen]], angle)
                 seen = interpolation_matrix(places, self.shape) @ sky.ravel()
-                kept[chosen] = signs[chosen] * seen / peak
+                kept[chosen] = signs[chosen] * seen
         distance = np.hypot(*np.moveaxis(first.grid, -1, 0)) / self.resolution
         ring = distance[y, x].astype(np.int64)
         known = [k for k in np.unique(ring) if (ring == k).sum() >= _FEW]
@@ -263,22 +291,26 @@ class SkyModel:
         rows: NDArray[np.int64],
         columns: NDArray[np.int64],
         signs: Image,
-    ) -> tuple[list[dict[int, Tensor]], list[Image]]:
-        """Sums of sources as bright as the star, and the peak of each in the first frame."""
+    ) -> Light:
+        """Sums of sources with peaks of 1 or -1 in the first frame."""
         light: list[dict[int, Tensor]] = []
-        peaks: list[Image] = []
-        for g, (_, templates) in enumerate(self.groups):
+        peaks: dict[int, Tensor] = {}
+        for _, templates in self.groups:
             sums: dict[int, list[Tensor]] = {k: [] for k in templates.frames}
-            for chosen in members:
+            for each, chosen in enumerate(members):
                 images = templates.at_pixels(rows[chosen], columns[chosen])
-                sign = torch.from_numpy(signs[chosen])
-                for k, each in images.items():
-                    sums[k].append(torch.tensordot(sign, each.double(), dims=1))
-                if g == 0:
-                    seen = images[min(images)].double().numpy()
-                    peaks.append(seen[np.arange(len(chosen)), rows[chosen], columns[chosen]])
-            light.append({k: torch.stack(each) for k, each in sums.items()})
-        return light, peaks
+                # Those behind the mask would otherwise be lost among the others.
+                peak = peaks.setdefault(each, images[min(images)].double().amax(dim=(1, 2)))
+                weight = torch.from_numpy(signs[chosen]) / peak
+                for k, image in images.items():
+                    sums[k].append(torch.tensordot(weight, image.double(), dims=1))
+            light.append({k: torch.stack(images) for k, images in sums.items()})
+        return light
+
+
+def _convolved(images: Image, kernel: Image) -> Image:
+    """Convolve images, (k, ny, nx), with a kernel; zero beyond their edges."""
+    return np.asarray(fftconvolve(images, kernel[None], mode="same", axes=(1, 2)))
 
 
 def _batches(items: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:

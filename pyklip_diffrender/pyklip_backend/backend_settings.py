@@ -106,12 +106,13 @@ class DiffrenderSettings:
     image : {"cleaned", "flux", "subtracted"}, optional
         Image that the products carry. "subtracted", always that of forward models and the default
         but for real NIRCam frames, is each frame minus its star. "cleaned", the default for real
-        NIRCam frames, is the posterior mean of the sky from all rolls
-        together, see ``imaging.SkyModel``; every frame has it on its own pixels, so that pyKLIP's
-        mean or median of the frames is the same image. "flux" has in each pixel the most probable
-        peak of a point source there, from all rolls together with the star marginalised: its noise
-        is that of the closed-form limits, and it keeps all light of a source. Pixels beyond the
-        fitted square have the frames minus star.
+        NIRCam frames, is the posterior mean of the sky from all rolls together, see
+        ``imaging.SkyModel``: sources are as sharp as in the frames but have no side lobes, which
+        takes up to half of the light of a disk. Every frame has it on its own pixels, so that
+        pyKLIP's mean or median of the frames is the same image. "flux" has in each pixel the most
+        probable peak of a point source there, from all rolls together with the star marginalised:
+        its noise is that of the closed-form limits, and it keeps all light of a source. Pixels
+        beyond the fitted square have the frames minus star.
     max_chi2 : float, optional
         Reduced chi-squared above which a fit is implausible and the reduction stops with a
         `RefinementError`; 100 by default, inf for no limit.

@@ -69,7 +69,7 @@ class SkyImages:
     def posterior_mean(self) -> Image:
         """Light of neither star nor detector, in the frames' unit, see `imaging.sky_model`.
 
-        Of faint sources it has 0.4 to 0.8 of the peak.
+        Point sources have 0.5 to 1 of their peak, least close to the star, and no side lobes.
         """
         model = SkyModel(self.detection.fits)
         middle = slice(model.center - self._half, model.center + self._half + 1)
