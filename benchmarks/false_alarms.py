@@ -10,13 +10,15 @@ Run from the root of the project, with fits that `Refinement.write` wrote::
 laws of scatter, and decides with the package's own code: maps with a false candidate, and the part
 of planets that become candidates. `maxima` compares the probability of a false alarm with maps of
 uniform noise that are sampled four times finer than the pixels. `real` counts the maxima of the
-maps of real fits with the sign of the data reversed, and with the rolls turned the wrong way,
-beside the expectation. Finished blocks are kept in the output folder and not computed again.
+maps of real fits with the sign of the data reversed, with the rolls turned the wrong way, and of
+single rolls of two stars as if they were one, beside the expectation. Finished blocks are kept in
+the output folder and not computed again.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -49,6 +51,9 @@ MARGIN = 16
 
 FINER = 4
 """Samples per pixel of maxima between pixels."""
+
+INNER = 0.2
+"""Smallest separation of candidates, arcsec."""
 
 SEPARATIONS = (0.3, 0.4, 0.5, 0.8, 1.2, 2.0)
 STRENGTHS = (6.5, 8.0)
@@ -120,7 +125,7 @@ def blocks(
     return np.concatenate(parts)
 
 
-def judged(fit: Refinement, inner: float = 0.2) -> tuple[Maps, Significance, Candidates]:
+def judged(fit: Refinement, inner: float = INNER) -> tuple[Maps, Significance, Candidates]:
     """Maps of a fit, what decides on their peaks, and its companions."""
     maps = Maps(groups_of([fit]))
     known = Candidates.of_fit(fit)
@@ -239,8 +244,25 @@ def real(paths: Sequence[Path]) -> None:
             counts = _counts(wrong, turned.snr(), known)
             table.add_row((path.stem, "rolls reversed", *counts))
         table[-1:].pprint_all()
+    for row in _two_stars(paths):
+        table.add_row(row)
     print("maxima and, in brackets, their expectation in Gaussian noise")
     table.pprint_all()
+
+
+def _two_stars(paths: Sequence[Path]) -> Iterator[tuple[str, ...]]:
+    """Rows of the maxima of two stars' single rolls in one filter, searched as if of one star."""
+    for one, other in itertools.combinations(paths, 2):
+        fits = [Refinement.read(path) for path in (one, other)]
+        first, second = (fit.frames[0].observation for fit in fits)
+        single = all(len(fit.frames) == 1 for fit in fits)
+        if single and first.filter == second.filter and first.target != second.target:
+            maps = Maps(groups_of(fits))
+            known = Candidates.at([], [])
+            significance = significance_of(fits, maps, known.offsets, INNER)
+            name = f"{one.stem} {other.stem}"
+            yield name, "two stars", *_counts(significance, maps.snr(), known)
+            yield name, "two stars, negative", *_counts(significance, -maps.snr(), known)
 
 
 def _counts(significance: Significance, snr: Image, known: Candidates) -> list[str]:

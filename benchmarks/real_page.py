@@ -25,6 +25,8 @@ from pyklip_diffrender.io.files import replacing
 
 DATA = Path("../shared/data")
 HIP_65426 = [str(DATA / "hip65426_f444w_calints.fits.gz"), str(DATA / "opd_2022-07-30.fits.gz")]
+AXIS = "128.5"
+"""Position angle of AU Mic's disk, degrees (MacGregor et al. 2013, ApJL 762, L21: 128.4 +- 0.1)."""
 
 
 def measurements(folder: Path) -> Iterator[tuple[str, list[str]]]:
@@ -41,6 +43,8 @@ def measurements(folder: Path) -> Iterator[tuple[str, list[str]]]:
             yield f"images_{star}_{band}_gaussian", ["benchmarks.images", *which, "--gaussian"]
     for band in FILTERS:
         yield f"disks_{band}", ["benchmarks.disks", "--filter", band]
+        which = ["--target", "V-AU-MIC", "--filter", band, "--disk", AXIS]
+        yield f"images_V-AU-MIC_{band}", ["benchmarks.images", *which]
     frames, opd = HIP_65426
     yield "star_flux", ["benchmarks.star_flux", "--frames", frames, "--opd", opd]
     products = str(folder / "hip65426")

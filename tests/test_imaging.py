@@ -80,6 +80,31 @@ def test_the_estimate_is_that_of_the_closed_form() -> None:
     np.testing.assert_allclose(estimate, expected, atol=4e-3 * np.abs(expected).max())
 
 
+def test_the_error_is_that_of_the_closed_form() -> None:
+    model = sky()
+    linear, _ = model.groups[0]
+    ny, nx = linear.frames[0].residual.shape
+    h = np.concatenate(
+        [convolution(model._point_sources[0], ny, nx) @ model._onto_frames[0][k].toarray()
+         for k in (0, 1)]
+    )  # fmt: skip
+    # The estimate's covariance is E Sigma E^T; with E = S H^T Sigma^-1 that is E H S^T.
+    estimate = dense(model)
+    response = estimate @ h
+    prior = model._prior.ravel() ** 2
+    covariance = (response * prior) @ (np.eye(len(prior)) - response).T
+    beam = np.fft.fftshift(np.fft.ifft2(model._beam).real)
+    places = np.indices(model.shape).reshape(2, -1).T - model.center
+    seen = np.array([np.roll(beam, place, (0, 1)).ravel() for place in places])
+    exact = np.sqrt((seen @ covariance * seen).sum(axis=1)).reshape(model.shape)
+    distance = np.hypot(*np.moveaxis(model.grid, -1, 0)) / model.resolution
+    error = model.error()
+    for ring in range(1, 6):
+        chosen = distance.astype(int) == ring
+        expected = np.median(exact[chosen])
+        assert np.median(error[chosen]) == pytest.approx(expected, rel=0.12)
+
+
 def test_a_source_in_white_noise_keeps_its_peak() -> None:
     """Noise of 1 everywhere, a prior of the stated S/N, frames that repeat beyond their edges."""
     model = sky()

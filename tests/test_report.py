@@ -500,7 +500,7 @@ def test_images_have_north_up() -> None:
     images = SkyImages(whole)
     overview = Overview(images, klip)
     wrong = [replace(PLANET, position_angle=angle).offset for angle in (10.0, 70.0, -40.0, 220.0)]
-    for image, grid in ((images.combined[0], images.grid), (images.posterior_mean, images.grid),
+    for image, grid in ((images.combined[0], images.grid), (images.posterior_mean[0], images.grid),
                         (klip.image, klip.grid),
                         (images.turned(whole.detection.snr), images.grid)):  # fmt: skip
         # Its position on the frame, turned twice, mirrored, and on the other side.
@@ -555,8 +555,8 @@ def test_images_of_the_sky_are_written_with_coordinates(tmp_path: Path) -> None:
     with fits.open(images.write(tmp_path / "images.fits")) as hdus:
         names = [hdu.name for hdu in hdus[1:]]
         assert names == [
-            "COMBINED", "COMBINED_ERROR", "THROUGHPUT", "POSTERIOR_MEAN", "CONTRAST",
-            "CONTRAST_ERROR", "SNR",
+            "COMBINED", "COMBINED_ERROR", "THROUGHPUT", "POSTERIOR_MEAN", "POSTERIOR_MEAN_ERROR",
+            "CONTRAST", "CONTRAST_ERROR", "SNR",
         ]  # fmt: skip
         (row,) = whole.detection.candidates
         image, wcs = np.nan_to_num(hdus["SNR"].data), WCS(hdus["POSTERIOR_MEAN"].header)
@@ -567,7 +567,12 @@ def test_images_of_the_sky_are_written_with_coordinates(tmp_path: Path) -> None:
         assert star.separation(peak).arcsec == pytest.approx(row["separation"].value, abs=0.07)
         angle = star.position_angle(peak).deg
         assert angle == pytest.approx(row["position_angle"].value, abs=8.0)
-        np.testing.assert_array_equal(hdus["POSTERIOR_MEAN"].data, images.posterior_mean)
+        np.testing.assert_array_equal(hdus["POSTERIOR_MEAN"].data, images.posterior_mean[0])
+        # Far from planet and star it scatters as its errors say.
+        away = np.hypot(*np.moveaxis(images.grid - PLANET.offset, -1, 0)) > 0.35
+        away &= (np.hypot(*np.moveaxis(images.grid, -1, 0)) > 0.3) & np.isfinite(image)
+        scatter = (hdus["POSTERIOR_MEAN"].data / hdus["POSTERIOR_MEAN_ERROR"].data)[away].std()
+        assert scatter == pytest.approx(1.0, abs=0.3)
         ratio = hdus["CONTRAST"].data[y, x] / hdus["CONTRAST_ERROR"].data[y, x]
         # The ratio of interpolated values, and the interpolated ratio.
         assert ratio == pytest.approx(hdus["SNR"].data[y, x], rel=0.05)

@@ -6,12 +6,13 @@ a point source with its side lobes, which behind a Lyot stop have most of its li
 model of the fit knows the covariance Sigma of the rest: noise, errors of the flat field, which
 rolls share, and all that the wavefront, the flux and the alignment of the star may still be. The
 prior is a = T u, point sources anywhere: u is white noise of unit variance, and T is such that
-a source of one standard deviation has a S/N of 1. With B = P * H T, the posterior mean is
+a source of one standard deviation has a S/N of `_STRENGTH`. With B = P * H T, the posterior mean is
 
     a = T u,    (1 + B^T Sigma^-1 B) u = B^T Sigma^-1 (d - star),
 
 which conjugate gradients solve. Like the components of a CLEAN map, it is shown as a Gaussian beam
-would see it, multiplied by the number with which a source in white noise keeps its peak.
+would see it, multiplied by the number with which a source in white noise keeps its peak. Sources
+behind the mask, whose images differ from P, and those that resemble starlight keep less.
 
 Rolls are weighted by their noise, nothing is interpolated before noise and star are known, and
 structure that is fixed on the detector is not taken for sky, because it does not turn with it. The
@@ -75,8 +76,11 @@ _STEP = 2
 _APART = 6
 """Places of one comb are this many steps apart, so far that they do not matter to each other."""
 
+_PROBES = 24
+"""Fields of random signs from which the error is estimated, to 3 to 10 %."""
+
 _FEW = 4
-"""Number of places in a ring below which its throughput is that of its neighbours."""
+"""Number of places in a ring below which its value is that of its neighbours."""
 
 _BATCH = 12
 """Right-hand sides that are solved together."""
@@ -244,9 +248,39 @@ class SkyModel:
         ndarray, (k, ny, nx)
         """
         images = self.light() if light is None else light
-        sources = self._prior * self._solved(self._prior * self._collected(images))
+        return self._seen(self._prior * self._solved(self._prior * self._collected(images)))
+
+    def _seen(self, sources: Image) -> Image:
+        """Images of point sources as the beam shows them."""
         transform = np.fft.rfft2(sources) * self._beam[:, : self.shape[1] // 2 + 1]
         return np.asarray(np.fft.irfft2(transform, s=self.shape))
+
+    def error(self, seed: int = 0) -> Image:
+        """Standard deviation that the noise of the frames has in the estimate, by separation.
+
+        With A = (1 + B^T Sigma^-1 B)^-1, the covariance of u is A - A^2. The diagonal of that of
+        the image, Q, is the expectation of z * (Q z) for random signs z (C. Bekas, E. Kokiopoulou
+        and Y. Saad 2007, Applied Numerical Mathematics 57, 1214).
+
+        Parameters
+        ----------
+        seed : int
+            Of the signs.
+
+        Returns
+        -------
+        ndarray, (ny, nx)
+        """
+        covered = sum(m.sum(axis=0) for part in self._onto_frames for m in part.values())
+        # The prior is wide where no frame is, so that those places would hide all others.
+        inside = np.asarray(covered).reshape(self.shape) > 0.5
+        signs = inside * np.random.default_rng(seed).choice([-1.0, 1.0], (_PROBES, *self.shape))
+        once = self._solved(self._prior * self._seen(signs))
+        covariance = self._seen(self._prior * (once - self._solved(once)))
+        distance = np.hypot(*np.moveaxis(self.grid, -1, 0)) / self.resolution
+        variance = (signs * covariance).mean(axis=0)[inside]
+        variance = _by_ring(variance, distance[inside], distance)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def throughput(self, seed: int = 0) -> Image:
         """Fraction of the peak of a faint point source that the estimate keeps, by separation.
@@ -280,10 +314,7 @@ class SkyModel:
                 seen = interpolation_matrix(places, self.shape) @ sky.ravel()
                 kept[chosen] = signs[chosen] * seen
         distance = np.hypot(*np.moveaxis(first.grid, -1, 0)) / self.resolution
-        ring = distance[y, x].astype(np.int64)
-        known = [k for k in np.unique(ring) if (ring == k).sum() >= _FEW]
-        medians = [float(np.median(kept[ring == k])) for k in known]
-        return np.asarray(np.interp(distance, np.array(known) + 0.5, medians))
+        return _by_ring(kept, distance[y, x], distance)
 
     def _sources(
         self,
@@ -311,6 +342,14 @@ class SkyModel:
 def _convolved(images: Image, kernel: Image) -> Image:
     """Convolve images, (k, ny, nx), with a kernel; zero beyond their edges."""
     return np.asarray(fftconvolve(images, kernel[None], mode="same", axes=(1, 2)))
+
+
+def _by_ring(values: Image, at: Image, distance: Image) -> Image:
+    """Medians of values in rings of width 1 at the distances `at`, interpolated to others."""
+    ring = at.astype(np.int64)
+    known = [k for k in np.unique(ring) if (ring == k).sum() >= _FEW]
+    medians = [float(np.median(values[ring == k])) for k in known]
+    return np.asarray(np.interp(distance, np.array(known) + 0.5, medians))
 
 
 def _batches(items: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:

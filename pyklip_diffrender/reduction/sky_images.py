@@ -66,14 +66,16 @@ class SkyImages:
         return combine_frames(self._templates, images, errors, self.grid @ self.to_sky)
 
     @cached_property
-    def posterior_mean(self) -> Image:
-        """Light of neither star nor detector, in the frames' unit, see `imaging.sky_model`.
+    def posterior_mean(self) -> tuple[Image, Image]:
+        """Light of neither star nor detector, and its standard deviation, in the frames' unit.
 
-        Point sources have 0.5 to 1 of their peak, least close to the star, and no side lobes.
+        See `imaging.sky_model`. Point sources have 0.5 to 1 of their peak, least close to the star,
+        and no side lobes.
         """
         model = SkyModel(self.detection.fits)
         middle = slice(model.center - self._half, model.center + self._half + 1)
-        return model.estimate()[0][middle, middle]
+        mean, error = (image[middle, middle] for image in (model.estimate()[0], model.error()))
+        return mean, error * self.detection.error_factor.of(self.grid @ self.to_sky)
 
     @cached_property
     def throughput(self) -> Image:
@@ -90,7 +92,7 @@ class SkyImages:
     @property
     def image(self) -> Image:
         """The image to show: the posterior mean, or with a disk in the model the mean of frames."""
-        return self.posterior_mean if self._disk is None else self.combined[0]
+        return (self.combined if self._disk is not None else self.posterior_mean)[0]
 
     @property
     def words(self) -> str:
@@ -111,11 +113,13 @@ class SkyImages:
         detection = self.detection
         unit = detection.observation.unit.to_string("fits")
         mean, error = self.combined
+        sky, sky_error = self.posterior_mean
         images = {
             "COMBINED": (mean, unit),
             "COMBINED_ERROR": (error, unit),
             "THROUGHPUT": (self.throughput, ""),
-            "POSTERIOR_MEAN": (self.posterior_mean, unit),
+            "POSTERIOR_MEAN": (sky, unit),
+            "POSTERIOR_MEAN_ERROR": (sky_error, unit),
             "CONTRAST": (self.turned(detection.contrast), ""),
             "CONTRAST_ERROR": (self.turned(detection.error), ""),
             "SNR": (self.turned(detection.snr), ""),
