@@ -117,7 +117,8 @@ def main() -> None:
     plain = {name: copy.deepcopy(dataset) for name in ("KLIP", *OURS)}
     images = {"KLIP": reduced(plain["KLIP"], "klip", MODES)}
     for name in OURS:
-        plain[name].diffrender = dr.DiffrenderSettings(image=name)
+        disk = options.disk is not None
+        plain[name].diffrender = dr.DiffrenderSettings(image=name, disk=disk)
         images[name] = reduced(plain[name], "diffrender", [1])
     fit = plain["cleaned"].diffrender_results[0].subtraction.fits[0].result
     model = fit.model

@@ -127,7 +127,7 @@ class SkyModel:
         reach = math.ceil(_REACH * self.resolution / self.pixelscale)
         self._point_sources = [self._point_source(templates, reach) for _, templates in self.groups]
         self._prior = _STRENGTH * self._noise() / np.linalg.norm(self._point_sources[0])
-        self._beam = self._scaled_beam()
+        self._beam, self._response = self._beam_and_response()
 
     @staticmethod
     def _point_source(templates: Templates, reach: int) -> Image:
@@ -138,15 +138,19 @@ class SkyModel:
         cut = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
         return np.asarray(cut / cut.max())
 
-    def _scaled_beam(self) -> Image:
-        """Transform of the beam with which a point source in white noise keeps its peak."""
+    def _beam_and_response(self) -> tuple[Image, Image]:
+        """Transforms of the beam, and of a point source in white noise as it shows it.
+
+        The beam is such that the peak of the source stays 1.
+        """
         width = _BEAM * self.resolution / self.pixelscale / math.sqrt(8 * math.log(2))
         frequency = np.fft.fftfreq(self.shape[0])
         beam = np.exp(-2 * (math.pi * width) ** 2 * (frequency[:, None] ** 2 + frequency**2))
         source = self._point_sources[0]
         power = np.abs(np.fft.fft2(source / np.linalg.norm(source), s=self.shape)) ** 2
         kept = _STRENGTH**2 * power / (1 + _STRENGTH**2 * power)
-        return np.asarray(beam / (beam * kept).mean())
+        peak = (beam * kept).mean()
+        return np.asarray(beam / peak), np.asarray(beam * kept / peak)
 
     def places(self, offsets: Image, angle: float) -> Image:
         """Place in the sky, (n, 2), of x, y in arcsec from the star in a frame.
@@ -252,8 +256,29 @@ class SkyModel:
 
     def _seen(self, sources: Image) -> Image:
         """Images of point sources as the beam shows them."""
-        transform = np.fft.rfft2(sources) * self._beam[:, : self.shape[1] // 2 + 1]
-        return np.asarray(np.fft.irfft2(transform, s=self.shape))
+        return self._filtered(sources, self._beam)
+
+    def _filtered(self, images: Image, transform: Image) -> Image:
+        product = np.fft.rfft2(images) * transform[:, : self.shape[1] // 2 + 1]
+        return np.asarray(np.fft.irfft2(product, s=self.shape))
+
+    def of_sources(self, offsets: Image, peaks: Image, angle: float) -> Image:
+        """Known point sources as the estimate would show them in white noise.
+
+        Parameters
+        ----------
+        offsets : ndarray, (k, 2)
+            x, y from the star in a frame, arcsec.
+        peaks : ndarray, (k,)
+        angle : float
+            Position angle of the frame's +y axis, degrees.
+
+        Returns
+        -------
+        ndarray, (ny, nx)
+        """
+        sources = interpolation_matrix(self.places(offsets, angle), self.shape).T @ peaks
+        return self._filtered(sources.reshape(self.shape), self._response)
 
     def error(self, seed: int = 0) -> Image:
         """Standard deviation that the noise of the frames has in the estimate, by separation.

@@ -103,6 +103,10 @@ class DiffrenderSettings:
         model, so that none of their light is subtracted with the star; True by default for real
         NIRCam frames, else False. Undetected companions still lose light, as much as the
         throughput map says.
+    disk : bool, optional
+        Fit extended light about the star together with it, see `fit_disk`, so that a disk is not
+        subtracted with the star. It includes companions, and `keep_detected` has no effect. False
+        by default.
     image : {"cleaned", "flux", "subtracted"}, optional
         Image that the products carry. "subtracted", always that of forward models and the default
         but for real NIRCam frames, is each frame minus its star. "cleaned", the default for real
@@ -154,6 +158,7 @@ class DiffrenderSettings:
     systematics: Systematics | PatternLibrary | str | os.PathLike[str] | None = None
     plan: str | None = None
     keep_detected: bool | None = None
+    disk: bool | None = None
     image: Literal["cleaned", "flux", "subtracted"] | None = None
     max_chi2: float | None = None
     injected_into: Any = None

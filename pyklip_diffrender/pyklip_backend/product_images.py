@@ -68,6 +68,7 @@ class ProductImages:
     def __init__(self, subtraction: Subtraction) -> None:
         self.pointings = subtraction.pointings
         self.fits = list(dict.fromkeys(part.result for part in self.pointings))
+        self._disk = subtraction.disk
 
     @cached_property
     def sky(self) -> SkyModel:
@@ -97,6 +98,18 @@ class ProductImages:
             first = images[min(images)].double().numpy()
             peaks.append(first[np.arange(len(row)), row, column])
         return np.concatenate(peaks).reshape(shape)
+
+    @cached_property
+    def _extended(self) -> Image | None:
+        """The disk as the estimate of the sky would show it, which is made from frames without."""
+        disk = self._disk
+        if disk is None or not len(disk.offsets):
+            return None
+        angle = self.fits[0].frames[0].observation.position_angle
+        away = disk.offsets[:, None] - self.maps.grid.reshape(-1, 2)
+        pixels = np.hypot(*np.moveaxis(away, -1, 0)).argmin(axis=1)
+        peaks = disk.contrasts * self._peaks.ravel()[pixels]
+        return self.sky.of_sources(disk.offsets, peaks, angle)
 
     def put_into(self, residuals: Image, image: str, added: Image | None = None) -> None:
         """Replace the fitted square of frames, (n, Ny, Nx), by an image of the sky, in place.
@@ -139,7 +152,8 @@ class ProductImages:
             for images, more in zip(light, self._added(added), strict=True):
                 for k, image in more.items():
                     images[k] = images[k] + image
-        return np.asarray(self.sky.estimate(light)[0])
+        rest = np.asarray(self.sky.estimate(light)[0])
+        return rest if self._extended is None else rest + self._extended
 
     def _flux(self, added: Image | None) -> Image:
         """Peak of a point source at each pixel of the first frame, with the star marginalised."""
@@ -150,7 +164,10 @@ class ProductImages:
         contrast = np.divide(
             numerator, self.maps.information, out=np.zeros_like(numerator), where=known
         )
-        return np.asarray(contrast * self._peaks)
+        peaks = np.asarray(contrast * self._peaks)
+        if self._extended is None:
+            return peaks
+        return peaks + self.sky.in_frame(self._extended, 0, min(self.maps.groups[0][1].frames))
 
     def _on_frame(self, flux: Image, frame: FrameFit) -> Image:
         """A map of the first frame on the pixels of a frame."""

@@ -25,6 +25,7 @@ from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:
+    from pyklip_diffrender.detection import Disk
     from pyklip_diffrender.detection.error_factor import ErrorFactor
     from pyklip_diffrender.optics.system import OpticalSystem
     from pyklip_diffrender.pattern import PatternChoice, PatternRequest
@@ -85,6 +86,8 @@ class Subtraction:
         The parts of the fits, one for each pointing; empty for other subtractors.
     error_factor : ErrorFactor, optional
         By how much the S/N scatters more than it should, if companions were searched.
+    disk : Disk, optional
+        Extended light in the frames, which the data of the fit do not have.
     """
 
     star: NDArray[np.float64]
@@ -95,6 +98,7 @@ class Subtraction:
     references: int = 0
     pointings: tuple[FittedPointing, ...] = ()
     error_factor: ErrorFactor | None = None
+    disk: Disk | None = None
 
     @property
     def worst(self) -> Fit:
@@ -195,8 +199,15 @@ def subtract_by_refinement(
         systematics=_requested_pattern(settings, observation, references),
         settings=settings.fit,
     )
-    keep, error_factor = settings.keep_detected, None
-    if observation.is_nircam if keep is None else keep:
+    keep, error_factor, disk = settings.keep_detected, None, None
+    if settings.disk:
+        from pyklip_diffrender.detection import fit_disk
+
+        tell("fitting the extended light")
+        disk = fit_disk(result)
+        result = disk.fit
+        tell(f"{disk}: {_described(result)}")
+    elif observation.is_nircam if keep is None else keep:
         result, error_factor = _with_companions(result, tell)
     star = np.full(observation.data.shape, np.nan)
     # It may have been refined again with companions.
@@ -218,6 +229,7 @@ def subtract_by_refinement(
         choice.reference_frames,
         tuple(fitted),
         error_factor,
+        disk,
     )
 
 
