@@ -45,7 +45,8 @@ class ReduceOptions:
         Search the whole frames as well, see `wide_field`. If sources beyond the fitted pixels are
         bright enough to be seen in these, the star is fitted once more without their light.
     disk : bool
-        Fit extended light about the star, see `fit_disk`, and search the frames without it.
+        Fit extended light about the star, see `fit_disk`, and search the frames without it. The
+        extended light takes up planets, so that the limits do not exclude any.
     injections : int
         Number of planets to add to the fitted frames, slightly brighter than the limits, to see
         how well they are recovered; see `recover_planets`. Seven of them take as long as the
