@@ -252,15 +252,16 @@ def real(paths: Sequence[Path]) -> None:
 
 def _two_stars(paths: Sequence[Path]) -> Iterator[tuple[str, ...]]:
     """Rows of the maxima of two stars' single rolls in one filter, searched as if of one star."""
-    for one, other in itertools.combinations(paths, 2):
-        fits = [Refinement.read(path) for path in (one, other)]
+    known = Candidates.at([], [])
+    read = {path.stem: Refinement.read(path) for path in paths}
+    single = {name: fit for name, fit in read.items() if len(fit.frames) == 1}
+    for names in itertools.combinations(single, 2):
+        fits = [single[name] for name in names]
         first, second = (fit.frames[0].observation for fit in fits)
-        single = all(len(fit.frames) == 1 for fit in fits)
-        if single and first.filter == second.filter and first.target != second.target:
+        if first.filter == second.filter and first.target != second.target:
             maps = Maps(groups_of(fits))
-            known = Candidates.at([], [])
             significance = significance_of(fits, maps, known.offsets, INNER)
-            name = f"{one.stem} {other.stem}"
+            name = " ".join(names)
             yield name, "two stars", *_counts(significance, maps.snr(), known)
             yield name, "two stars, negative", *_counts(significance, -maps.snr(), known)
 

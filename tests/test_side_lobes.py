@@ -71,6 +71,12 @@ def test_a_source_may_be_significant_only_beside_the_candidate() -> None:
     assert lobes_of(maps, alone) == [True]
 
 
+def test_a_source_that_is_not_significant_explains_nothing() -> None:
+    place = (0.34, -0.09)
+    maps = maps_of({HIDDEN: 3.5, place: 4.0})
+    assert lobes_of(maps, candidates_of(maps, {place: 5.7})) == [False]
+
+
 @pytest.mark.slow
 def test_no_candidate_beside_a_planet_behind_the_mask() -> None:
     """A planet of 9e-5 at 0.11 arcsec ends a fit as CONVERGED, with a peak of 5.1 at 0.35."""
