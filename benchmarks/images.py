@@ -52,7 +52,10 @@ STRENGTH = 8.0
 
 
 def reduced(dataset: Any, algo: str, modes: list[int]) -> Image:
-    """Run `klip_dataset`; the images by number of modes, (modes, ny, nx)."""
+    """Run `klip_dataset`; the images by number of modes, (modes, ny, nx).
+
+    With a movement of 0, a frame would be one of its own references.
+    """
     with (
         tempfile.TemporaryDirectory() as folder,
         contextlib.redirect_stdout(io.StringIO()),
@@ -60,7 +63,7 @@ def reduced(dataset: Any, algo: str, modes: list[int]) -> Image:
     ):
         klip_dataset(
             dataset, mode="ADI+RDI", outputdir=folder, fileprefix="x", annuli=1, subsections=1,
-            numbasis=modes, movement=0, numthreads=1, psf_library=dataset.psflib,
+            numbasis=modes, movement=1, numthreads=1, psf_library=dataset.psflib,
             time_collapse="mean", algo=algo, verbose=False,
         )  # fmt: skip
     with warnings.catch_warnings():
