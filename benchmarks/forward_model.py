@@ -220,7 +220,7 @@ class Trial(Planet):
         ):
             fm.klip_dataset(
                 dataset, planet, mode=mode, outputdir=folder, fileprefix="x", annuli=1,
-                subsections=1, numbasis=[5], movement=0, numthreads=1, mute_progression=True,
+                subsections=1, numbasis=[5], movement=1, numthreads=1, mute_progression=True,
                 psf_library=library, aligned_center=CENTER,
             )  # fmt: skip
             path = Path(folder) / "x-klipped-KLmodes-all.fits"

@@ -144,7 +144,7 @@ def measured(frames: Frames, planet: Planet, mode: str, algorithm: str | None) -
         )  # fmt: skip
         fm.klip_dataset(
             dataset, forward, mode=mode, outputdir=name, fileprefix="x", annuli=1, subsections=1,
-            numbasis=[MODES], movement=0, numthreads=1, mute_progression=True,
+            numbasis=[MODES], movement=1, numthreads=1, mute_progression=True,
             psf_library=dataset.psflib, **({"algo": algorithm} if algorithm else {}),
         )  # fmt: skip
         with fits.open(folder / "x-klipped-KLmodes-all.fits") as hdus:

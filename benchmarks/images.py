@@ -50,6 +50,9 @@ BESIDE = 45.0
 STRENGTH = 8.0
 """Peaks of the injected planets over the standard deviation of the pixels of the ring."""
 
+LEAST = 1e-3
+"""Throughput below which a number of modes says nothing of planets."""
+
 
 def reduced(dataset: Any, algo: str, modes: list[int]) -> Image:
     """Run `klip_dataset`; the images by number of modes, (modes, ny, nx).
@@ -119,11 +122,15 @@ def main() -> None:
     dataset = JWSTData(*names, center_include_offset=False)
     plain = {name: copy.deepcopy(dataset) for name in ("KLIP", *OURS)}
     images = {"KLIP": reduced(plain["KLIP"], "klip", MODES)}
+    first = plain[OURS[0]]
     for name in OURS:
-        disk = options.disk is not None
-        plain[name].diffrender = dr.DiffrenderSettings(image=name, disk=disk)
+        # The frames are fitted once.
+        plain[name].diffrender = dr.DiffrenderSettings(
+            image=name, disk=options.disk is not None,
+            injected_into=None if name == OURS[0] else first,
+        )  # fmt: skip
         images[name] = reduced(plain[name], "diffrender", [1])
-    fit = plain["cleaned"].diffrender_results[0].subtraction.fits[0].result
+    fit = first.diffrender_results[0].subtraction.fits[0].result
     model = fit.model
     scale = float(np.mean(model.detector.pixelscale))
     resolution = float(model.bandpass.mean_wavelength) / model.diameter
@@ -149,7 +156,7 @@ def main() -> None:
             for name in images:
                 copied = copy.deepcopy(dataset)
                 if name in OURS:
-                    copied.diffrender = dr.DiffrenderSettings(image=name, injected_into=plain[name])
+                    copied.diffrender = dr.DiffrenderSettings(image=name, injected_into=first)
                 planets = [peak if stamp is None else peak * stamp] * len(copied.input)
                 fakes.inject_planet(
                     copied.input, copied.centers, planets, copied.wcs, *place, fwhm=fwhm
@@ -162,8 +169,8 @@ def main() -> None:
                     kept[name][m, k] += flux / peak / len(ANGLES)
     for smooth in (False, True):
         best = {
-            name: np.min(
-                [limits(image, center, scale, fwhm, smooth) / np.maximum(left, 1e-3)
+            name: np.nanmin(
+                [limits(image, center, scale, fwhm, smooth) / np.where(left > LEAST, left, np.nan)
                  for image, left in zip(each, kept[name], strict=True)],
                 axis=0,
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -134,7 +135,9 @@ def test_products_and_refusals(tmp_path: Path) -> None:
     assert lit.orientation is None  # The frame's own orientation is not known.
     with astropy_fits.open(lit.write(tmp_path)) as hdus:
         names = [hdu.name for hdu in hdus[1:]]
-        assert names == ["IMAGE", "IMAGE_ERROR", "LIGHT", "OFFSET_X", "OFFSET_Y", "SOURCES"]
+        assert names == ["IMAGE", "IMAGE_ERROR", "LIGHT", "HIDES_POINTS", "OFFSET_X", "OFFSET_Y",
+                         "SOURCES"]  # fmt: skip
+        assert not hdus["HIDES_POINTS"].data.any()
         assert hdus["IMAGE"].header["BUNIT"] == "ph"
         np.testing.assert_allclose(
             WCS(hdus["LIGHT"].header).wcs_pix2world(2, 9, 0), disk.grid[9, 2]
@@ -167,14 +170,95 @@ def test_the_threshold_is_in_standard_deviations() -> None:
     np.testing.assert_allclose(solved, [2.0, 0.0, 0.4], atol=1e-5)
 
 
-def test_sources_stay_on_their_pixels_when_the_star_moves() -> None:
-    """A pixel near the inner edge may then be on the other side of it."""
+def test_gains_are_with_respect_to_sources_on_the_same_pixels() -> None:
+    """So that a fit that repeats them gains nothing."""
     fit = small_fit()
-    first = module._fit_sources(fit, 0.30)
-    again = module._fit_sources(fit, 0.40, first)
-    assert len(module._positions(first.templates.grid, 0.40)[0]) < len(first.contrasts)
-    assert len(again.contrasts) == len(first.contrasts)
-    assert again.offsets == pytest.approx(first.offsets)
+    pixels = module._positions(fit.frames[0].grid, 0.30)
+    first = module._fit_sources(fit, pixels)
+    assert first.gain > 10
+    again = module._fit_sources(fit, pixels, replace(first, light={0: np.zeros((24, 24))}))
+    assert again.gain == pytest.approx(0, abs=1e-3)
+    assert again.contrasts == pytest.approx(first.contrasts, rel=0.01, abs=1e-8)
+
+
+def planets_in(
+    frames: list[dr.Observation], places: list[tuple[float, float]], contrast: float
+) -> list[dr.Observation]:
+    """The frames with planets at x, y from the star in the first of them, arcsec."""
+    ((_, templates),) = groups_of([fitted()[1].fit])
+    light = templates.at(torch.tensor(places, dtype=torch.float64))
+    return [
+        replace(each, data=each.data + contrast * light[k].sum(dim=0).numpy())
+        for k, each in enumerate(frames)
+    ]
+
+
+def with_disk(frames: list[dr.Observation]) -> dr.Disk:
+    """Fit frames with the settings of `fitted`."""
+    model = dr.nircam_coronagraph("F444W", **OPTIONS)
+    settings = dr.GaussNewton(cycles=10, response_npix=64)
+    return dr.fit_disk(dr.refine(model, frames, dr.random_opd(1, npix=128), settings=settings))
+
+
+@pytest.mark.slow
+def test_planets_beside_a_ring_are_found_at_twice_the_limits() -> None:
+    _, disk = fitted()
+    alone = dr.detect(disk.fit, without_limits=disk.hides_points)
+    assert len(alone.candidates) == 0
+    curve = alone.contrast_curve
+    limit = float(np.interp(1.05, curve["separation"].value, curve["contrast"]))
+    # Much of the ring's light would be noise without its own sources.
+    assert limit < 3e-7
+    frames, _ = rolls(BRIGHTNESS)
+    # From 1.0 to 1.15 arcsec from the star, 0.4 from the ring or more.
+    places = [(0.6, -0.9), (-0.8, -0.6), (0.3, 1.1)]
+    for times in (2.0, 5.0):
+        again = with_disk(planets_in(frames, places, times * limit))
+        found = dr.detect(again.fit, without_limits=again.hides_points).candidates
+        away = np.hypot(*np.moveaxis(
+            np.stack([found["x"].value, found["y"].value], axis=-1)[:, None] - places, -1, 0
+        ))  # fmt: skip
+        assert sorted(away.argmin(axis=1)) == [0, 1, 2]
+        assert away.min(axis=0) == pytest.approx(0, abs=0.05)
+        assert np.asarray(found["contrast"]) == pytest.approx(times * limit, rel=0.35 / times**0.5)
+
+
+@pytest.mark.slow
+def test_a_planet_next_to_a_ring_counts_as_its_light_and_has_no_limit() -> None:
+    _, disk = fitted()
+    away = np.hypot(*np.moveaxis(disk.grid - (1.0, -0.35), -1, 0))
+    assert disk.hides_points[np.unravel_index(away.argmin(), away.shape)]
+    assert 0.15 < disk.hides_points.mean() < 0.35
+    again = with_disk(planets_in(rolls(BRIGHTNESS)[0], [(1.0, -0.35)], 1e-6))
+    assert len(dr.detect(again.fit).candidates) == 0
+    assert again.contrast > disk.contrast
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("contrast", [1e-5, 1e-4])
+def test_a_planet_alone_is_no_disk(contrast: float) -> None:
+    """Although sources lower chi-squared by ten thousands."""
+    disk = with_disk(planets_in(rolls(0.0)[0], [(0.6, -0.5)], contrast))
+    assert disk.contrast == 0
+    assert disk.gain > 1e4
+    assert not disk.hides_points.any()
+    (planet,) = dr.detect(disk.fit).candidates
+    assert planet["contrast"] == pytest.approx(contrast, rel=0.03)
+
+
+def test_limits_are_those_of_the_pixels_that_are_left() -> None:
+    fit = small_fit()
+    grid = fit.frames[0].grid
+    whole = dr.detect(fit)
+    half = dr.detect(fit, without_limits=grid[..., 0] < 0)
+    near = np.hypot(*np.moveaxis(grid, -1, 0)) < 0.35
+    curve = dr.detect(fit, without_limits=near).contrast_curve
+    assert curve["separation"].min() > whole.contrast_curve["separation"].min()
+    assert (half.contrast_curve["lowest"] >= whole.contrast_curve["lowest"]).all()
+    assert (half.contrast_curve["lowest"] > whole.contrast_curve["lowest"]).any()
+    np.testing.assert_array_equal(half.error, whole.error)
+    with pytest.raises(IncompatibleSetupError, match=r"without_limits: got the shape \(3,\)"):
+        dr.detect(fit, without_limits=np.zeros(3, dtype=bool))
 
 
 @pytest.mark.slow
@@ -195,18 +279,19 @@ def test_products_of_pyklip_keep_a_ring() -> None:
         keep_detected=False,
     )
     amounts: dict[tuple[str, bool], float] = {}
-    for with_disk in (False, True):
-        asked = replace(settings, disk=with_disk)
-        with pytest.warns(DiffrenderWarning, match="disk=True for a star with a disk"):
+    for fits_disk in (False, True):
+        asked = replace(settings, disk=fits_disk)
+        advice = pytest.warns(DiffrenderWarning, match="disk=True for a star with a disk")
+        with nullcontext() if fits_disk else advice:
             subtraction = subtract_by_refinement(observation, dr.random_opd(1, npix=128), asked)
-        assert (subtraction.disk is not None) == with_disk
+        assert (subtraction.disk is not None) == fits_disk
         residuals = observation.data - subtraction.star
-        amounts["subtracted", with_disk] = amount(np.nan_to_num(residuals[0]), rings[0])
+        amounts["subtracted", fits_disk] = amount(np.nan_to_num(residuals[0]), rings[0])
         images = ProductImages(subtraction)
         for image in ("cleaned", "flux"):
             shown = residuals.copy()
             images.put_into(shown, image)
-            amounts[image, with_disk] = amount(np.nan_to_num(shown[0]), rings[0])
+            amounts[image, fits_disk] = amount(np.nan_to_num(shown[0]), rings[0])
     assert amounts["subtracted", False] < 0.2
     assert amounts["subtracted", True] == pytest.approx(1.0, abs=0.1)
     # Its light, which the data of the fit do not have, is in the images of the sky again, without

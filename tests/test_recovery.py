@@ -127,6 +127,22 @@ def test_planets_are_as_bright_as_stated_and_where_they_are_said_to_be(count: in
     assert "..." not in str(planets)
 
 
+def test_no_planet_is_where_extended_light_would_hide_it() -> None:
+    """All but a quarter of the field is hidden."""
+    plain = searched()
+    hidden = (plain.grid[..., 0] < 0) | (plain.grid[..., 1] < 0)
+    images: list[np.ndarray] = []
+
+    def search(science: tuple[dr.Observation, ...]) -> Any:
+        images.append(science[0].data[0])
+        return searched(science)
+
+    planets = recover_planets(plain, 5, search, hidden)
+    assert len(planets) == 5
+    assert sum(np.count_nonzero(each) for each in images) == 5
+    assert not any(each[hidden].any() for each in images)
+
+
 def test_sets_have_at_most_seven_planets_in_a_wide_field() -> None:
     wide = QTable({"separation": [0.2, 1.1] * u.arcsec, "small_sample": [LIMIT, LIMIT]})
     sizes: list[int] = []

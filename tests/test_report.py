@@ -681,7 +681,7 @@ def shown() -> dict[str, Any]:
         detection, 5.0, flat, flat, flat, flat, detection.error_factor, detection.candidates,
         detection.contrast_curve,
     )  # fmt: skip
-    disk = dr.Disk(fit, (), flat, flat, flat, np.ones((1, 2)), np.ones(1), 9.0)
+    disk = dr.Disk(fit, (), flat, flat, flat, np.ones((1, 2)), np.ones(1), flat > 1, 9.0)
     values = (evil, sequence, fit, detection, again, whole.fit.model, known, fit.initial,
               wide, disk)  # fmt: skip
     return {type(value).__name__: value for value in values}

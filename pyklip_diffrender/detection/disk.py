@@ -49,6 +49,9 @@ class Disk:
     contrasts : ndarray, (k,)
         Their light as a fraction of the star's, before the coronagraph. Empty if there is no
         significant extended light; `light` is then 0.
+    hides_points : ndarray of bool, (ny, nx)
+        Where a point source of S/N 5 would count as extended light: mostly within two lambda/D of
+        it. Limits for point sources do not hold there.
     gain : float
         Decrease of chi-squared by the sources in the frames' first fit, with the star marginalised.
 
@@ -68,6 +71,7 @@ class Disk:
     grid: Image
     offsets: Image
     contrasts: Image
+    hides_points: NDArray[np.bool_]
     gain: float
 
     def __repr__(self) -> str:
@@ -142,8 +146,8 @@ class Disk:
     def write(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Write disk.fits; returns its path.
 
-        Its extensions are IMAGE, IMAGE_ERROR, LIGHT (one for every frame), OFFSET_X, OFFSET_Y and
-        the table SOURCES.
+        Its extensions are IMAGE, IMAGE_ERROR, LIGHT (one for every frame), HIDES_POINTS (1 or 0),
+        OFFSET_X, OFFSET_Y and the table SOURCES.
 
         Raises
         ------
@@ -166,6 +170,7 @@ class Disk:
                     image_hdu(each, "LIGHT", unit, cards, k)
                     for k, (each, cards) in enumerate(zip(self.light, frames, strict=True), 1)
                 ),
+                image_hdu(np.asarray(self.hides_points, dtype=float), "HIDES_POINTS", "", wcs),
                 image_hdu(self.grid[..., 0], "OFFSET_X", "arcsec", wcs),
                 image_hdu(self.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
                 sources,

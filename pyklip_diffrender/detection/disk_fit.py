@@ -11,7 +11,11 @@ star stays. The last term, a threshold of s standard deviations, keeps sources a
 noise asks for.
 
 The light of a disk biases the star that was fitted without it, beyond the range of the linear
-model. So the star is fitted again without that light, until the sources hardly change.
+model. So the star is fitted again without that light, three times in all.
+
+Sources first stand at every second pixel of the field. They show where light is extended; there,
+and where there are point sources, sources at every pixel follow. Point sources are fitted, too, but
+are no part of the extended light: they stay in the data, for the search to judge.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from pyklip_diffrender.detection.combination import combine_frames
+from pyklip_diffrender.detection.connected_light import ConnectedLight
 from pyklip_diffrender.detection.disk import Disk
 from pyklip_diffrender.detection.field import Image, separation_of
 from pyklip_diffrender.detection.groups import groups_of, has_only_reference_stars
@@ -38,23 +43,22 @@ from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["fit_disk"]
 
+Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""Rows and columns."""
+
 _log = logging.getLogger(__name__)
 
 _SPACING = 2
-"""Distance of neighbouring sources, pixels: about lambda/D in NIRCam's long-wave filters."""
+"""Distance of neighbouring sources over the whole field, pixels: about lambda/D in NIRCam's
+long-wave filters. A simulated ring that was fitted by sources so far apart, without those at every
+pixel, left a chi-squared of 2.2 per pixel, and of 1.05 with them."""
 
 _THRESHOLD = 1.0
 """Standard deviations that a source has to exceed."""
 
-_ROUNDS = 2
-"""Largest number of times that the star is fitted again."""
-
 _SIGNIFICANT = 4.0
 """Decrease of chi-squared per source below which it is noise: it was 1.9 for a simulated star
 without a disk, and 11 to 26 for stars with one."""
-
-_GAIN = 0.02
-"""Decrease of chi-squared per pixel below which the star is not fitted again."""
 
 
 def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) -> Disk:
@@ -62,12 +66,13 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
 
     The light may have any shape, but not be negative. What is symmetric about the star, or seen in
     a single roll, is told from the star only by the prior on its wavefront: two rolls or more are
-    best. Planets are part of the extended light, too: `detect` them without it first.
+    best. Sources that are dark 1.5 lambda/D away in all directions are no part of it: pass the
+    attributes `fit` and `hides_points` of the result to `detect` to search for them.
 
     Parameters
     ----------
     fit : Refinement
-        Of the target. Its companions become part of the extended light.
+        Of the target. The result's own has no companions: they are in its data.
     inner : float or Quantity
         Smallest separation of sources, arcsec.
     progress : bool
@@ -104,20 +109,14 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
             "fit_disk: expected frames of the target, got a reference star"
         )
     original = [frame.observation for frame in fit.frames]
-    with ProgressBar("disk", shown=progress) as bar:
-        sources = _fit_sources(fit, inner)
-        first, gain = sources.gain, sources.gain
-        if gain < _SIGNIFICANT * len(sources):
-            _log.info("no extended light: %s", sources)
-            sources, gain = sources.dark(), 0.0
-        pixels = sum(int(original[k].combined().valid.sum()) for k in sources.light)
-        for _ in range(_ROUNDS):
-            bar.update(sources=len(sources))
-            if gain < _GAIN * pixels:
-                break
-            fit = without_light(fit, sources.light, original)
-            sources = _fit_sources(fit, inner, sources)
-            gain = sources.gain
+    sources = _fit_sources(fit, _positions(fit.frames[0].grid, inner))
+    gain, extended = sources.gain, None
+    if gain >= _SIGNIFICANT * len(sources):
+        with ProgressBar("disk", shown=progress) as bar:
+            extended = _extended(fit, sources, inner, original, bar)
+    if extended is None:
+        _log.info("no extended light: %s", sources)
+    fit, sources = extended or (fit, sources.dark())
     image, error = _combined(fit, sources, original)
     is_lit = sources.contrasts > 0
     return Disk(
@@ -128,8 +127,48 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
         grid=sources.templates.grid,
         offsets=sources.offsets[is_lit],
         contrasts=sources.contrasts[is_lit],
-        gain=first,
+        hides_points=sources.connected.hides_points,
+        gain=gain,
     )
+
+
+def _extended(
+    fit: Refinement,
+    sources: _Sources,
+    inner: float,
+    original: Sequence[Observation],
+    bar: ProgressBar,
+) -> tuple[Refinement, _Sources] | None:
+    """The star without extended light, and the sources of that light; None if there is none.
+
+    Parameters
+    ----------
+    fit : Refinement
+        The star together with all light.
+    sources : _Sources
+        Of all light.
+    inner : float
+        arcsec.
+    original : sequence of Observation
+        The frames of the fit.
+    bar : ProgressBar
+    """
+    bar.update(sources=len(sources))
+    fit = without_light(fit, sources.light, original)
+    sources = _fit_sources(fit, sources.pixels, sources)
+    light, outside = sources.connected, separation_of(sources.templates.grid) >= inner
+    region = light.region & outside
+    if not region.any():
+        return None
+    rows, columns = np.nonzero(region | (light.bright & outside))
+    # The star first without point sources, whose light it would take up.
+    for only_extended in (False, True):
+        sources = _fit_sources(fit, (rows, columns), sources, only_extended)
+        bar.update(sources=len(sources))
+        if not len(sources):
+            return None
+        fit = without_light(fit, sources.light, original)
+    return fit, sources
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,17 +181,20 @@ class _Sources:
     pixels : tuple of ndarray, (k,)
         Rows and columns.
     contrasts : ndarray, (k,)
+    errors : ndarray, (k,)
+        Standard deviations of the contrasts, each source alone.
     flux : float
         Flux of the star, to which contrasts are relative.
     light : dict of int to ndarray, (ny, nx)
         By frame.
     gain : float
-        Decrease of chi-squared with respect to the sources from which these were fitted.
+        Decrease of chi-squared with respect to earlier sources on the same pixels, if any.
     """
 
     templates: Templates
-    pixels: tuple[NDArray[np.int64], NDArray[np.int64]]
+    pixels: Pixels
     contrasts: Image
+    errors: Image
     flux: float
     light: dict[int, Image]
     gain: float
@@ -164,6 +206,15 @@ class _Sources:
     def offsets(self) -> Image:
         """x, y from the star, arcsec, (k, 2)."""
         return np.asarray(self.templates.grid[self.pixels])
+
+    @property
+    def connected(self) -> ConnectedLight:
+        """Which of the light is extended."""
+        grid = self.templates.grid
+        snr = np.zeros(grid.shape[:2])
+        snr[self.pixels] = self.contrasts / self.errors
+        pixel = float(np.hypot(*(grid[0, 1] - grid[0, 0])))
+        return ConnectedLight(snr, self.templates.fit.model.resolution / pixel)
 
     def __str__(self) -> str:
         return (
@@ -177,26 +228,34 @@ class _Sources:
         return replace(self, contrasts=np.zeros_like(self.contrasts), light=light)
 
 
-def _fit_sources(fit: Refinement, inner: float, start: _Sources | None = None) -> _Sources:
-    """Sources in the frames of a fit, to which the light of `start` is added again."""
+def _fit_sources(
+    fit: Refinement, pixels: Pixels, start: _Sources | None = None, only_extended: bool = False
+) -> _Sources:
+    """Sources in the frames of a fit, to which the light of `start` is added again.
+
+    With `only_extended`, those that are point sources are left out after the fit.
+    """
     ((linear, templates),) = groups_of([fit])
-    # The same pixels in every round, although the star moves a little and with it their distances.
-    pixels = _positions(templates.grid, inner) if start is None else start.pixels
     images = templates.at_pixels(*pixels)
     flux, before = fit.frames[0].flux, np.zeros(len(pixels[0]))
     if start is not None:
         linear = linear.without("companions", start.light)
-        before = start.contrasts * (start.flux / flux)
+        if all(map(np.array_equal, start.pixels, pixels)):
+            before = start.contrasts * (start.flux / flux)
     matrix, vector = (each.numpy() for each in linear.normal_equations(images))
+    errors = matrix.diagonal().clip(min=1e-300) ** -0.5
     contrasts = _brightest(matrix, vector, before)
+    sources = _Sources(templates, pixels, contrasts, errors, flux, {}, 0.0)
+    if only_extended:
+        contrasts = np.where(sources.connected.is_extended[pixels], contrasts, 0.0)
     light = {k: np.tensordot(contrasts, each.double().numpy(), 1) for k, each in images.items()}
     gain = _gain(matrix, vector, contrasts) - _gain(matrix, vector, before)
-    sources = _Sources(templates, pixels, contrasts, flux, light, gain)
+    sources = replace(sources, contrasts=contrasts, light=light, gain=gain)
     _log.info("extended light: %s", sources)
     return sources
 
 
-def _positions(grid: Image, inner: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _positions(grid: Image, inner: float) -> Pixels:
     """Rows and columns of the pixels on which sources are."""
     # The last ones, too, because the light of a disk goes on beyond the frame.
     axes = (np.unique(np.append(np.arange(0, n, _SPACING), n - 1)) for n in grid.shape[:2])

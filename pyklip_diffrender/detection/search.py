@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from astropy.table import QTable
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender.detection.candidate_tables import measured_table
 from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
@@ -82,6 +82,7 @@ def detect(
     inner: float = 0.2,
     scatter: float | None = None,
     separations: ArrayLike | None = None,
+    without_limits: NDArray[np.bool_] | None = None,
     relinearise: float = 25.0,
     progress: bool = False,
 ) -> Detection:
@@ -105,6 +106,9 @@ def detect(
         share do not show in chi-squared.
     separations : array or Quantity, optional
         Separations of the contrast curve, arcsec. Default every 0.1 from 0.2 to the nearest edge.
+    without_limits : ndarray of bool, (ny, nx), optional
+        Pixels of the first frame that the contrast curve leaves out, see `Disk.hides_points`.
+        Separations of which no pixel is left have no row.
     relinearise : float
         S/N of a candidate above which the star is refined again with the candidates in the model,
         because bright sources bias the wavefront about which the model is linearised. Where a fit
@@ -120,7 +124,8 @@ def detect(
     ------
     IncompatibleSetupError
         For fits that failed or were read without their linear model, for fits of a reference
-        star only, or for a threshold or separation that is not positive.
+        star only, for a threshold or separation that is not positive, or if `without_limits` has
+        another shape than the first frame.
 
     Examples
     --------
@@ -136,6 +141,8 @@ def detect(
     fits = _checked(fits)
     inner = float(to_arcsec(inner, "inner"))
     require_positive(threshold=threshold, inner=inner, scatter=scatter)
+    if without_limits is not None:
+        _require_shape(np.shape(without_limits), fits[0].frames[0].grid.shape[:2])
 
     def look(fits: Sequence[Refinement], known: Candidates) -> _Outcome:
         maps = Maps(groups_of(fits), progress)
@@ -177,8 +184,11 @@ def detect(
     factors = factor.of(maps.grid)
     error = factors / np.sqrt(information)
     separations = curve_separations(maps.grid, separations)
+    has_limit = np.isfinite(error)
+    if without_limits is not None:
+        has_limit &= ~np.asarray(without_limits, dtype=bool)
     rings = [
-        np.array(ring)[:, np.isfinite(error[ring])]
+        np.array(ring)[:, has_limit[ring]]
         for ring in ring_pixels(maps.grid, separations, most=error.size)
     ]
     # The noise of fits that do not explain their data is not known.
@@ -208,6 +218,13 @@ def detect(
         ),
         grid=maps.grid,
     )
+
+
+def _require_shape(actual: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    if actual != expected:
+        raise IncompatibleSetupError(
+            f"without_limits: got the shape {actual}; expected that of the first frame, {expected}"
+        )
 
 
 def measure(

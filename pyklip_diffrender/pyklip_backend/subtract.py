@@ -207,7 +207,7 @@ def subtract_by_refinement(
         disk = fit_disk(result)
         result = disk.fit
         tell(f"{disk}: {_described(result)}")
-    elif observation.is_nircam if keep is None else keep:
+    if observation.is_nircam if keep is None else keep:
         result, error_factor = _with_companions(result, tell)
     star = np.full(observation.data.shape, np.nan)
     # It may have been refined again with companions.

@@ -46,7 +46,7 @@ class ReduceOptions:
         bright enough to be seen in these, the star is fitted once more without their light.
     disk : bool
         Fit extended light about the star, see `fit_disk`, and search the frames without it. The
-        extended light takes up planets, so that the limits do not exclude any.
+        limits are those of the positions where a planet would not be taken for a part of it.
     injections : int
         Number of planets to add to the fitted frames, slightly brighter than the limits, to see
         how well they are recovered; see `recover_planets`. Seven of them take as long as the

@@ -216,8 +216,8 @@ def _disk(summary: Mapping[str, Any]) -> str:
     return html.note(
         f"Altogether {scientific(disk['contrast'])} of the star's light, in {disk['sources']} "
         f"sources that lower chi-squared by {disk['chi2_decrease']:.0f}.{axis} The search and the "
-        "limits above are for frames without this light, which takes up most planets, and those of "
-        "a few times the limits too: they do not exclude planets."
+        "limits above are for frames without this light. The limits hold where a planet would not "
+        f"be taken for a part of it, in {100 * (1 - disk['hidden']):.0f} % of the field."
     )
 
 

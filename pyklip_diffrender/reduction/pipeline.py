@@ -12,6 +12,7 @@ from astropy.table import QTable
 
 from pyklip_diffrender.detection import (
     Detection,
+    Disk,
     completeness,
     detect,
     fit_disk,
@@ -197,7 +198,7 @@ class _Run:
                 disk = fit_disk(fit, progress=self.progress)
                 fit = disk.fit
         with stage("search"):
-            detection = self._search(fit)
+            detection = self._search(fit, disk)
             if options.wide:
                 wide = wide_field(detection, whole)
         cleaned = None if wide is None else wide.subtracted(whole, sequence.science)
@@ -208,7 +209,7 @@ class _Run:
                 wide = wide_field(detection, whole)
         if options.injections and len(detection.contrast_curve):
             with stage(f"{options.injections} injected planets"):
-                injections = self._inject(detection, choice)
+                injections = self._inject(detection, choice, disk)
         if options.completeness and len(detection.contrast_curve):
             with stage("completeness"):
                 fractions = completeness(detection, progress=self.progress)
@@ -245,17 +246,33 @@ class _Run:
         flux, error = to_jansky(options.star_flux), options.star_flux_error
         return with_star_flux(fit, flux, error, progress=self.progress)
 
-    def _search(self, fit: Refinement) -> Detection:
-        return detect(fit, threshold=self.preparation.options.threshold, progress=self.progress)
+    def _search(self, fit: Refinement, disk: Disk | None = None) -> Detection:
+        return detect(
+            fit,
+            threshold=self.preparation.options.threshold,
+            without_limits=None if disk is None else disk.hides_points,
+            progress=self.progress,
+        )
 
-    def _inject(self, detection: Detection, choice: PatternChoice) -> QTable | None:
+    def _inject(
+        self, detection: Detection, choice: PatternChoice, disk: Disk | None
+    ) -> QTable | None:
         """Measure injected planets; None, with a message, where that fails."""
+
+        def search(science: Iterable[Observation]) -> Detection:
+            if disk is None:
+                return self._search(self._fit(science, choice))
+            whole = [
+                replace(frame, data=frame.data + light)
+                for frame, light in zip(science, disk.light, strict=True)
+            ]
+            again = fit_disk(self._fit(whole, choice))
+            return self._search(again.fit, again)
+
+        hidden = None if disk is None else disk.hides_points
+        count = self.preparation.options.injections
         try:
-            return recover_planets(
-                detection,
-                self.preparation.options.injections,
-                lambda science: self._search(self._fit(science, choice)),
-            )
+            return recover_planets(detection, count, search, hidden)
         except DiffrenderError as error:  # The reduction is complete without it.
             _log.warning("no planets were injected: %s", error)
             return None

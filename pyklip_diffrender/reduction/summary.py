@@ -200,6 +200,7 @@ def _disk(disk: Disk) -> dict[str, Any]:
         "contrast": disk.contrast,
         "sources": len(disk.contrasts),
         "chi2_decrease": disk.gain,
+        "hidden": float(disk.hides_points.mean()),
         "position_angle_deg": disk.orientation,
     }
 
