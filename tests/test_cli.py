@@ -444,6 +444,9 @@ def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
     assert more["extended light, and wavefront without it"] > one
     eight = steps(twice, systematics="off", injections=8)
     assert eight["8 injected planets"] == 2 * sum(list(both.values())[:2])
+    both_kinds = steps(twice, systematics="off", injections=8, disk=True)
+    longer = both_kinds["8 injected planets"] - eight["8 injected planets"]
+    assert longer == pytest.approx(2 * more["extended light, and wavefront without it"])
     tied = steps(twice, systematics="off", star_flux=0.4)
     assert tied["wavefront"] == pytest.approx(1.6 * two)
     whole = steps(twice, systematics="off", wide=True)

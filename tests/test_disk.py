@@ -257,6 +257,9 @@ def test_limits_are_those_of_the_pixels_that_are_left() -> None:
     assert (half.contrast_curve["lowest"] >= whole.contrast_curve["lowest"]).all()
     assert (half.contrast_curve["lowest"] > whole.contrast_curve["lowest"]).any()
     np.testing.assert_array_equal(half.error, whole.error)
+    np.testing.assert_array_equal(half.has_limits, whole.has_limits & (grid[..., 0] >= 0))
+    table = dr.completeness(half, separations=[0.6], strengths=[3.0], angles=12)
+    assert 5 < table["planets"][0] < 8  # Two of twelve are on the edge.
     with pytest.raises(IncompatibleSetupError, match=r"without_limits: got the shape \(3,\)"):
         dr.detect(fit, without_limits=np.zeros(3, dtype=bool))
 

@@ -68,6 +68,7 @@ def searched(science: tuple[dr.Observation, ...] | None = None, **changes: Any) 
     curve = QTable({"separation": [0.2, 1.0] * u.arcsec, "small_sample": [2 * LIMIT, LIMIT]})
     changes.setdefault("candidates", table(np.zeros((0, 2)), []))
     values = {
+        "has_limits": np.isfinite(changes.get("snr", snr)),
         "fits": [SimpleNamespace(frames=[Frame(1.0), Frame(2.0)])],
         "grid": grid, "snr": snr, "north": NORTH, "contrast_curve": curve, "measure": measure,
         "sources": sources(changes["candidates"]), "error_factor": ErrorFactor.constant(1.0),
@@ -129,15 +130,15 @@ def test_planets_are_as_bright_as_stated_and_where_they_are_said_to_be(count: in
 
 def test_no_planet_is_where_extended_light_would_hide_it() -> None:
     """All but a quarter of the field is hidden."""
-    plain = searched()
-    hidden = (plain.grid[..., 0] < 0) | (plain.grid[..., 1] < 0)
+    grid = searched().grid
+    hidden = (grid[..., 0] < 0) | (grid[..., 1] < 0)
     images: list[np.ndarray] = []
 
     def search(science: tuple[dr.Observation, ...]) -> Any:
         images.append(science[0].data[0])
         return searched(science)
 
-    planets = recover_planets(plain, 5, search, hidden)
+    planets = recover_planets(searched(has_limits=~hidden), 5, search)
     assert len(planets) == 5
     assert sum(np.count_nonzero(each) for each in images) == 5
     assert not any(each[hidden].any() for each in images)

@@ -104,6 +104,7 @@ def _hdus_of(detection: Any) -> fits.HDUList:
                     ("FREEDOM", detection.error_factor.freedom),
                 )
             ),
+            image_hdu(np.asarray(detection.has_limits, dtype=float), "HAS_LIMITS", "", wcs),
             image_hdu(detection.grid[..., 0], "OFFSET_X", "arcsec", wcs),
             image_hdu(detection.grid[..., 1], "OFFSET_Y", "arcsec", wcs),
             *(
@@ -126,9 +127,10 @@ def _maps_of(hdus: fits.HDUList) -> dict[str, Any]:
     KeyError, ValueError
         If an extension is missing, or if not all images have the same shape.
     """
-    maps = {attribute: image(hdus, name, 0) for name, attribute in _MAPS.items()}
+    maps: dict[str, Any] = {attribute: image(hdus, name, 0) for name, attribute in _MAPS.items()}
     maps["grid"] = np.stack([image(hdus, "OFFSET_X", 0), image(hdus, "OFFSET_Y", 0)], axis=-1)
     factors, freedom = image(hdus, "ERROR_FACTOR", 0), image(hdus, "FREEDOM", 0)
+    maps["has_limits"] = image(hdus, "HAS_LIMITS", 0) > 0
     shapes = {each.shape[:2] for each in (*maps.values(), factors, freedom)}
     if len(shapes) > 1 or maps["snr"].ndim != 2:
         raise ValueError(f"maps have the shapes {sorted(shapes)}")

@@ -81,10 +81,7 @@ class MeasuredPlanet(NamedTuple):
 
 
 def recover_planets(
-    detection: Detection,
-    count: int,
-    search: Callable[[tuple[Observation, ...]], Detection],
-    hidden: NDArray[np.bool_] | None = None,
+    detection: Detection, count: int, search: Callable[[tuple[Observation, ...]], Detection]
 ) -> QTable:
     """Add planets to the frames of a detection and search them again.
 
@@ -98,8 +95,6 @@ def recover_planets(
         Number of planets.
     search : callable
         Fits and searches frames of the target as it was done for the detection.
-    hidden : ndarray of bool, (ny, nx), optional
-        Pixels of the first frame that get no planets, see `Disk.hides_points`.
 
     Returns
     -------
@@ -122,7 +117,7 @@ def recover_planets(
         )
         places = np.array(
             [
-                _free_place(detection, separation, _GOLDEN * k + _NEXT * trial, hidden)
+                _free_place(detection, separation, _GOLDEN * k + _NEXT * trial)
                 for k, separation in enumerate(separations)
             ]
         )
@@ -198,18 +193,13 @@ def measured_planet(detection: Detection, place: tuple[float, float]) -> Measure
     return MeasuredPlanet(contrast, error, snr, False)
 
 
-def _free_place(
-    detection: Detection, separation: float, angle: float, hidden: NDArray[np.bool_] | None = None
-) -> NDArray[np.float64]:
-    """x, y at a separation, where the map has a value that is not hidden and no candidate is near.
+def _free_place(detection: Detection, separation: float, angle: float) -> NDArray[np.float64]:
+    """x, y at a separation, where there are limits and no candidate is near.
 
     The first such place counter-clockwise from the angle; if there is none, that at the angle.
     """
     table = detection.candidates
     candidates = np.stack([table["x"].value, table["y"].value], axis=-1)
-    covered = np.isfinite(detection.snr)
-    if hidden is not None:
-        covered &= ~hidden
     turns = np.arange(0, 360, _STEP).tolist()
     circle: list[NDArray[np.float64]] = [
         np.array(Planet(1.0, separation, angle + turn).offset) for turn in turns
@@ -217,6 +207,6 @@ def _free_place(
     for place in circle:
         away = np.hypot(*np.moveaxis(detection.grid - place, -1, 0))
         nearest = np.unravel_index(away.argmin(), away.shape)
-        if covered[nearest] and (np.hypot(*(candidates - place).T) > CLEAR).all():
+        if detection.has_limits[nearest] and (np.hypot(*(candidates - place).T) > CLEAR).all():
             return place
     return circle[0]

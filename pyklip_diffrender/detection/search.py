@@ -184,11 +184,11 @@ def detect(
     factors = factor.of(maps.grid)
     error = factors / np.sqrt(information)
     separations = curve_separations(maps.grid, separations)
-    has_limit = np.isfinite(error)
+    has_limits = np.isfinite(error)
     if without_limits is not None:
-        has_limit &= ~np.asarray(without_limits, dtype=bool)
+        has_limits &= ~np.asarray(without_limits, dtype=bool)
     rings = [
-        np.array(ring)[:, has_limit[ring]]
+        np.array(ring)[:, has_limits[ring]]
         for ring in ring_pixels(maps.grid, separations, most=error.size)
     ]
     # The noise of fits that do not explain their data is not known.
@@ -216,6 +216,7 @@ def detect(
             factor,
             Sky.of(fits).star_jansky,
         ),
+        has_limits=has_limits,
         grid=maps.grid,
     )
 

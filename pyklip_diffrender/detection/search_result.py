@@ -85,6 +85,8 @@ class Detection:
         the S/N, ``error_factor.threshold(threshold, offsets)`` is that at a position.
     contrast_curve : QTable
         See `contrast.contrast_table`.
+    has_limits : ndarray of bool, (ny, nx)
+        Pixels whose limits are in the curve.
     grid : ndarray, (ny, nx, 2)
         x, y of the pixels from the star, arcsec.
     path : Path or None
@@ -118,6 +120,7 @@ class Detection:
     rings: QTable
     threshold: float
     contrast_curve: QTable
+    has_limits: NDArray[np.bool_]
     grid: Image
     path: Path | None = None
 

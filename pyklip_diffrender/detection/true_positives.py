@@ -56,9 +56,9 @@ def completeness(
 ) -> QTable:
     """Compute the fraction of planets that the search of a detection would find.
 
-    Planets are as bright as a grid of contrasts, one at a time, at places that do not overlap with
-    candidates. Their own photon noise is neglected, as is the change of the wavefront's
-    linearisation: both are small near the limit.
+    Planets are as bright as a grid of contrasts, one at a time, at places that have limits and do
+    not overlap with candidates. Their own photon noise is neglected, as is the change of the
+    wavefront's linearisation: both are small near the limit.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def completeness(
     curve = detection.contrast_curve
     limit_at, limits = curve["separation"].value, np.asarray(curve["small_sample"])
     chosen = limit_at[1::2] if separations is None else curve_separations(maps.grid, separations)
-    free = np.isfinite(detection.snr) & far_from(maps.grid, known.offsets, CLEAR)
+    free = detection.has_limits & far_from(maps.grid, known.offsets, CLEAR)
     places = [
         _free_places(maps.grid, free, separation, angles, _GOLDEN * n)
         for n, separation in enumerate(chosen)

@@ -269,10 +269,8 @@ class _Run:
             again = fit_disk(self._fit(whole, choice))
             return self._search(again.fit, again)
 
-        hidden = None if disk is None else disk.hides_points
-        count = self.preparation.options.injections
         try:
-            return recover_planets(detection, count, search, hidden)
+            return recover_planets(detection, self.preparation.options.injections, search)
         except DiffrenderError as error:  # The reduction is complete without it.
             _log.warning("no planets were injected: %s", error)
             return None
