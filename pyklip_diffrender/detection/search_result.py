@@ -325,6 +325,7 @@ class Detection:
           known star;
         - ERROR_FACTOR, FREEDOM: factor of the errors, and degrees of freedom of Student's t, which
           noise follows in units of these errors;
+        - HAS_LIMITS: 1 for the pixels whose limits are in the contrast curve, else 0;
         - OFFSET_X, OFFSET_Y: position of every pixel from the star, arcsec;
         - SUBTRACTED, numbered by EXTVER: each frame without its star, candidates preserved;
         - DATA, ERROR, VALID: the first frame, its integrations averaged;
