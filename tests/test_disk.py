@@ -13,6 +13,7 @@ import torch
 from astropy.io import fits as astropy_fits
 from astropy.wcs import WCS
 from matplotlib import pyplot
+from matplotlib.contour import ContourSet
 from scipy.optimize import nnls
 
 import pyklip_diffrender as dr
@@ -145,6 +146,12 @@ def test_products_and_refusals(tmp_path: Path) -> None:
         np.testing.assert_array_equal(hdus["SOURCES"].data["contrast"], lit.contrasts)
     axes = lit.plot()
     pyplot.close(axes[0].figure)
+    lines = [
+        sum(isinstance(each, ContourSet) for each in axes[1].collections)
+        for axes in (lit.plot(), replace(lit, hides_points=lit.grid[..., 0] > 0).plot())
+    ]
+    pyplot.close("all")
+    assert lines == [0, 1]
     assert [ax.get_title(loc="left") for ax in axes] == [
         "frames without the star",
         "extended light",

@@ -26,8 +26,8 @@ _DIRECTIONS = 12
 """Number of directions of lines, over half a turn."""
 
 _SHARE = 1 / 3
-"""Least share of the smoothed brightness that the opening keeps of extended light. It was 0.5 to 1
-along a simulated ring, and 0.2 between a source and the ring two lambda/D away."""
+"""Least share of the smoothed brightness that the opening keeps of extended light. It was at least
+0.41 for 95 % of the sources of a simulated ring, and at most 0.14 for planets 0.4 arcsec away."""
 
 _FAINTEST = 2.0
 _LEAST = 5.0

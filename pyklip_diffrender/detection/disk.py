@@ -117,6 +117,8 @@ class Disk:
     def plot(self, ax: Any = None) -> NDArray[Any]:
         """Draw the frames without the star, and the extended light in the first one.
 
+        A dashed line in the second encloses where a point source would count as extended light.
+
         Parameters
         ----------
         ax : two Axes, optional
@@ -135,6 +137,11 @@ class Disk:
             (axes[1], self.light[0], "extended light"),
         ):
             drawing.signed_image(each, image, self.grid, limit, bar=bar, title=title, north=north)
+        if self.hides_points.any():
+            axes[1].contour(
+                *np.moveaxis(self.grid, -1, 0), self.hides_points, levels=[0.5],
+                colors="0.3", linestyles="dashed", linewidths=1,
+            )  # fmt: skip
         return np.array(axes)
 
     @property

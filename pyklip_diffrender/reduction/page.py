@@ -217,7 +217,8 @@ def _disk(summary: Mapping[str, Any]) -> str:
         f"Altogether {scientific(disk['contrast'])} of the star's light, in {disk['sources']} "
         f"sources that lower chi-squared by {disk['chi2_decrease']:.0f}.{axis} The search and the "
         "limits above are for frames without this light. The limits hold where a planet would not "
-        f"be taken for a part of it, in {100 * (1 - disk['hidden']):.0f} % of the field."
+        f"be taken for a part of it, in {100 * (1 - disk['hidden']):.0f} % of the field: outside "
+        "the dashed line."
     )
 
 
