@@ -231,6 +231,17 @@ def test_planets_beside_a_ring_are_found_at_twice_the_limits() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("brightness", "count"), [(2e-5, 2), (1e-5, 2), (BRIGHTNESS, 1)])
+def test_clumps_of_faint_rings_and_of_single_rolls_are_no_planets(
+    brightness: float, count: int
+) -> None:
+    frames, rings = rolls(brightness)
+    disk = with_disk(frames[:count])
+    assert len(dr.detect(disk.fit).candidates) == 0
+    assert amount(disk.light[0], rings[0]) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.slow
 def test_a_planet_next_to_a_ring_counts_as_its_light_and_has_no_limit() -> None:
     _, disk = fitted()
     away = np.hypot(*np.moveaxis(disk.grid - (1.0, -0.35), -1, 0))
