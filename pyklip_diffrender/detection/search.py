@@ -107,8 +107,8 @@ def detect(
     separations : array or Quantity, optional
         Separations of the contrast curve, arcsec. Default every 0.1 from 0.2 to the nearest edge.
     without_limits : ndarray of bool, (ny, nx), optional
-        Pixels of the first frame that the contrast curve leaves out, see ``hides_points`` of `Disk`.
-        Separations of which no pixel is left have no row.
+        Pixels of the first frame that the contrast curve leaves out: see ``hides_points`` of
+        `Disk`. Separations of which no pixel is left have no row.
     relinearise : float
         S/N of a candidate above which the star is refined again with the candidates in the model,
         because bright sources bias the wavefront about which the model is linearised. Where a fit
