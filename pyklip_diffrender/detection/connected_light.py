@@ -26,9 +26,9 @@ _DIRECTIONS = 12
 """Number of directions of lines, over half a turn."""
 
 _SHARE = 0.18
-"""Least share of the smoothed brightness that the opening keeps of extended light. It was 0.21 to 1
-at the peaks of simulated rings and clouds of S/N 8 to 3800, which noise breaks up into clumps, and
-at most 0.16 for planets of S/N 13 and more 0.4 arcsec from a bright ring."""
+"""Least share of the smoothed brightness that the opening keeps of extended light. It was 0.21
+or more at the brightest peaks, of S/N 8 to 95, of simulated rings and clouds, which noise breaks up
+into clumps, and at most 0.16 for planets of S/N 13 and more 0.4 arcsec from a bright ring."""
 
 _FAINTEST = 1.0
 _LEAST = 3.0

@@ -31,7 +31,7 @@ from scipy.optimize import minimize
 from pyklip_diffrender.detection.combination import combine_frames
 from pyklip_diffrender.detection.connected_light import ConnectedLight
 from pyklip_diffrender.detection.disk import Disk
-from pyklip_diffrender.detection.field import Image, separation_of
+from pyklip_diffrender.detection.field import Image, pixel_width, separation_of
 from pyklip_diffrender.detection.groups import groups_of, has_only_reference_stars
 from pyklip_diffrender.detection.relinearise import without_light
 from pyklip_diffrender.detection.templates import Templates
@@ -213,8 +213,7 @@ class _Sources:
         grid = self.templates.grid
         snr = np.zeros(grid.shape[:2])
         snr[self.pixels] = self.contrasts / self.errors
-        pixel = float(np.hypot(*(grid[0, 1] - grid[0, 0])))
-        return ConnectedLight(snr, self.templates.fit.model.resolution / pixel)
+        return ConnectedLight(snr, self.templates.fit.model.resolution / pixel_width(grid))
 
     def __str__(self) -> str:
         return (

@@ -218,8 +218,8 @@ def _disk(summary: Mapping[str, Any]) -> str:
         f"sources that lower chi-squared by {disk['chi2_decrease']:.0f}.{axis} The search and the "
         "limits above are for frames without this light. The limits hold where a planet would not "
         f"be taken for a part of it, in {100 * (1 - disk['hidden']):.0f} % of the field: outside "
-        "the dashed line. Next to a bright disk, about a fifth of a planet's light is taken for "
-        "the disk's: contrasts are too low by that fraction."
+        "the dashed line. Next to the disk of AU Mic, a fifth of the light of injected planets was "
+        "taken for the disk's: contrasts next to a bright disk may be too low by as much."
     )
 
 
