@@ -79,11 +79,15 @@ def curve_of(
     science: list[FrameFit],
     references: list[FrameFit] | tuple[FrameFit, ...] = (),
     separations: Any = None,
+    hidden: Any = False,
 ) -> QTable:
-    """KLIP's curve for fitted frames, as if they had been searched."""
+    """KLIP's curve for fitted frames, as if they had been searched but where `hidden`."""
     curve = SimpleNamespace(meta={"resolution_arcsec": RESOLUTION})
     searched: Any = SimpleNamespace(
-        fits=(SimpleNamespace(frames=tuple(science)),), contrast_curve=curve
+        fits=(SimpleNamespace(frames=tuple(science)),),
+        contrast_curve=curve,
+        grid=science[0].grid,
+        has_limits=~np.broadcast_to(hidden, science[0].grid.shape[:2]),
     )
     return klip_curve(searched, [each.observation for each in references], separations)
 
@@ -145,6 +149,27 @@ def test_companions_of_the_fit_are_not_noise() -> None:
         known.append(replace(each, observation=observation, companion_image=planet))
     curve = curve_of(known, references, SEPARATIONS)
     assert curve["contrast"] == pytest.approx(quiet(), rel=1e-6)
+
+
+def test_noise_is_that_of_the_places_that_have_limits() -> None:
+    """A bright source of which the search knows nothing is on one side of the star."""
+    science, references = frames()
+    grid = science[0].grid
+    bright = np.exp(-((grid - [0.5, 0.0]) ** 2).sum(axis=-1) / 0.01)
+    lit = [
+        replace(
+            each,
+            observation=replace(each.observation, data=each.observation.data + 1e4 * bright),
+        )
+        for each in science
+    ]
+    worse = curve_of(lit, references, SEPARATIONS)["contrast"]
+    assert (worse > 2 * quiet()).any()
+    spared = curve_of(lit, references, SEPARATIONS, grid[..., 0] > -0.1)["contrast"]
+    assert (spared < 0.5 * worse).any()
+    # A ring without such places has no limit.
+    inner = curve_of(*frames(), SEPARATIONS, np.hypot(*np.moveaxis(grid, -1, 0)) < 0.6)
+    assert np.isnan(inner["contrast"]).tolist() == [True, False]
 
 
 def test_two_rolls_alone_and_masked_pixels() -> None:

@@ -199,12 +199,24 @@ def test_a_planet_is_its_candidate_or_what_is_measured_at_its_place(
         dr.Observation.from_arrays(k * data, np.ones_like(data), pixelscale=PIXEL) for k in (1, 2)
     )
     candidates = table(np.array([[1.0, 1.0], np.add(place, away)]), [1e-3, 7e-4])
-    measured = measured_planet(searched(frames, candidates=candidates), place)
+    # The star of the search has a flux of 1.
+    measured = measured_planet(searched(frames, candidates=candidates), place, 0.8)
     contrast, error, detected = expected
-    assert (measured.contrast, measured.detected) == (pytest.approx(contrast), detected)
+    assert (0.8 * measured.contrast, measured.detected) == (pytest.approx(contrast), detected)
     # Noise alone, without what the table's error has of the star's flux.
-    assert measured.contrast_error == pytest.approx(error * 0.1 * LIMIT)
+    assert 0.8 * measured.contrast_error == pytest.approx(error * 0.1 * LIMIT)
     assert measured.snr == pytest.approx(10 * contrast / LIMIT)
+
+
+def test_recovered_contrasts_are_relative_to_the_star_of_the_injection() -> None:
+    """Though the star is twice as bright in the fit of the frames with planets."""
+
+    def search(science: tuple[dr.Observation, ...]) -> Any:
+        brighter = SimpleNamespace(frames=[Frame(2.0), Frame(4.0)])
+        return searched(science, fits=[brighter])
+
+    planets = recover_planets(searched(), 2, search)
+    np.testing.assert_allclose(planets["contrast"], 2 * planets["injected"])
 
 
 def covered(keep: Callable[[Any, Any], Any]) -> Any:

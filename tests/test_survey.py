@@ -809,17 +809,19 @@ def test_what_is_recovered_is_the_candidate_at_the_place() -> None:
             np.testing.assert_allclose(offsets, [[x, y]])
             return QTable({"contrast": [4.5e-5], "contrast_error": [2e-5], "snr": [4.5]})
 
+        star = SimpleNamespace(frames=[SimpleNamespace(flux=3.0)])
         detection = SimpleNamespace(
-            north=20.0, sources=sources, error_factor=ErrorFactor.constant(1.0), measure=measure
-        )
+            north=20.0, sources=sources, error_factor=ErrorFactor.constant(1.0), measure=measure,
+            fits=[star],
+        )  # fmt: skip
         return SimpleNamespace(detection=detection)
 
     other = (0.5, 0.5, 7e-5)
-    recovered = work._recovered(searched(other, (x + 0.03, y, 9e-5)), planet)
-    expected = {"contrast": 9e-5, "contrast_error": 1e-5, "snr": 9.0, "detected": True}
+    recovered = work._recovered(searched(other, (x + 0.03, y, 9e-5)), planet, 2.0)
+    expected = {"contrast": 1.35e-4, "contrast_error": 1.5e-5, "snr": 9.0, "detected": True}
     assert recovered == pytest.approx(expected)
     for rows in ((other,), ()):
-        recovered = work._recovered(searched(*rows), planet)
+        recovered = work._recovered(searched(*rows), planet, 3.0)
         assert (recovered["snr"], recovered["detected"]) == (4.5, False)
 
 

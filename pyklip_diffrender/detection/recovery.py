@@ -68,7 +68,7 @@ class MeasuredPlanet(NamedTuple):
     contrast : float
         Of the candidate within 0.1 arcsec, or else measured at the place of the planet.
     contrast_error : float
-        Without that of the star's flux, which is the unit of injected planets, too.
+        Without that of the star's flux.
     snr : float
     detected : bool
         Whether there is such a candidate.
@@ -86,7 +86,9 @@ def recover_planets(
     """Add planets to the frames of a detection and search them again.
 
     The planets are spread over all separations and angles, up to seven at a time, and are 1.6 times
-    as bright as the limit with the small-sample correction at their separations.
+    as bright as the limit with the small-sample correction at their separations. Their contrasts,
+    injected and measured, are relative to the star of the detection: how bright the star is in the
+    fit of the frames with planets, which may differ by several per cent, does not matter.
 
     Parameters
     ----------
@@ -128,7 +130,7 @@ def recover_planets(
         again = search(with_planets(frames, injected))
         for planet in injected:
             angle = full_circle(planet.position_angle + detection.north)
-            measured = measured_planet(again, planet.offset)
+            measured = measured_planet(again, planet.offset, frames[0].flux)
             planets.add_row((planet.separation, angle, planet.contrast, *measured))
     for name, unit in _UNITS.items():
         planets[name] = planets[name] * unit
@@ -166,7 +168,9 @@ def with_planets(frames: Sequence[FrameFit], planets: Sequence[Planet]) -> tuple
     return tuple(science)
 
 
-def measured_planet(detection: Detection, place: tuple[float, float]) -> MeasuredPlanet:
+def measured_planet(
+    detection: Detection, place: tuple[float, float], flux: float
+) -> MeasuredPlanet:
     """Measure a planet of which the position is known.
 
     Parameters
@@ -174,23 +178,26 @@ def measured_planet(detection: Detection, place: tuple[float, float]) -> Measure
     detection : Detection
     place : (float, float)
         x, y from the star in the first frame, arcsec.
+    flux : float
+        Of the star to which the contrast is relative, in the unit of `FrameFit.flux`: of an
+        injected planet, that of the fit with which it was rendered.
 
     Returns
     -------
     MeasuredPlanet
     """
     sources, factor = detection.sources, detection.error_factor
+    unit = detection.fits[0].frames[0].flux / flux
     distances = np.hypot(*(sources.offsets.numpy() - place).T)
     if len(sources) and distances.min() < _SAME:
         k = int(distances.argmin())
         error = float(factor.of(sources.offsets)[k] * sources.errors[k, 0])
-        return MeasuredPlanet(
-            float(sources.contrasts[k]), error, float(sources.snr(factor)[k]), True
-        )
+        contrast = float(sources.contrasts[k])
+        return MeasuredPlanet(unit * contrast, unit * error, float(sources.snr(factor)[k]), True)
     row = detection.measure([place])[0]
     contrast, snr = float(row["contrast"]), float(row["snr"])
     error = contrast / snr if snr else float(row["contrast_error"])
-    return MeasuredPlanet(contrast, error, snr, False)
+    return MeasuredPlanet(unit * contrast, unit * error, snr, False)
 
 
 def _free_place(detection: Detection, separation: float, angle: float) -> NDArray[np.float64]:

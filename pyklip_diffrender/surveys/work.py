@@ -45,7 +45,7 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
     write_products(reduction, folder, fit=job.injection is None)
     result = _result(summarise(reduction))
     if job.injection is not None and job.base is not None:
-        result["recovered"] = _recovered(reduction, job.injection)
+        result["recovered"] = _recovered(reduction, job.injection, frames[0].flux)
     return result
 
 
@@ -76,10 +76,14 @@ def _planet(injection: Injection, north: float) -> Planet:
     return Planet(injection.contrast, injection.separation, injection.angle - north)
 
 
-def _recovered(reduction: Reduction, planet: Injection) -> dict[str, Any]:
-    """Measure an injected planet: its candidate, or else the position of the injection."""
-    found = reduction.detection
-    measured = measured_planet(found, _planet(planet, found.north).offset)._asdict()
+def _recovered(reduction: Reduction, planet: Injection, flux: float) -> dict[str, Any]:
+    """Measure an injected planet: its candidate, or else the position of the injection.
+
+    Its contrast is relative to a star of that flux.
+    """
+    detection = reduction.detection
+    place = _planet(planet, detection.north).offset
+    measured = measured_planet(detection, place, flux)._asdict()
     return {key: value if math.isfinite(value) else None for key, value in measured.items()}
 
 

@@ -21,6 +21,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
 from pyklip_diffrender.detection import Detection
+from pyklip_diffrender.detection.field import pixels_of
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.units import to_arcsec
@@ -69,8 +70,9 @@ def klip_curve(
     Every roll is projected onto the Karhunen-Loeve modes of the other rolls and all frames of
     reference stars. The residuals are turned to the orientation of the first roll, averaged and
     smoothed with the image of a planet. The noise is the standard deviation in a ring of width
-    lambda/D, the throughput that of injected planets, and the number of modes at every separation
-    that with the best limit. Companions that are part of the fit are subtracted first.
+    lambda/D where the detection has limits, the throughput that of injected planets, and the number
+    of modes at every separation that with the best limit. Companions that are part of the fit are
+    subtracted first.
 
     Parameters
     ----------
@@ -85,7 +87,8 @@ def klip_curve(
     Returns
     -------
     QTable
-        Columns separation; contrast, NaN where no light of a planet is left; contrast with the
+        Columns separation; contrast, NaN where no light of a planet is left or the detection has no
+        limits; contrast with the
         small-sample correction; number of modes; throughput, the fraction of a planet's image
         behind the mask that is left. The first columns have the names of those of
         `Detection.contrast_curve`; ``meta["label"]`` says how the star was subtracted.
@@ -109,8 +112,12 @@ def klip_curve(
             f"separations: got none within {edge:.3g} arcsec, where rings are complete"
         )
     plain = klip.images(klip.science)
-    rings = [np.abs(klip.distance - each) < resolution / 2 for each in separations]
-    noise = np.array([[image[ring].std() for ring in rings] for image in plain])
+    has_limits = _has_limits(detection, klip.grid)
+    rings = [has_limits & (np.abs(klip.distance - each) < resolution / 2) for each in separations]
+    # No pixels, no noise, as in a ring inside KLIP's mask.
+    noise = np.array(
+        [[image[ring].std() if ring.any() else 0.0 for ring in rings] for image in plain]
+    )
     # So faint that the modes hardly change.
     contrasts = _SIGMAS * noise.min(axis=0) / klip.norm
     response, alone = np.zeros_like(noise), np.zeros(len(separations))
@@ -147,6 +154,15 @@ def klip_curve(
     for name, form in formats.items():
         table[name].info.format = form
     return table
+
+
+def _has_limits(detection: Detection, grid: Image) -> NDArray[np.bool_]:
+    """Where a detection has limits, on another grid, (ny, nx)."""
+    nearest = np.rint(pixels_of(detection.grid, grid)).astype(int)
+    columns, rows = np.moveaxis(nearest, -1, 0)
+    ny, nx = detection.has_limits.shape
+    inside = (rows >= 0) & (rows < ny) & (columns >= 0) & (columns < nx)
+    return inside & detection.has_limits[rows.clip(0, ny - 1), columns.clip(0, nx - 1)]
 
 
 def klip_image(
