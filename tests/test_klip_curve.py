@@ -155,7 +155,7 @@ def test_noise_is_that_of_the_places_that_have_limits() -> None:
     """A bright source of which the search knows nothing is on one side of the star."""
     science, references = frames()
     grid = science[0].grid
-    bright = np.exp(-((grid - [0.5, 0.0]) ** 2).sum(axis=-1) / 0.01)
+    bright = np.exp(-((grid - [0.45, -0.25]) ** 2).sum(axis=-1) / 0.01)
     lit = [
         replace(
             each,
