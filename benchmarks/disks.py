@@ -7,9 +7,8 @@ Run from the root of the project, with the frames of programme 1184 in ../shared
 It fits the edge-on disk of AU Mic with `reduce(disk=True)`, and subtracts the star with KLIP
 (ADI+RDI: the other roll and four frames of two other stars). It prints the 5-sigma limits of both
 for point sources where these would not count as the disk's light, KLIP's for frames from which the
-fitted disk was subtracted. Then it injects the
-sources of this disk into the frames of HIP 17695, which has none, and prints how much of that known
-light each keeps.
+fitted disk was subtracted. Then it injects the sources of this disk into the frames of HIP 17695,
+which has none, and prints how much of that known light each keeps.
 """
 
 from __future__ import annotations

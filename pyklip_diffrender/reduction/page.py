@@ -219,8 +219,8 @@ def _disk(summary: Mapping[str, Any]) -> str:
         "limits above are for frames without this light. The limits hold where a planet would not "
         f"be taken for a part of it, in {100 * (1 - disk['hidden']):.0f} % of the field: outside "
         "the dashed line. Of twelve planets of twice the limits that were injected next to AU "
-        "Mic's disk, ten were found, with 0.8 to 1.2 times their light; the disk took half or more "
-        "of the light of the other two."
+        "Mic's disk, ten were found, with 0.8 to 1.2 times their light; the other two had half of "
+        "it and less."
     )
 
 

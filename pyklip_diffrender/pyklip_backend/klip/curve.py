@@ -88,10 +88,9 @@ def klip_curve(
     -------
     QTable
         Columns separation; contrast, NaN where no light of a planet is left or the detection has no
-        limits; contrast with the
-        small-sample correction; number of modes; throughput, the fraction of a planet's image
-        behind the mask that is left. The first columns have the names of those of
-        `Detection.contrast_curve`; ``meta["label"]`` says how the star was subtracted.
+        limits; contrast with the small-sample correction; number of modes; throughput, the fraction
+        of a planet's image behind the mask that is left. The first columns have the names of those
+        of `Detection.contrast_curve`; ``meta["label"]`` says how the star was subtracted.
 
     Raises
     ------
