@@ -124,7 +124,7 @@ def test_companions_are_taken_from_all_frames() -> None:
     start = {"flux": torch.tensor([2e5])}
     planets = [dr.Planet.from_offset(contrast, 0.4, 0.3) for contrast in (0.1, 0.2, 0.3)]
     frames = tuple(FrameUnknowns(("flux",), start, modes=2, amplitude_modes=1) for _ in range(2))
-    unknowns = Unknowns(frames, own=("flux",), drift=1)
+    unknowns = Unknowns(frames, own=("flux",), drift=1, blocks=((0,), (1,)))
     vector = torch.arange(unknowns.size, dtype=torch.float64)
     more, longer = unknowns.with_companions(planets, vector)
     fewer, shorter = more.without_companions(torch.tensor([True, False, True]), longer)

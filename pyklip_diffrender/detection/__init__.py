@@ -15,6 +15,7 @@ from pyklip_diffrender.detection.disk import Disk
 from pyklip_diffrender.detection.disk_fit import fit_disk
 from pyklip_diffrender.detection.figure import draw_curve, draw_search
 from pyklip_diffrender.detection.recovery import measured_planet, recover_planets, with_planets
+from pyklip_diffrender.detection.reference_stars import sources_of_references
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.true_positives import completeness, contrast_of_completeness
@@ -39,6 +40,7 @@ __all__ = [
     "measured_planet",
     "recover_planets",
     "require_outer_pixels",
+    "sources_of_references",
     "wide_field",
     "with_planets",
 ]

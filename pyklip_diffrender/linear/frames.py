@@ -24,7 +24,7 @@ class Unknown(NamedTuple):
     component : int
         Index within that parameter.
     frame : int
-        The frame whose own value it is; -1 if all frames share it.
+        The frame whose own value it is, or the block of drift; -1 if all frames share it.
     """
 
     name: str
@@ -44,9 +44,10 @@ class FrameRows:
     ----------
     rows : Tensor, (rows,), int64
         Index of the unknown that each row belongs to.
-    drift : Tensor, (some,), int64
+    drift : Tensor, (blocks, some), int64
         Indices of the unknowns by which the leading wavefront modes of this frame differ from
-        those of the other frames.
+        those that all frames share. One block may be the frame's own, and another one that of its
+        exposure sequence.
     first_mode : int
         Index of the first wavefront mode among the rows.
     """
@@ -59,13 +60,16 @@ class FrameRows:
         """Sum values by row, (rows, k), to values by unknown, (size, k)."""
         total = torch.zeros(size, *on_rows.shape[1:], dtype=on_rows.dtype)
         total.index_add_(0, self.rows, on_rows)
-        count = len(self.drift)
-        return total.index_add_(0, self.drift, on_rows[self.first_mode : self.first_mode + count])
+        leading = on_rows[self.first_mode : self.first_mode + self.drift.shape[-1]]
+        for block in self.drift:
+            total.index_add_(0, block, leading)
+        return total
 
     def of_unknowns(self, values: Tensor) -> Tensor:
         """Values by row from values by unknown; the adjoint of `onto_unknowns`."""
         rows = values[self.rows]
-        rows[self.first_mode : self.first_mode + len(self.drift)] += values[self.drift]
+        for block in self.drift:
+            rows[self.first_mode : self.first_mode + len(block)] += values[block]
         return rows
 
 

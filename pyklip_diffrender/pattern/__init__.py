@@ -11,6 +11,8 @@ from pyklip_diffrender.pattern.choice import (
     ReferenceFrames,
     as_request,
     choose_systematics,
+    pattern_for_visit,
+    with_known_pattern,
 )
 from pyklip_diffrender.pattern.fit import fit_with_pattern
 from pyklip_diffrender.pattern.learn import learn_library
@@ -47,7 +49,9 @@ __all__ = [
     "learn_systematics",
     "measure_patterns",
     "package_library",
+    "pattern_for_visit",
     "pattern_pedestal",
     "pattern_size",
     "place_on_detector",
+    "with_known_pattern",
 ]

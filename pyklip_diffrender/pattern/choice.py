@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -14,6 +14,7 @@ from astropy import units as u
 
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.io.names import same_name
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern.library import (
@@ -22,6 +23,7 @@ from pyklip_diffrender.pattern.library import (
     known_systematics,
     package_library,
 )
+from pyklip_diffrender.pattern.measure import flat_of
 from pyklip_diffrender.pattern.placement import place_on_detector
 from pyklip_diffrender.pattern.presence import lacks_pattern
 from pyklip_diffrender.refinement.fit_result import Refinement
@@ -44,7 +46,7 @@ PatternRequest: TypeAlias = Systematics | PatternLibrary | Literal["auto", "refe
 ReferenceFrames: TypeAlias = Sequence[Observation] | Callable[[], Sequence[Observation]]
 """Frames of reference stars, or a function that reads them where they are needed."""
 
-Origin: TypeAlias = Literal["none", "given", "library", "references", "rolls"]
+Origin: TypeAlias = Literal["none", "off", "given", "library", "references", "rolls"]
 
 _log = logging.getLogger(__name__)
 
@@ -87,10 +89,12 @@ class PatternChoice:
         One for each reference star that was fitted.
     failed : tuple of (str, str)
         Reference stars that could not be fitted, and why.
-    origin : {"none", "given", "library", "references", "rolls"}
-        Where the pattern comes from: nowhere, from the caller, from libraries alone,
-        from reference stars (and the library), or from the rolls, which share a pattern of which
-        only the size is known.
+    origin : {"none", "off", "given", "library", "references", "rolls"}
+        Where the pattern comes from: nowhere, because none is known or none was wanted; from the
+        caller, from libraries alone, from reference stars (and the library), or from the rolls,
+        which share a pattern of which only the size is known.
+    library : PatternLibrary
+        The library that was searched.
     """
 
     science: tuple[Observation, ...]
@@ -99,6 +103,7 @@ class PatternChoice:
     references: tuple[Refinement, ...] = ()
     failed: tuple[tuple[str, str], ...] = ()
     origin: Origin = "none"
+    library: PatternLibrary = field(default_factory=PatternLibrary)
 
     @property
     def label(self) -> str:
@@ -120,6 +125,17 @@ class PatternChoice:
         if self.systematics is None:
             return 0
         return sum(len(frame.observation) for fit in self.references for frame in fit.frames)
+
+    @property
+    def has_other_flat_field(self) -> bool:
+        """Whether the frames were calibrated with another flat field than those of the library.
+
+        They may show its pattern nevertheless, or the headers may not say.
+        """
+        if self.origin != "library":
+            return False
+        own, known = flat_of(self.science[0]), self.library.matching(self.science[0])
+        return own is None or any(pattern.flat != own for pattern in known)
 
     def is_refuted_by(self, fit: Refinement) -> bool:
         """Return True if a fit shows less than half of the library's pattern.
@@ -211,6 +227,9 @@ def choose_systematics(
     failed: list[tuple[str, str]] = []
     pattern = systematics if isinstance(systematics, Systematics) else None
     origin: Origin = "none" if pattern is None else "given"
+    known = PatternLibrary()
+    if systematics == "off":
+        origin = "off"
     if systematics != "off" and not isinstance(systematics, Systematics):
         first = science[0]
         known = _library(systematics) if library else PatternLibrary()
@@ -233,7 +252,50 @@ def choose_systematics(
     if pattern is not None and settings is None and science[0].is_nircam:
         settings = replace(settings_for(science[0]), min_model_error=_KNOWN_MODEL_ERROR)
     settings = _limited(settings, science[0], memory)
-    return PatternChoice(tuple(science), pattern, settings, tuple(fits), tuple(failed), origin)
+    return PatternChoice(
+        tuple(science), pattern, settings, tuple(fits), tuple(failed), origin, known
+    )
+
+
+def pattern_for_visit(
+    choice: PatternChoice, science: Sequence[Observation], references: Sequence[Observation]
+) -> Systematics | None:
+    """The flat-field pattern for a fit of all frames of a visit.
+
+    A pattern that was learned from one of these stars would count its frames twice, and patterns
+    of other stars are taken instead. Where there are none, frames that show the same pixels of the
+    detector share a pattern of which only the size is known.
+
+    Parameters
+    ----------
+    choice : PatternChoice
+        That of the target's own fit.
+    science, references : sequence of Observation
+    """
+    if choice.origin in ("off", "given"):
+        return choice.systematics
+    if choice.origin == "library":
+        own = {each.target for each in references}
+        patterns = [
+            pattern
+            for pattern in choice.library.patterns
+            if not any(same_name(pattern.star, star) for star in own)
+        ]
+        known = known_systematics(science[0], library=PatternLibrary(tuple(patterns)))
+        if known is not None:
+            return known
+    first = science[0]
+    alike = [
+        each
+        for each in references
+        if each.first_pixel == first.first_pixel and each.shape == first.shape
+    ]
+    return _unknown_pattern([*science, *alike])
+
+
+def with_known_pattern(settings: GaussNewton) -> GaussNewton:
+    """Settings of a fit whose flat-field pattern accounts for the largest part of its error."""
+    return replace(settings, min_model_error=min(settings.min_model_error, _KNOWN_MODEL_ERROR))
 
 
 def _library(systematics: PatternLibrary | str) -> PatternLibrary:
@@ -323,10 +385,31 @@ def _rough_fit(
     *,
     settings: GaussNewton | None,
     progress: bool,
+    systematics: Systematics | None = None,
 ) -> Refinement:
     """Fit until the pattern dominates the residual."""
     settings = replace(settings or settings_for(observation), **_ROUGH)
-    return refine(model, observation, opd, settings=settings, progress=progress)
+    return refine(
+        model, observation, opd, settings=settings, systematics=systematics, progress=progress
+    )
+
+
+def is_refuted_by_first_frame(
+    choice: PatternChoice, model: OpticalSystem, opd: OPDMap, *, progress: bool = False
+) -> bool:
+    """Whether the first frame alone shows less than half of the library's pattern.
+
+    Its rough fit takes a tenth of the time of a fit of two rolls, which need not be repeated then.
+    """
+    rough = _rough_fit(
+        model,
+        choice.science[0],
+        opd,
+        settings=choice.settings,
+        progress=progress,
+        systematics=choice.systematics,
+    )
+    return rough.status.usable and choice.is_refuted_by(rough)
 
 
 def _by_star(observations: Iterable[Observation]) -> dict[str, list[Observation]]:

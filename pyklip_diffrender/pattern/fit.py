@@ -5,8 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.pattern.choice import PatternChoice, ReferenceFrames, choose_systematics
+from pyklip_diffrender.pattern.choice import (
+    PatternChoice,
+    ReferenceFrames,
+    choose_systematics,
+    is_refuted_by_first_frame,
+)
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.opd import OPDMap
@@ -48,6 +54,11 @@ def fit_with_pattern(
         As `choose_systematics` and `fit`.
     """
     choice = choose_systematics(science, references, model, opd, **options)
+    if choice.has_other_flat_field:
+        with stage("pattern of the library in the first frame"):
+            is_refuted = is_refuted_by_first_frame(choice, model, opd)
+        if is_refuted:
+            choice = choose_systematics(science, references, model, opd, library=False, **options)
     result = fit(choice, False)
     if choice.is_refuted_by(result):
         choice = choose_systematics(science, references, model, opd, library=False, **options)

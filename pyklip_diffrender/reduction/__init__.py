@@ -15,13 +15,16 @@ from pyklip_diffrender.reduction.several import (
     write_comparison,
 )
 from pyklip_diffrender.reduction.summary import summarise
+from pyklip_diffrender.reduction.visit import Contribution, Visit
 
 __all__ = [
     "COMPARISON",
     "PRODUCTS",
+    "Contribution",
     "Preparation",
     "ReduceOptions",
     "Reduction",
+    "Visit",
     "compare_reductions",
     "existing_products",
     "prepare",

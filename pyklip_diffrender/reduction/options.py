@@ -17,6 +17,8 @@ from pyklip_diffrender.refinement import GaussNewton, to_jansky
 
 __all__ = ["ReduceOptions"]
 
+_REFERENCES = ("joint", "pattern", "off")
+
 _SMALLEST = 8
 """Side of the smallest fitted square, pixels."""
 
@@ -37,6 +39,11 @@ class ReduceOptions:
         shows less than half of a library's pattern is repeated without libraries. Where nothing is
         known, rolls of the same pixels share a pattern of which only the size is known. With "off"
         there is no pattern.
+    references : {"joint", "pattern", "off"}
+        What the frames of reference stars are for. With "joint" they are fitted together with the
+        target's, in one likelihood, if that makes the limits deeper; with "pattern" they teach the
+        flat-field pattern where the library has none; with "off" they are not used. With `disk`,
+        "joint" stands for "pattern".
     settings : GaussNewton, optional
         Settings of the fits; default those of `refine`.
     threshold : float
@@ -95,6 +102,7 @@ class ReduceOptions:
 
     size: int = 80
     systematics: PatternRequest | str | os.PathLike[str] = "auto"
+    references: str = "joint"
     settings: GaussNewton | None = None
     threshold: float = 5.0
     wide: bool = False
@@ -108,6 +116,10 @@ class ReduceOptions:
 
     def __post_init__(self) -> None:
         _require_whole(self.size, "size", _SMALLEST)
+        if self.references not in _REFERENCES:
+            raise IncompatibleSetupError(
+                f"references: got {self.references!r}, expected one of {', '.join(_REFERENCES)}"
+            )
         _require_whole(self.injections, "injections", 0)
         require_bound(self.threshold, "threshold", "positive")
         require_bound(self.star_flux_error, "star_flux_error", "positive")

@@ -22,10 +22,12 @@ from pyklip_diffrender.detection import (
 )
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.progress import numbered_stages, stage
+from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern import PatternChoice, fit_with_pattern
 from pyklip_diffrender.reduction.options import ReduceOptions
 from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.visit import Visit, with_references
 from pyklip_diffrender.refinement import (
     Refinement,
     refine,
@@ -180,9 +182,11 @@ class _Run:
 
     def result(self) -> Reduction:
         options, whole = self.preparation.options, self.preparation.whole.science
+        for_pattern = options.references == "pattern" or options.systematics == "references"
+        for_pattern = for_pattern or (options.disk and options.references == "joint")
         choice, fit = fit_with_pattern(
             self.preparation.sequence.science,
-            self.preparation.sequence.references,
+            self.preparation.sequence.references if for_pattern else (),
             self.preparation.model,
             self.preparation.wavefront,
             self._first_fit,
@@ -191,6 +195,7 @@ class _Run:
             memory=options.memory,
             progress=self.progress,
         )
+        fit, visit = self._with_references(fit, choice)
         sequence = replace(self.preparation.sequence, science=choice.science)
         disk = wide = injections = fractions = None
         if options.disk:
@@ -204,7 +209,7 @@ class _Run:
         cleaned = None if wide is None else wide.subtracted(whole, sequence.science)
         if cleaned is not None:
             with stage("star and search without the light of sources beyond the fitted pixels"):
-                fit = self._fit(cleaned, choice)
+                fit, visit = self._with_references(self._fit(cleaned, choice), choice)
                 detection = self._search(fit)
                 wide = wide_field(detection, whole)
         if options.injections and len(detection.contrast_curve):
@@ -220,6 +225,7 @@ class _Run:
             choice.references,
             choice.systematics,
             choice.failed,
+            visit,
             wide,
             disk,
             injections,
@@ -246,6 +252,20 @@ class _Run:
         flux, error = to_jansky(options.star_flux), options.star_flux_error
         return with_star_flux(fit, flux, error, progress=self.progress)
 
+    def _with_references(self, fit: Refinement, choice: PatternChoice) -> tuple[Refinement, Visit]:
+        """Fit target and reference stars together, if the options ask for it."""
+        options = self.preparation.options
+        # The light of a disk would have to be told from the wavefront of other stars first.
+        if options.references != "joint" or options.disk:
+            return fit, Visit()
+        return with_references(
+            fit,
+            choice,
+            self.preparation.sequence.references,
+            memory=None if options.memory is None else to_bytes(options.memory, "memory"),
+            progress=self.progress,
+        )
+
     def _search(self, fit: Refinement, disk: Disk | None = None) -> Detection:
         return detect(
             fit,
@@ -261,7 +281,7 @@ class _Run:
 
         def search(science: Iterable[Observation]) -> Detection:
             if disk is None:
-                return self._search(self._fit(science, choice))
+                return self._search(self._with_references(self._fit(science, choice), choice)[0])
             whole = [
                 replace(frame, data=frame.data + light)
                 for frame, light in zip(science, disk.light, strict=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from pyklip_diffrender.detection import Detection, Disk, WideField
 from pyklip_diffrender.io.files import require_new
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.reduction.extended import looks_extended, on_extended_light
+from pyklip_diffrender.reduction.visit import Visit
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.systematics import Systematics
@@ -45,6 +46,8 @@ class Reduction:
         The flat-field pattern that was used.
     failed : tuple of (str, str)
         Reference stars that could not be fitted, and why.
+    visit : Visit
+        What every frame of a reference star has contributed to the fit of the target.
     wide : WideField or None
         The search of the whole frames, if it was asked for.
     disk : Disk or None
@@ -70,6 +73,7 @@ class Reduction:
     references: tuple[Refinement, ...] = ()
     systematics: Systematics | None = None
     failed: tuple[tuple[str, str], ...] = ()
+    visit: Visit = field(default_factory=Visit)
     wide: WideField | None = None
     disk: Disk | None = None
     injections: QTable | None = None

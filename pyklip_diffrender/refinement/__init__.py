@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pyklip_diffrender.refinement.continuation import refine_again
+from pyklip_diffrender.refinement.continuation import join_frames, refine_again
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.flux_scale import (
@@ -22,6 +22,7 @@ __all__ = [
     "Refinement",
     "Status",
     "jansky_per_unit",
+    "join_frames",
     "nircam_settings",
     "refine",
     "refine_again",

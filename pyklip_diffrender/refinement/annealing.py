@@ -100,6 +100,12 @@ _WIDENINGS = 3
 """Largest number of times that a prior is widened. Two rolls of HIP 17695 in F444W needed two."""
 
 
+_DRIFT_ROUNDS = 3
+_SAME_DRIFT = 0.15
+"""Largest number of times that the size of the drift is measured, and the relative change of it
+below which it is known."""
+
+
 class Annealing:
     """One fit with a given basis.
 
@@ -262,6 +268,8 @@ class Annealing:
     def _finish(self, best: State, converged: bool) -> tuple[State, Status]:
         """Correct what the residual of the best iterate shows to be wrong."""
         best = self._without_outliers(best)
+        if converged:
+            best = self._with_measured_drift(best)
         if converged and self.settings.widen_prior:
             best = self._with_wider_prior(best)
         if best.flux <= 0:
@@ -279,6 +287,29 @@ class Annealing:
             state = self._settled(state, _STEPS)
         return state
 
+    def _with_measured_drift(self, state: State) -> State:
+        """Give the drift between frames the size that maximises the evidence, and go on with it."""
+        stated = self.settings
+        if not self.solver.priors.drift or self._unexplained(state):
+            return state
+        for _ in range(_DRIFT_ROUNDS):
+            self.solver.linear_model(state, 0.0, self._all_modes, math.inf, final=False)
+            ratios = self.solver.priors.ratios(self.solver.posterior(state))
+            changed = self.settings.with_drift_scales(ratios, stated)
+            if changed == self.settings:
+                break
+            _log.info("the drift between frames is %s times the stated one", ratios)
+            before = self.solver.priors.scales
+            self.settings = changed
+            self.solver.priors = ModePriors.of(
+                changed, self.basis, [each.observation for each in self.problems]
+            )
+            state = self._settled(state, _STEPS)
+            change = (self.solver.priors.scales / before).log().abs().max()
+            if float(change) < _SAME_DRIFT:
+                break
+        return state
+
     def _with_wider_prior(self, state: State) -> State:
         """Raise the scales of a prior that is too narrow, and go on with them."""
         for _ in range(_WIDENINGS):
@@ -290,8 +321,9 @@ class Annealing:
                 break
             _log.info("the wavefront is improbable under its prior, by factors %s", ratios)
             self.settings = self.settings.with_wider_priors(ratios)
-            frames = len(self.problems)
-            self.solver.priors = ModePriors.of(self.settings, self.basis, frames)
+            self.solver.priors = ModePriors.of(
+                self.settings, self.basis, [each.observation for each in self.problems]
+            )
             state = self._without_outliers(self._settled(state, self.settings.max_iterations))
         return state
 

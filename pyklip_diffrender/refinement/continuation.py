@@ -7,16 +7,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.fit_result import Refinement
-from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.problem import Problem, starting_values
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.status import breakdown_explained
+from pyklip_diffrender.scene.agreement import require_agreement
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["continue_from", "fit_in_stages", "refine_again"]
+__all__ = ["continue_from", "fit_in_stages", "join_frames", "refine_again"]
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +60,8 @@ def continue_from(fit: Refinement, **changes: Any) -> tuple[GaussNewton, dict[Un
     reached = {
         "prior": _with_scales(settings.prior, fit.scales, "{}"),
         "drift": settings.drift and _with_scales(settings.drift, fit.scales, "{} drift"),
+        "dither_drift": settings.dither_drift
+        and _with_scales(settings.dither_drift, fit.scales, "{} dither"),
         "companions": fit.planets,
     }
     warm = dict(zip(fit.linear.unknowns, fit.linear.vector.tolist(), strict=True))
@@ -139,3 +147,90 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
     with breakdown_explained(problems[0].observation.name):
         again = fit_in_stages(problems, settings, warm, seed=fit.seed, progress=progress)
     return replace(again, catalogue_error=fit.catalogue_error)
+
+
+def join_frames(
+    fit: Refinement,
+    others: Sequence[Observation],
+    settings: GaussNewton,
+    *,
+    systematics: Systematics | None,
+    progress: bool = False,
+) -> Refinement:
+    """Continue a fit with more frames in its likelihood, such as those of reference stars.
+
+    The wavefront of the fit is near that of the new frames, whose stars are first aligned with it.
+    A few steps of all unknowns then take the place of a fit from the map on.
+
+    Parameters
+    ----------
+    fit : Refinement
+    others : sequence of Observation
+        Of the shape of the fitted frames.
+    settings : GaussNewton
+        Those of the fit, with a prior on the drift between frames.
+    systematics : Systematics or None
+        Pattern of all frames.
+    progress : bool
+        Show progress bars.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If the fit was read from a file without its linear model, and for frames that cannot share
+        a fit.
+    NoValidPixelsError, ShapeError
+        For new frames that do not suit the model.
+    """
+    require_agreement([*(frame.observation for frame in fit.frames), *others])
+    settings, reached = continue_from(replace(fit, settings=settings))
+    own = (*settings.own, "pedestal")
+    count = len(fit.frames)
+    warm = {
+        # A single frame has no unknowns of its own.
+        each._replace(frame=0) if count == 1 and each.name in own else each: value
+        for each, value in reached.items()
+    }
+    problems = [
+        Problem(frame.model, frame.observation, fit.initial, frame.start, systematics)
+        for frame in fit.frames
+    ]
+    for k, observation in enumerate(others, count):
+        start = starting_values(fit.model, observation, {})
+        for name, values in _aligned(fit, observation, start, settings, systematics).items():
+            warm |= {Unknown(name, i, k): float(value) for i, value in enumerate(values)}
+        problems.append(Problem(fit.model, observation, fit.initial, start, systematics))
+    with breakdown_explained(problems[0].observation.name):
+        joined = fit_in_stages(problems, settings, warm, seed=fit.seed, progress=progress)
+    return replace(joined, catalogue_error=fit.catalogue_error)
+
+
+def _aligned(
+    fit: Refinement,
+    observation: Observation,
+    start: Mapping[str, Any],
+    settings: GaussNewton,
+    systematics: Systematics | None,
+) -> dict[str, NDArray[np.float64]]:
+    """Own parameters of a frame with the wavefront and the shared parameters of a fit."""
+    first = fit.frames[0]
+    shared = {n: v for n, v in first.values.items() if n in fit.model.parameters}
+    own = tuple(name for name in settings.free if name in settings.own)
+    alone = replace(
+        settings,
+        free=own,
+        own=own,
+        wavefront=False,
+        drift=None,
+        dither_drift=None,
+        companions=(),
+        max_companions=0,
+        deviations={n: d for n, d in settings.deviations.items() if n in own},
+    )
+    kept = {n: v for n, v in shared.items() if n not in own}
+    problem = Problem(
+        fit.model, observation, replace(fit.initial, data=fit.wavefront), {**kept, **start},
+        systematics,
+    )  # fmt: skip
+    aligned = fit_in_stages([problem], alone, seed=fit.seed, progress=False).frames[0]
+    return {name: aligned.values[name] for name in own}

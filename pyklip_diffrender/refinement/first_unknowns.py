@@ -46,7 +46,7 @@ def first_unknowns(
         for forward in forwards
     )  # fmt: skip
     own = (*settings.own, "pedestal") if len(frames) > 1 else ()
-    return Unknowns(frames, own, priors.drift)
+    return Unknowns(frames, own, priors.drift, priors.blocks)
 
 
 def _frame_unknowns(
@@ -73,6 +73,9 @@ def _frame_unknowns(
     image = forward.at(unknowns, unknowns.initial()).image
     # With photon-noise weights the faint pixels would dominate this first estimate.
     flat = torch.full_like(problem.sigma, float(problem.sigma.median()))
+    # The flux of a catalogue is that of the target.
+    if problem.observation.reference and "flux" not in problem.start:
+        deviations.pop("flux", None)
     is_known = "flux" in deviations
     if is_known and "flux" not in problem.start:
         raise IncompatibleSetupError(

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     MissingOPDError,
@@ -17,7 +15,7 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.refinement.continuation import fit_in_stages
 from pyklip_diffrender.refinement.fit_result import Refinement
-from pyklip_diffrender.refinement.problem import Problem
+from pyklip_diffrender.refinement.problem import Problem, starting_values
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
 from pyklip_diffrender.refinement.status import breakdown_explained
 from pyklip_diffrender.scene.agreement import require_agreement
@@ -127,7 +125,7 @@ def refine(
         raise IncompatibleSetupError(f"plan: got {plan!r}, expected 'auto' or 'off'")
     wavefront = as_opd_map(opd)
     problems = [
-        Problem(model, each, wavefront, _with_position(model, each, begin), systematics)
+        Problem(model, each, wavefront, starting_values(model, each, begin), systematics)
         for each, begin in zip(observations, _one_by_one(start, len(observations)), strict=True)
     ]
     with breakdown_explained(observations[0].name):
@@ -143,17 +141,3 @@ def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start
             "one for all"
         )
     return list(start)
-
-
-def _with_position(model: OpticalSystem, observation: Observation, start: Start) -> dict[str, Any]:
-    """Add the position of the star, if the observation has one, to the starting values."""
-    ny, nx = observation.shape
-    displacement = observation.center[0] - np.array([(nx - 1) / 2, (ny - 1) / 2])
-    axis = displacement * np.array(model.detector.pixelscale)
-    if observation.star_offset is not None and "star_offset" in model.parameters:
-        start = {"star_offset": observation.star_offset, **start}
-        # The optical axis goes through the occulter, and the star's image is beside it.
-        axis -= observation.star_offset
-    if "detector_shift" in start or np.abs(axis).max() <= 1e-10:
-        return dict(start)
-    return {**start, "detector_shift": axis}

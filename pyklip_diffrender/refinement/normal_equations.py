@@ -112,8 +112,8 @@ def linearise(
         )
         rendered = jacobians[k] if jacobians else forward.jacobian(point, modes, outweighing)
         part = state.unknowns.rows[k]
-        rows, drift = part.rows[: len(rendered)], part.drift if modes else part.drift[:0]
-        first = part.first_mode
+        rows, first = part.rows[: len(rendered)], part.first_mode
+        drift = part.drift if modes else part.drift[:, :0]
         frames.append(LinearFrame(rows, drift, first, residual, weight, rendered, common))
         product, pulled = _accumulate(
             rendered.flatten(1), weight.flatten(), whitened[k].cpu().flatten()
@@ -121,10 +121,11 @@ def linearise(
         if len(state.points) == 1:
             curvature, gradient = product, pulled
             continue
-        leading = slice(first, first + len(drift))
-        for to, which in ((rows, slice(None)), (drift, leading)):
+        leading = slice(first, first + drift.shape[1])
+        parts = [(rows, slice(None)), *((block, leading) for block in drift)]
+        for to, which in parts:
             gradient.index_add_(0, to, pulled[which])
-            for onto, selection in ((rows, slice(None)), (drift, leading)):
+            for onto, selection in parts:
                 curvature[to[:, None], onto] += product[which, selection]
     if noise.shares_pattern:
         rows = summed_rows(frames, size)

@@ -64,14 +64,14 @@ class Objective:
 
     Attributes
     ----------
-    shares_pattern : bool
-        Whether all frames show the same pixels of the detector, and the error of the systematics
-        is therefore one unknown in all of them; otherwise it is noise of every frame.
+    shares_pattern : tuple of bool
+        Which frames show the same pixels of the detector, so that the error of the systematics is
+        one unknown in all of them. It is noise of every other frame.
     """
 
     def __init__(self, forwards: Sequence[Forward], robust: float) -> None:
         self.forwards = tuple(forwards)
-        self.shares_pattern = _share_pattern([forward.problem for forward in self.forwards])
+        self.shares_pattern = _sharing([forward.problem for forward in self.forwards])
         self.robust = robust
 
     @property
@@ -118,7 +118,8 @@ class Objective:
         for k, point in enumerate(state.points):
             problem = self.forwards[k].problem
             whole = self.sigma(k, point, kappa)
-            own = torch.hypot(problem.sigma, kappa * point.total) if self.shares_pattern else whole
+            shares = self.shares_pattern[k]
+            own = torch.hypot(problem.sigma, kappa * point.total) if shares else whole
             weight = torch.where(problem.valid, 1 / own, 0.0)
             if math.isfinite(robust):
                 # Outliers show against all errors, that of the pattern included.
@@ -126,12 +127,14 @@ class Objective:
                 weight = weight * torch.rsqrt(1 + (residual / robust) ** 2)
             weights.append(weight)
         common = [torch.zeros_like(weight) for weight in weights]
-        if self.shares_pattern:
-            error = self.forwards[0].problem.gain_error
-            light = [point.multiplied for point in state.points]
-            seen = sum((weight * s) ** 2 for weight, s in zip(weights, light, strict=True))
+        sharing = [k for k, shares in enumerate(self.shares_pattern) if shares]
+        if sharing:
+            error = self.forwards[sharing[0]].problem.gain_error
+            light = {k: state.points[k].multiplied for k in sharing}
+            seen = sum((weights[k] * light[k]) ** 2 for k in sharing)
             scale = error / torch.sqrt(1 + error**2 * seen)
-            common = [s * scale for s in light]
+            for k in sharing:
+                common[k] = light[k] * scale
         return Noise(tuple(weights), tuple(common))
 
     def residual(self, frame: int, point: Point) -> Tensor:
@@ -171,17 +174,21 @@ class Objective:
         return high
 
 
-def _share_pattern(problems: Sequence[Problem]) -> bool:
-    """Whether several frames show the same pixels of the detector with an uncertain pattern."""
-    first = problems[0].observation
-    return (
-        len(problems) > 1
-        and first.first_pixel is not None
-        and bool((problems[0].gain_error > 0).any())
-        and all(
-            problem.observation.first_pixel == first.first_pixel
-            and problem.observation.shape == first.shape
-            and problem.systematics is problems[0].systematics
-            for problem in problems
-        )
-    )
+def _sharing(problems: Sequence[Problem]) -> tuple[bool, ...]:
+    """Which frames show the same pixels of the detector with an uncertain pattern.
+
+    Of several such sets the largest shares it, or the first one of two equal ones.
+    """
+    places = [
+        (each.observation.first_pixel, each.observation.shape, id(each.systematics))
+        for each in problems
+    ]
+    known = [
+        place
+        for place, problem in zip(places, problems, strict=True)
+        if place[0] is not None and bool((problem.gain_error > 0).any())
+    ]
+    most = max(known, key=known.count, default=None)
+    if most is None or known.count(most) < 2:
+        return (False,) * len(problems)
+    return tuple(place == most for place in places)

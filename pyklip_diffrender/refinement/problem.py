@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.opd import OPDMap, resample
 
-__all__ = ["Problem"]
+__all__ = ["Problem", "starting_values"]
 
 _log = logging.getLogger(__name__)
 
@@ -197,3 +197,19 @@ def require_same_setup(model: OpticalSystem, observation: Observation) -> None:
             f"(x, y), the model {model.detector.pixelscale}. Make the model with "
             "pixelscale=observation.pixelscale"
         )
+
+
+def starting_values(
+    model: OpticalSystem, observation: Observation, start: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Add the position of the star, if the observation has one, to the starting values."""
+    ny, nx = observation.shape
+    displacement = observation.center[0] - np.array([(nx - 1) / 2, (ny - 1) / 2])
+    axis = displacement * np.array(model.detector.pixelscale)
+    if observation.star_offset is not None and "star_offset" in model.parameters:
+        start = {"star_offset": observation.star_offset, **start}
+        # The optical axis goes through the occulter, and the star's image is beside it.
+        axis -= observation.star_offset
+    if "detector_shift" in start or np.abs(axis).max() <= 1e-10:
+        return dict(start)
+    return {**start, "detector_shift": axis}

@@ -41,6 +41,12 @@ whose wavefronts differ by 2 nm take the change for a shift of the star. Behind 
 the star up to 1.5 times too bright, and limits 1.5 times higher. In the long-wave channel it makes
 limits of two rolls of G 7-34 6 to 11 % higher from 0.4 to 1 arcsec, and is not used."""
 
+_DRIFTS = (" drift", " dither")
+"""What follows the names of groups of modes in those of `drift` and `dither_drift`."""
+
+_DRIFT_RANGE = 4.0
+"""Largest factor between the scale of a drift that maximises the evidence and the one stated."""
+
 _SWITCHES = (
     "wavefront", "grow_basis", "coarse_first", "widen_prior", "companions_if_stalled",
     "accurate_steps",
@@ -92,6 +98,11 @@ class GaussNewton:
     drift : WavefrontPrior, optional
         Prior on the difference between the wavefronts of several frames. By default all frames
         share one wavefront.
+    dither_drift : WavefrontPrior, optional
+        Prior on the difference between the wavefronts of the frames of one exposure sequence, such
+        as the small-grid dithers of a star. These share a difference of the size of `drift` from
+        frames before or after a slew. By default the wavefronts of any two frames differ by
+        `drift`.
     drift_cycles : float
         Highest spatial frequency of such differences.
     companions : tuple of Planet
@@ -156,6 +167,7 @@ class GaussNewton:
     prior: WavefrontPrior = field(default_factory=WavefrontPrior)
     widen_prior: bool = False
     drift: WavefrontPrior | None = None
+    dither_drift: WavefrontPrior | None = None
     drift_cycles: float = 8.0
     companions: tuple[Planet, ...] = ()
     max_companions: int = 0
@@ -246,14 +258,40 @@ class GaussNewton:
         Parameters
         ----------
         ratios : mapping of str to float
-            As ``Refinement.prior_ratios``: by group of modes, followed by " drift" for those of
-            `drift`, and "amplitude".
+            As ``Refinement.prior_ratios``: by group of modes, followed by " drift" or " dither"
+            for those of `drift` and `dither_drift`, and "amplitude".
         """
-        of_drift = {
-            name.removesuffix(" drift"): r for name, r in ratios.items() if " drift" in name
-        }
-        drift = self.drift and self.drift.widened(of_drift)
-        return replace(self, prior=self.prior.widened(ratios), drift=drift)
+        of_drift, of_dither = (_labelled(ratios, label) for label in _DRIFTS)
+        return replace(
+            self,
+            prior=self.prior.widened(ratios),
+            drift=self.drift and self.drift.widened(of_drift),
+            dither_drift=self.dither_drift and self.dither_drift.widened(of_dither),
+        )
+
+    def with_drift_scales(self, ratios: Mapping[str, float], within: GaussNewton) -> GaussNewton:
+        """Return settings whose drifts have scales multiplied by ratios, within bounds.
+
+        Parameters
+        ----------
+        ratios : mapping of str to float
+            As for `with_wider_priors`; those of `prior` do not count.
+        within : GaussNewton
+            Its drifts are the middle of the bounds, a factor of `_DRIFT_RANGE` to either side.
+        """
+        changed = {}
+        for field_name, label in (("drift", _DRIFTS[0]), ("dither_drift", _DRIFTS[1])):
+            prior, middle = getattr(self, field_name), getattr(within, field_name)
+            if prior is not None and middle.fit_scales:
+                own = _labelled(ratios, label)
+                scales = {
+                    name: float(np.clip(own.get(name, 1.0) * scale,
+                                        middle.scales[name] / _DRIFT_RANGE,
+                                        middle.scales[name] * _DRIFT_RANGE))
+                    for name, scale in prior.scales.items()
+                }  # fmt: skip
+                changed[field_name] = replace(prior, scales=scales)
+        return replace(self, **changed)
 
     @classmethod
     def nircam(
@@ -358,6 +396,11 @@ class GaussNewton:
         free = changes.get("free", preset.free)
         deviations = {name: value for name, value in preset.deviations.items() if name in free}
         return replace(preset, **{"deviations": deviations, **changes})
+
+
+def _labelled(ratios: Mapping[str, float], label: str) -> dict[str, float]:
+    """Ratios of the groups with a label, by the name of the group without it."""
+    return {n.removesuffix(label): ratio for n, ratio in ratios.items() if n.endswith(label)}
 
 
 def settings_for(observation: Observation) -> GaussNewton:

@@ -113,7 +113,7 @@ class Solver:
         self.objective = Objective(
             [Forward(problem, responses) for problem in problems], settings.robust
         )
-        self.priors = ModePriors.of(settings, basis, len(problems))
+        self.priors = ModePriors.of(settings, basis, [each.observation for each in problems])
         self.damping = 0.0
         self._kappa, self._needs_accurate = math.inf, False
         self._equations: NormalEquations | None = None

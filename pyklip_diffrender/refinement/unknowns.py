@@ -3,7 +3,8 @@
 The vector of a frame has its optical parameters, levels, companions, amplitude and wavefront. The
 vector of all frames begins with the unknowns that differ between frames, frame by frame. Then come
 the shared ones in the order of a frame's vector, with the wavefront modes last. At its end are
-the differences of the leading modes of each frame from the shared modes.
+the blocks of drift, by which the leading modes of a frame differ from the shared modes: those of
+its exposure sequence, and its own.
 """
 
 from __future__ import annotations
@@ -194,11 +195,14 @@ class Unknowns:
         Names of the parameters that differ between frames.
     drift : int
         Number of leading modes that may differ between frames.
+    blocks : tuple of tuple of int
+        For every frame, which blocks of drift its wavefront has; empty without drift.
     """
 
     frames: tuple[FrameUnknowns, ...]
     own: tuple[str, ...] = ()
     drift: int = 0
+    blocks: tuple[tuple[int, ...], ...] = ()
 
     @cached_property
     def _own_size(self) -> int:
@@ -206,10 +210,14 @@ class Unknowns:
         slices = self.frames[0].slices
         return sum(slices[n].stop - slices[n].start for n in self.frames[0].names if n in self.own)
 
+    def _blocks_of(self, frame: int) -> tuple[int, ...]:
+        return self.blocks[frame] if self.blocks else ()
+
     @cached_property
     def size(self) -> int:
         """Number of unknowns."""
-        return self.where("modes").stop + len(self.frames) * self.drift
+        number = 1 + max((block for blocks in self.blocks for block in blocks), default=-1)
+        return self.where("modes").stop + number * self.drift
 
     def where(self, name: str) -> slice:
         """Place of "companions", "amplitude" or "modes", which frames share."""
@@ -236,7 +244,8 @@ class Unknowns:
             begin, count = own if name in self.own else shared, where.stop - where.start
             rows[where] = torch.arange(begin, begin + count)
             own, shared = (own + count, shared) if name in self.own else (own, shared + count)
-        drift = shared + frame * self.drift + torch.arange(self.drift)
+        blocks = torch.tensor(self._blocks_of(frame), dtype=torch.int64)
+        drift = shared + blocks[:, None] * self.drift + torch.arange(self.drift)
         return FrameRows(rows, drift, self.frames[frame].where("modes").start)
 
     def labels(self) -> tuple[Unknown, ...]:
@@ -247,8 +256,9 @@ class Unknowns:
                 owner = frame if name in self.own else -1
                 for k, place in enumerate(part.rows[where].tolist()):
                     labels[place] = Unknown(name, k, owner)
-            for k, place in enumerate(part.drift.tolist()):
-                labels[place] = Unknown("drift", k, frame)
+            for block, places in zip(self._blocks_of(frame), part.drift.tolist(), strict=True):
+                for k, place in enumerate(places):
+                    labels[place] = Unknown("drift", k, block)
         return tuple(labels)
 
     def _joined(self, vectors: Iterable[Tensor]) -> Tensor:

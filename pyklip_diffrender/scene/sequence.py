@@ -38,7 +38,7 @@ from pyklip_diffrender.scene.pixel_checks import why_other_brightness, why_turne
 __all__ = ["Sequence"]
 
 _NEARLY_THE_SAME = 2
-"""Pixels by which the stars of two rolls may be apart for one window on the detector."""
+"""Pixels by which the stars of two frames may be apart for one window on the detector."""
 
 
 @dataclass(frozen=True)
@@ -301,20 +301,24 @@ class Sequence:
     def cutout(self, size: int) -> Sequence:
         """Cut the `size` x `size` pixels about the star out of every frame.
 
-        Rolls whose stars are on nearly the same pixel of the detector are cut alike, so that
-        they share its pattern.
+        Frames whose stars are on nearly the same pixel of the detector as in the first one are cut
+        alike, so that they share its pattern.
         """
-        science = [each.cutout(size) for each in self.science]
-        origin = science[0].first_pixel
-        for k, cut in enumerate(science):
-            if origin is None or cut.first_pixel is None or cut.first_pixel == origin:
-                continue
-            if np.abs(np.subtract(cut.first_pixel, origin)).max() <= _NEARLY_THE_SAME:
-                science[k] = self.science[k].cutout(size, first_pixel=origin)
+        first = self.science[0].cutout(size)
+
+        def cut(frame: Observation) -> Observation:
+            alone = frame.cutout(size)
+            if first.first_pixel is None or alone.first_pixel is None:
+                return alone
+            away = np.abs(np.subtract(alone.first_pixel, first.first_pixel)).max()
+            if not 0 < away <= _NEARLY_THE_SAME:
+                return alone
+            return frame.cutout(size, first_pixel=first.first_pixel)
+
         return replace(
             self,
-            science=tuple(science),
-            references=tuple(each.cutout(size) for each in self.references),
+            science=tuple(map(cut, self.science)),
+            references=tuple(map(cut, self.references)),
         )
 
 

@@ -1,0 +1,371 @@
+"""The frames of reference stars in one likelihood with those of the target.
+
+The target is fitted first. The frames of reference stars of the same visit are then aligned with
+its wavefront, and a few steps fit all frames together: with one wavefront, but for a drift from
+exposure to exposure whose size is measured, and with one flat-field pattern on the pixels of the
+detector. What speaks against a frame is looked at after that fit, in this order:
+
+1. A companion of a reference star is masked in its frames.
+2. Frames of a reference star that the model does not explain as well as it does the target's are
+   left out.
+3. If the limits of all frames together are not deeper than those of the target's frames alone,
+   which may have the library's pattern, the latter are kept.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from astropy.table import QTable
+from numpy.typing import NDArray
+
+from pyklip_diffrender.detection import contrast_curve, sources_of_references
+from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.io.progress import stage
+from pyklip_diffrender.pattern import PatternChoice, pattern_for_visit, with_known_pattern
+from pyklip_diffrender.refinement import Refinement, join_frames, refine_again
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
+
+__all__ = ["Contribution", "Visit", "with_references"]
+
+_log = logging.getLogger(__name__)
+
+_SLEWS = WavefrontPrior(scales={"segment": 0.75, "texture": 0.5}, knee=1.0, slope=1.0)
+_DITHERS = WavefrontPrior(scales={"segment": 0.4, "texture": 0.25}, knee=1.0, slope=1.0)
+_CYCLES = 12.0
+"""Drift of the wavefront, nm, between exposures with a slew between them and between the dithers of
+one of them: 2.7 and 1.4 nm rms to begin with, and as the frames themselves show it within a factor
+of four. The heaters of the instruments' electronics alone change it by 1 to 2 nm within minutes (R.
+Telfer et al. 2024, SPIE 13092), and it drifts by 9 nm within days (Feng et al. 2025, section 4).
+Finer modes than those up to 12 cycles per pupil are those of the polished segments, which last."""
+
+_EXCESS = 1.5
+"""Chi-squared per pixel of a reference frame over that of the target's frames, from which it
+contradicts them."""
+
+_FAINT = 0.05
+"""Flux of a reference star over the target's below which its frames teach nothing: their noise is
+20 times that of the target, relative to the star."""
+
+_MASKED = 1.5
+"""Radius of the mask about a companion of a reference star, lambda/D: its first bright ring."""
+
+_COMPANIONS = 3
+"""Largest number of companions of a reference star that are masked, one after another."""
+
+_SEPARATIONS = (0.4, 0.55, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0)
+"""arcsec at which limits with and without the references are compared."""
+
+_ANGLES = 6
+"""Positions at each of them."""
+
+_FRAME = 2.2
+"""Memory for one more frame, relative to the derivatives of its pixels by all unknowns."""
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """What a frame of a reference star was used for.
+
+    Attributes
+    ----------
+    name : str
+        Name of its file.
+    star : str
+    use : {"joint", "pattern", "left out"}
+        In one likelihood with the target; for the flat-field pattern only; or not at all.
+    reason : str
+        Why it was not used, or not all of its pixels; else empty.
+    chi2 : float
+        Chi-squared per pixel in the joint fit; NaN without one.
+    flux : float
+        Flux of its star over the target's; NaN without a joint fit.
+    drift : float
+        Rms of the difference of its wavefront from that of the target's first frame, nm; NaN
+        without a joint fit.
+    """
+
+    name: str
+    star: str
+    use: str
+    reason: str = ""
+    chi2: float = math.nan
+    flux: float = math.nan
+    drift: float = math.nan
+
+
+@dataclass(frozen=True)
+class Visit:
+    """What the frames of reference stars have brought to a reduction.
+
+    Attributes
+    ----------
+    contributions : tuple of Contribution
+        One for each frame of a reference star.
+    gain : float
+        Limits of the target's frames alone over those of the fit that was kept, in units of flux:
+        the median over separations from 0.4 to 2 arcsec. NaN if the frames were not fitted
+        together.
+
+    Examples
+    --------
+    >>> from pyklip_diffrender.reduction import Contribution, Visit
+    >>> Visit((Contribution("a.fits", "HD 2", "joint", chi2=0.98, flux=2.0, drift=1.4),), 1.3)
+    <Visit: 1 of 1 reference frames in the likelihood, limits 1.30 times deeper>
+    """
+
+    contributions: tuple[Contribution, ...] = ()
+    gain: float = math.nan
+
+    def __repr__(self) -> str:
+        used = sum(each.use == "joint" for each in self.contributions)
+        deeper = f", limits {self.gain:.2f} times deeper" if used else ""
+        return (
+            f"<Visit: {used} of {len(self.contributions)} reference frames in the "
+            f"likelihood{deeper}>"
+        )
+
+    @property
+    def table(self) -> QTable:
+        """One row for each frame of a reference star, with the columns of `Contribution`."""
+        names = tuple(Contribution.__dataclass_fields__)
+        rows = [tuple(getattr(each, name) for name in names) for each in self.contributions]
+        kinds = [str, str, str, str, float, float, float]
+        table = QTable(rows=rows or None, names=names, dtype=kinds)
+        table["drift"].unit = "nm"
+        return table
+
+
+def with_references(
+    fit: Refinement,
+    choice: PatternChoice,
+    references: Sequence[Observation],
+    *,
+    memory: float | None = None,
+    progress: bool = False,
+) -> tuple[Refinement, Visit]:
+    """Fit the frames of reference stars together with those of the target.
+
+    Parameters
+    ----------
+    fit : Refinement
+        Of the target's frames alone.
+    choice : PatternChoice
+        Its flat-field pattern.
+    references : sequence of Observation
+        Cut like the target's frames.
+    memory : float, optional
+        Bytes that the process may take; frames that do not fit are left out.
+    progress : bool
+        Show progress bars.
+
+    Returns
+    -------
+    fit : Refinement
+        The target's frames come first; that of the target alone if it has the deeper limits.
+    visit : Visit
+    """
+    if not references or not fit.status.usable:
+        return fit, Visit()
+    left_out: dict[str, str] = {}
+    used = _that_fit_into(memory, fit, references, left_out)
+    pattern = pattern_for_visit(choice, [each.observation for each in fit.frames], used)
+    settings = replace(
+        fit.settings,
+        drift=fit.settings.drift or _SLEWS,
+        dither_drift=_DITHERS,
+        drift_cycles=_CYCLES,
+    )
+    if pattern is not None:
+        settings = with_known_pattern(settings)
+    joint: Refinement | None = None
+    remarks: dict[str, str] = {}
+    with stage("reference stars and target together"):
+        while used:
+            try:
+                joint = join_frames(fit, used, settings, systematics=pattern, progress=progress)
+            except DiffrenderError as error:
+                _log.warning("the reference frames are not fitted with the target: %s", error)
+                left_out |= {each.name: f"the joint fit failed: {error}" for each in used}
+                used, joint = [], None
+                break
+            joint = _with_companions_masked(joint, remarks, progress)
+            contradicting = _contradicting(joint, len(fit.frames))
+            if not contradicting:
+                break
+            left_out |= contradicting
+            used, joint = [each for each in used if each.name not in contradicting], None
+    if joint is None or not joint.status.usable:
+        return fit, Visit(_left_out(references, left_out))
+    gain = _gain(fit, joint)
+    _log.info("limits with the reference frames are %.2f times deeper than without", gain)
+    if not gain > 1 or (fit.status.calibrated and not joint.status.calibrated):
+        reason = (
+            f"limits would be {1 / gain:.2f} times those without it"
+            if gain <= 1 else "the model does not explain it together with the target"
+        )  # fmt: skip
+        left_out |= {each.name: reason for each in used}
+        return fit, Visit(_left_out(references, left_out))
+    return joint, Visit(_contributions(joint, references, left_out, remarks), gain)
+
+
+def _that_fit_into(
+    memory: float | None,
+    fit: Refinement,
+    references: Sequence[Observation],
+    left_out: dict[str, str],
+) -> list[Observation]:
+    """As many frames as the memory allows, those nearest in time to the target first."""
+    if memory is None:
+        return list(references)
+    derivatives = 4.0 * fit.linear.frames[0].jacobian.numel()
+    spare = fit.settings.memory_beside(len(fit.frames) * derivatives) / (_FRAME * derivatives)
+    date = fit.frames[0].observation.date
+
+    def days(each: Observation) -> float:
+        return 0.0 if each.date is None or date is None else abs(float(each.date.mjd - date.mjd))
+
+    nearest = sorted(references, key=days)
+    chosen = nearest[: max(0, int(spare))]
+    for each in nearest[len(chosen) :]:
+        left_out[each.name] = f"it does not fit into {memory / 1e9:.3g} GB of memory (--memory)"
+        _log.warning("%s is left out: %s", each.name, left_out[each.name])
+    return [each for each in references if any(each is one for one in chosen)]
+
+
+def _frame_chi2(fit: Refinement) -> NDArray[np.float64]:
+    """Chi-squared per pixel of every frame, with the pattern that frames share marginalised."""
+    linear = fit.linear
+    residuals = {k: frame.residual for k, frame in enumerate(linear.frames)}
+    white = linear.noise.inverse(residuals)
+    return np.array(
+        [
+            float((frame.weight * frame.residual * white[k]).sum() / (frame.weight > 0).sum())
+            for k, frame in enumerate(linear.frames)
+        ]
+    )
+
+
+def _contradicting(joint: Refinement, science: int) -> dict[str, str]:
+    """Frames of reference stars that are not explained as the target's are, and why."""
+    chi2, flux = _frame_chi2(joint), np.array([frame.flux for frame in joint.frames])
+    usual = max(1.0, float(np.median(chi2[:science])))
+    reasons = {}
+    for k, frame in enumerate(joint.frames[science:], science):
+        name = frame.observation.name
+        if flux[k] < _FAINT * flux[0]:
+            reasons[name] = f"its star has {flux[k] / flux[0]:.2g} of the target's flux"
+        elif chi2[k] > _EXCESS * usual:
+            reasons[name] = (
+                f"the model that explains the target leaves it a chi-squared of {chi2[k]:.2f} per "
+                "pixel"
+            )
+    for name, reason in reasons.items():
+        _log.warning("%s is left out: %s", name, reason)
+    return reasons
+
+
+def _with_companions_masked(
+    joint: Refinement, remarks: dict[str, str], progress: bool
+) -> Refinement:
+    """Fit again as often as a companion of a reference star shows, with its pixels masked."""
+    for _ in range(_COMPANIONS):
+        masked = _without_companions(joint, remarks)
+        if masked is None:
+            break
+        joint = refine_again(masked, progress=progress)
+    return joint
+
+
+def _without_companions(joint: Refinement, remarks: dict[str, str]) -> Refinement | None:
+    """The fit with companions of reference stars masked; None if there are no new ones."""
+    frames, is_new = list(joint.frames), False
+    for k, (contrast, x, y) in sources_of_references(joint).items():
+        frame = joint.frames[k]
+        observation = frame.observation
+        away = np.hypot(frame.grid[..., 0] - x, frame.grid[..., 1] - y)
+        near = away < _MASKED * joint.model.resolution
+        if not (observation.valid & near).any():
+            continue
+        is_new = True
+        remark = (
+            f"a source of {contrast:.1e} of its star's light at {math.hypot(x, y):.2f} arcsec is "
+            "masked"
+        )
+        _log.warning("%s: %s", observation.name, remark)
+        remarks[observation.name] = "; ".join(filter(None, (remarks.get(observation.name), remark)))
+        frames[k] = replace(
+            frame, observation=replace(observation, valid=observation.valid & ~near)
+        )
+    return replace(joint, frames=tuple(frames)) if is_new else None
+
+
+def _gain(alone: Refinement, joint: Refinement) -> float:
+    """Limits of one fit over those of another, in units of flux, the median over separations."""
+    curves = []
+    for fit in (alone, joint):
+        edge = float(np.abs(fit.frames[0].grid).max())
+        separations = [each for each in _SEPARATIONS if each < edge] or [edge / 2]
+        curve = contrast_curve(fit, separations, angles=_ANGLES, scatter=1.0)
+        curves.append(fit.frames[0].flux * np.asarray(curve["contrast"]))
+    return float(np.nanmedian(curves[0] / curves[1]))
+
+
+def _drifts(joint: Refinement) -> NDArray[np.float64]:
+    """Rms of the difference of every frame's wavefront from that of the first one, nm."""
+    coefficients = []
+    linear = joint.linear
+    for frame in linear.frames:
+        drift = torch.zeros(frame.drift.shape[-1], dtype=torch.float64)
+        for block in frame.drift:
+            drift = drift + linear.vector[block]
+        coefficients.append(drift)
+    return np.array([float((each - coefficients[0]).norm()) for each in coefficients])
+
+
+def _contributions(
+    joint: Refinement,
+    references: Iterable[Observation],
+    left_out: dict[str, str],
+    remarks: dict[str, str],
+) -> tuple[Contribution, ...]:
+    """What every frame was used for."""
+    chi2, drifts = _frame_chi2(joint), _drifts(joint)
+    places = {
+        frame.observation.name: k
+        for k, frame in enumerate(joint.frames)
+        if frame.observation.reference
+    }
+    contributions: list[Contribution] = []
+    for each in references:
+        if each.name in left_out:
+            contributions += _left_out([each], left_out)
+            continue
+        k = places[each.name]
+        contributions.append(
+            Contribution(
+                each.name,
+                each.target,
+                "joint",
+                remarks.get(each.name, ""),
+                float(chi2[k]),
+                joint.frames[k].flux / joint.frames[0].flux,
+                float(drifts[k]),
+            )
+        )
+    return tuple(contributions)
+
+
+def _left_out(
+    references: Iterable[Observation], reasons: dict[str, str]
+) -> tuple[Contribution, ...]:
+    return tuple(
+        Contribution(each.name, each.target, "left out", reasons.get(each.name, ""))
+        for each in references
+    )
