@@ -27,11 +27,13 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern import PatternChoice, fit_with_pattern
 from pyklip_diffrender.reduction.options import ReduceOptions
 from pyklip_diffrender.reduction.reduction_result import Reduction
-from pyklip_diffrender.reduction.visit import Visit, with_references
+from pyklip_diffrender.reduction.visit import Visit, rough_settings, with_references
 from pyklip_diffrender.refinement import (
     Refinement,
     refine,
+    refine_again,
     require_calibrated,
+    settings_for,
     to_jansky,
     with_star_flux,
 )
@@ -238,13 +240,16 @@ class _Run:
             return self._fit(choice.science, choice)
 
     def _fit(self, science: Iterable[Observation], choice: PatternChoice) -> Refinement:
-        options = self.preparation.options
+        """Fit the frames of the target; roughly, if reference stars are to join them."""
+        options, settings = self.preparation.options, choice.settings
+        if self._joins_early(choice):
+            settings = rough_settings(settings or settings_for(choice.science[0]))
         fit = refine(
             self.preparation.model,
             tuple(science),
             self.preparation.wavefront,
             systematics=choice.systematics,
-            settings=choice.settings,
+            settings=settings,
             progress=self.progress,
         )
         if options.star_flux is None:
@@ -252,19 +257,39 @@ class _Run:
         flux, error = to_jansky(options.star_flux), options.star_flux_error
         return with_star_flux(fit, flux, error, progress=self.progress)
 
-    def _with_references(self, fit: Refinement, choice: PatternChoice) -> tuple[Refinement, Visit]:
-        """Fit target and reference stars together, if the options ask for it."""
+    @property
+    def _joining(self) -> tuple[Observation, ...]:
+        """Frames of reference stars that are fitted together with the target's."""
         options = self.preparation.options
         # The light of a disk would have to be told from the wavefront of other stars first.
-        if options.references != "joint" or options.disk:
-            return fit, Visit()
-        return with_references(
+        joins = options.references == "joint" and not options.disk
+        return self.preparation.sequence.references if joins else ()
+
+    def _joins_early(self, choice: PatternChoice) -> bool:
+        """Whether the fit of the target alone is only the beginning of that of all frames.
+
+        Where the library knows the pattern, it may be the better one.
+        """
+        return bool(self._joining) and choice.origin != "library"
+
+    def _with_references(self, fit: Refinement, choice: PatternChoice) -> tuple[Refinement, Visit]:
+        """Fit target and reference stars together."""
+        memory = self.preparation.options.memory
+        joint, visit = with_references(
             fit,
             choice,
-            self.preparation.sequence.references,
-            memory=None if options.memory is None else to_bytes(options.memory, "memory"),
+            self._joining,
+            memory=None if memory is None else to_bytes(memory, "memory"),
             progress=self.progress,
         )
+        if joint is fit and self._joins_early(choice):
+            full = choice.settings or settings_for(choice.science[0])
+            with stage("wavefront of the target alone"):
+                joint = refine_again(
+                    fit, tolerance=full.tolerance, widen_prior=full.widen_prior,
+                    progress=self.progress,
+                )  # fmt: skip
+        return joint, visit
 
     def _search(self, fit: Refinement, disk: Disk | None = None) -> Detection:
         return detect(

@@ -28,11 +28,11 @@ from pyklip_diffrender.detection import contrast_curve, sources_of_references
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.pattern import PatternChoice, pattern_for_visit, with_known_pattern
-from pyklip_diffrender.refinement import Refinement, join_frames, refine_again
+from pyklip_diffrender.refinement import GaussNewton, Refinement, join_frames, refine_again
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["Contribution", "Visit", "with_references"]
+__all__ = ["Contribution", "Visit", "rough_settings", "with_references"]
 
 _log = logging.getLogger(__name__)
 
@@ -44,6 +44,12 @@ one of them: 2.7 and 1.4 nm rms to begin with, and as the frames themselves show
 of four. The heaters of the instruments' electronics alone change it by 1 to 2 nm within minutes (R.
 Telfer et al. 2024, SPIE 13092), and it drifts by 9 nm within days (Feng et al. 2025, section 4).
 Finer modes than those up to 12 cycles per pupil are those of the polished segments, which last."""
+
+_TOLERANCE = 3e-4
+"""`GaussNewton.tolerance` of the joint fit: 13 units of chi-squared for seven frames."""
+
+_ROUGH = 1e-3
+"""`GaussNewton.tolerance` of the fit of the target alone that precedes it."""
 
 _EXCESS = 1.5
 """Chi-squared per pixel of a reference frame over that of the target's frames, from which it
@@ -142,6 +148,11 @@ class Visit:
         return table
 
 
+def rough_settings(settings: GaussNewton) -> GaussNewton:
+    """Settings of a fit of the target from which the fit of all frames goes on."""
+    return replace(settings, tolerance=max(settings.tolerance, _ROUGH), widen_prior=False)
+
+
 def with_references(
     fit: Refinement,
     choice: PatternChoice,
@@ -181,6 +192,8 @@ def with_references(
         drift=fit.settings.drift or _SLEWS,
         dither_drift=_DITHERS,
         drift_cycles=_CYCLES,
+        tolerance=max(fit.settings.tolerance, _TOLERANCE),
+        widen_prior=True,
     )
     if pattern is not None:
         settings = with_known_pattern(settings)

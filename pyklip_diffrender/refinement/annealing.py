@@ -100,10 +100,11 @@ _WIDENINGS = 3
 """Largest number of times that a prior is widened. Two rolls of HIP 17695 in F444W needed two."""
 
 
-_DRIFT_ROUNDS = 3
-_SAME_DRIFT = 0.15
-"""Largest number of times that the size of the drift is measured, and the relative change of it
-below which it is known."""
+_DRIFT_ROUNDS = 2
+_DRIFT_STEPS = 1
+_SAME_DRIFT = 0.25
+"""Largest number of times that the size of the drift is measured, number of steps after each, and
+the relative change of it below which it is known. A third time changed it by 5 %."""
 
 
 class Annealing:
@@ -304,7 +305,7 @@ class Annealing:
             self.solver.priors = ModePriors.of(
                 changed, self.basis, [each.observation for each in self.problems]
             )
-            state = self._settled(state, _STEPS)
+            state = self._settled(state, _DRIFT_STEPS)
             change = (self.solver.priors.scales / before).log().abs().max()
             if float(change) < _SAME_DRIFT:
                 break

@@ -7,12 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.fit_result import Refinement
+from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.problem import Problem, starting_values
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.status import breakdown_explained
@@ -195,11 +193,23 @@ def join_frames(
         Problem(frame.model, frame.observation, fit.initial, frame.start, systematics)
         for frame in fit.frames
     ]
+    bad = {
+        (frame.observation.first_pixel, frame.observation.shape): ~frame.observation.valid.any(
+            axis=0
+        )
+        for frame in fit.frames
+    }
     for k, observation in enumerate(others, count):
+        # Pixels that are bad in the fitted frames are bad in all frames.
+        known = bad.get((observation.first_pixel, observation.shape))
+        if observation.first_pixel is not None and known is not None:
+            observation = replace(observation, valid=observation.valid & ~known)
         start = starting_values(fit.model, observation, {})
-        for name, values in _aligned(fit, observation, start, settings, systematics).items():
+        aligned = _aligned(fit, observation, start, settings, systematics)
+        for name in own:
+            values = aligned.values.get(name, ())
             warm |= {Unknown(name, i, k): float(value) for i, value in enumerate(values)}
-        problems.append(Problem(fit.model, observation, fit.initial, start, systematics))
+        problems.append(Problem(fit.model, aligned.observation, fit.initial, start, systematics))
     with breakdown_explained(problems[0].observation.name):
         joined = fit_in_stages(problems, settings, warm, seed=fit.seed, progress=progress)
     return replace(joined, catalogue_error=fit.catalogue_error)
@@ -211,8 +221,8 @@ def _aligned(
     start: Mapping[str, Any],
     settings: GaussNewton,
     systematics: Systematics | None,
-) -> dict[str, NDArray[np.float64]]:
-    """Own parameters of a frame with the wavefront and the shared parameters of a fit."""
+) -> FrameFit:
+    """A frame fitted with the wavefront and the shared parameters of another fit."""
     first = fit.frames[0]
     shared = {n: v for n, v in first.values.items() if n in fit.model.parameters}
     own = tuple(name for name in settings.free if name in settings.own)
@@ -232,5 +242,4 @@ def _aligned(
         fit.model, observation, replace(fit.initial, data=fit.wavefront), {**kept, **start},
         systematics,
     )  # fmt: skip
-    aligned = fit_in_stages([problem], alone, seed=fit.seed, progress=False).frames[0]
-    return {name: aligned.values[name] for name in own}
+    return fit_in_stages([problem], alone, seed=fit.seed, progress=False).frames[0]
