@@ -321,6 +321,7 @@ def compare(case: Case, reduction: dr.Reduction) -> dict[str, Any]:
             {"snr": float(table["snr"][k]), "place": places[k].tolist()} for k in sorted(left)
         ],
         "snr_scatter": float(np.nanstd(detection.residual_snr[distant])),
+        "error_factor": float(detection.scatter),
         "limits_over_known_star": float(np.median(ratio)) if len(ratio) else None,
         "limits": [float(each) for each in curve["contrast"]],
         "separations": [float(each.to_value("arcsec")) for each in curve["separation"]],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +17,14 @@ __all__ = ["sources_of_references"]
 
 _log = logging.getLogger(__name__)
 
-_THRESHOLD = 5.0
-"""S/N, in units of its scatter, above which a peak is a source."""
+_THRESHOLD = 6.0
+"""S/N above which a peak is a source. Fainter ones leave less than a fifth of it in the target."""
+
+_WORTH_A_LOOK = 4.5
+"""The same for an approximate S/N, in units of its scatter."""
+
+_SAME_ROLL = 1.0
+"""Degrees between frames whose sources are at the same pixels."""
 
 _INNER = 0.3
 """Smallest separation, arcsec. Nearer to the star, a source is taken up by the wavefront."""
@@ -69,27 +76,14 @@ def _brightest_source(
     fit: Refinement, places: list[int]
 ) -> tuple[float, float, float, float] | None:
     """Contrast, x, y and S/N of the most significant source in frames of one reference star."""
-    # Templates show planets in the frames of a target; this star takes its part.
-    frames = [
-        replace(frame, observation=replace(frame.observation, reference=k not in places))
-        for k, frame in enumerate(fit.frames)
-    ]
-    templates = Templates(replace(fit, frames=tuple(frames)), frames[places[0]])
+    templates = _templates_of(fit, places)
     away = np.hypot(templates.grid[..., 0], templates.grid[..., 1])
-    rows, columns = np.nonzero(away > _INNER)
-    chosen = (rows % _STEP == 0) & (columns % _STEP == 0)
+    rows, columns = (each.ravel() for each in np.indices(away.shape))
+    chosen = (away.ravel() > _INNER) & (rows % _STEP == 0) & (columns % _STEP == 0)
     rows, columns = rows[chosen], columns[chosen]
-    numerator, information = (np.zeros(len(rows)) for _ in range(2))
-    for start in range(0, len(rows), _BATCH):
-        part = slice(start, start + _BATCH)
-        products = fit.star_only.weigh(templates.at_pixels(rows[part], columns[part]))
-        numerator[part], information[part] = products.numerator, products.information
-    known = information > 0
-    snr = np.divide(numerator, np.sqrt(information, where=known), where=known,
-                    out=np.zeros_like(numerator))  # fmt: skip
-    scatter = max(1.0, 1.4826 * float(np.median(np.abs(snr[known]))))
+    snr = _approximate_snr(fit, places, rows, columns)
     peak = int(snr.argmax())
-    if snr[peak] < _THRESHOLD * scatter:
+    if snr[peak] < _WORTH_A_LOOK:
         return None
     # The highest of the neighbouring pixels is nearer to the source.
     near_rows, near_columns = (
@@ -102,6 +96,45 @@ def _brightest_source(
     products = fit.star_only.weigh(templates.at_pixels(near_rows, near_columns))
     size = products.numerator / torch.sqrt(products.information.clamp(min=1e-300))
     best = int(size.argmax())
+    if size[best] < _THRESHOLD:
+        return None
     x, y = templates.grid[near_rows[best], near_columns[best]]
     contrast = float(products.numerator[best] / products.information[best])
-    return contrast, float(x), float(y), float(size[best] / scatter)
+    return contrast, float(x), float(y), float(size[best])
+
+
+def _templates_of(fit: Refinement, places: Sequence[int]) -> Templates:
+    """Templates in some frames of a reference star, which takes the part of the target."""
+    frames = [
+        replace(frame, observation=replace(frame.observation, reference=k not in places))
+        for k, frame in enumerate(fit.frames)
+    ]
+    return Templates(replace(fit, frames=tuple(frames)), frames[places[0]])
+
+
+def _approximate_snr(
+    fit: Refinement, places: Sequence[int], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """S/N of sources at pixels of the first frame of a star, (k,), in units of its scatter.
+
+    With the residual r of all unknowns, p . Sigma^-1 r is exact, and p . C^-1 p takes the place of
+    p . Sigma^-1 p, which differs from it by a factor that varies slowly over the field. Dithers
+    move the star by a fraction of a pixel, so that templates of the first frame do for all.
+    """
+    linear, first = fit.star_only, places[0]
+    templates = _templates_of(fit, [first])
+    cleaned = torch.zeros_like(linear.cleaned[first])
+    weight = torch.zeros_like(cleaned)
+    for k in places:
+        roll = fit.frames[k].observation.roll_from(fit.frames[first].observation)
+        if abs(roll) < _SAME_ROLL:
+            scale = fit.frames[k].flux / fit.frames[first].flux
+            cleaned += scale * linear.frames[k].weight * linear.cleaned[k]
+            weight += (scale * linear.frames[k].weight) ** 2
+    snr = np.zeros(len(rows))
+    for start in range(0, len(rows), _BATCH):
+        part = slice(start, start + _BATCH)
+        images = templates.at_pixels(rows[part], columns[part])[first].flatten(1).double()
+        information = images.square() @ weight.flatten()
+        snr[part] = images @ cleaned.flatten() / information.clamp(min=1e-300).sqrt()
+    return snr / max(1e-300, 1.4826 * float(np.median(np.abs(snr))))
