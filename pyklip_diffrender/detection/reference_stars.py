@@ -5,15 +5,19 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
+from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.field import pixel_width
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.refinement import Refinement
 
-__all__ = ["sources_of_references"]
+__all__ = ["ReferenceSource", "sources_of_references"]
 
 _log = logging.getLogger(__name__)
 
@@ -33,11 +37,32 @@ _STEP = 2
 """Pixels between the positions that are looked at: about lambda/D in the long-wave channel. Between
 four of them a source keeps 0.7 of its S/N."""
 
+_STEPS = 6
+"""Largest number of steps of its position."""
+
 _BATCH = 320
 """Number of templates that are rendered at a time."""
 
 
-def sources_of_references(fit: Refinement) -> dict[int, NDArray[np.float64]]:
+class ReferenceSource(NamedTuple):
+    """A point source beside a reference star, in one frame.
+
+    Attributes
+    ----------
+    contrast : float
+        To its star.
+    offset : tuple of float
+        x, y from the star, arcsec.
+    light : ndarray, (ny, nx)
+        Its image, in the unit of the frame.
+    """
+
+    contrast: float
+    offset: tuple[float, float]
+    light: NDArray[np.float64]
+
+
+def sources_of_references(fit: Refinement) -> dict[int, ReferenceSource]:
     """Find the most significant point source beside each reference star of a fit.
 
     A source beside a reference star leaves a dark spot in the residual of the target, at the same
@@ -50,9 +75,8 @@ def sources_of_references(fit: Refinement) -> dict[int, NDArray[np.float64]]:
 
     Returns
     -------
-    dict of int to ndarray, (3,)
-        Contrast to its star, and x and y from it in arcsec, by the frame's place in the fit, for
-        all frames of the stars that have one.
+    dict of int to ReferenceSource
+        By the frame's place in the fit, for all frames of the stars that have one.
     """
     stars: dict[str, list[int]] = {}
     for k, frame in enumerate(fit.frames):
@@ -60,23 +84,27 @@ def sources_of_references(fit: Refinement) -> dict[int, NDArray[np.float64]]:
             stars.setdefault(frame.observation.target, []).append(k)
     sources = {}
     for star, places in stars.items():
-        brightest = _brightest_source(fit, places)
+        templates = _templates_of(fit, places)
+        brightest = _brightest_source(fit, templates, places)
         if brightest is None:
             continue
         contrast, x, y, snr = brightest
         _log.info("%s has a source of S/N %.1f at x, y = %.2f, %.2f arcsec", star, snr, x, y)
+        offset = np.array([[x, y]])
+        images = templates.at(torch.from_numpy(offset))
         origin = fit.frames[places[0]].observation
         for k in places:
-            ((turned_x, turned_y),) = fit.frames[k].observation.turned(np.array([[x, y]]), origin)
-            sources[k] = np.array([contrast, turned_x, turned_y])
+            ((turned_x, turned_y),) = fit.frames[k].observation.turned(offset, origin)
+            sources[k] = ReferenceSource(
+                contrast, (float(turned_x), float(turned_y)), contrast * images[k][0].numpy()
+            )
     return sources
 
 
 def _brightest_source(
-    fit: Refinement, places: list[int]
+    fit: Refinement, templates: Templates, places: Sequence[int]
 ) -> tuple[float, float, float, float] | None:
     """Contrast, x, y and S/N of the most significant source in frames of one reference star."""
-    templates = _templates_of(fit, places)
     away = np.hypot(templates.grid[..., 0], templates.grid[..., 1])
     rows, columns = (each.ravel() for each in np.indices(away.shape))
     chosen = (away.ravel() > _INNER) & (rows % _STEP == 0) & (columns % _STEP == 0)
@@ -85,22 +113,18 @@ def _brightest_source(
     peak = int(snr.argmax())
     if snr[peak] < _WORTH_A_LOOK:
         return None
-    # The highest of the neighbouring pixels is nearer to the source.
-    near_rows, near_columns = (
-        each.ravel()
-        for each in np.meshgrid(
-            np.clip(rows[peak] + np.arange(-1, 2), 0, away.shape[0] - 1),
-            np.clip(columns[peak] + np.arange(-1, 2), 0, away.shape[1] - 1),
-        )
-    )
-    products = fit.star_only.weigh(templates.at_pixels(near_rows, near_columns))
-    size = products.numerator / torch.sqrt(products.information.clamp(min=1e-300))
-    best = int(size.argmax())
-    if size[best] < _THRESHOLD:
+    # The search steps over pixels, and a source may be between them.
+    group, pixel = (fit.star_only, templates), pixel_width(templates.grid)
+    row, column = rows[peak : peak + 1], columns[peak : peak + 1]
+    products = fit.star_only.weigh(templates.at_pixels(row, column))
+    contrast = (products.numerator / products.information).numpy()
+    start = Candidates.at(templates.grid[row, column], contrast)
+    source = refine_candidates([group], start, _STEP * pixel, _STEPS)
+    measured = float(source.snr(ErrorFactor.constant(1.0))[0])
+    if measured < _THRESHOLD:
         return None
-    x, y = templates.grid[near_rows[best], near_columns[best]]
-    contrast = float(products.numerator[best] / products.information[best])
-    return contrast, float(x), float(y), float(size[best])
+    x, y = source.offsets[0].tolist()
+    return float(source.contrasts[0]), x, y, measured
 
 
 def _templates_of(fit: Refinement, places: Sequence[int]) -> Templates:

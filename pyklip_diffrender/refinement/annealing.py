@@ -100,11 +100,14 @@ _WIDENINGS = 3
 """Largest number of times that a prior is widened. Two rolls of HIP 17695 in F444W needed two."""
 
 
-_DRIFT_ROUNDS = 2
-_DRIFT_STEPS = 1
+_EARLY = 2
+"""Number of steps of a fit that continues another one, after which the size of the drift between
+frames is measured for the first time."""
+
+_DRIFT_STEPS = 2
 _SAME_DRIFT = 0.25
-"""Largest number of times that the size of the drift is measured, number of steps after each, and
-the relative change of it below which it is known. A third time changed it by 5 %."""
+"""Largest number of steps after the size of the drift is measured for the last time, and relative
+change of it that takes none."""
 
 
 class Annealing:
@@ -131,6 +134,7 @@ class Annealing:
         progress: bool,
     ) -> None:
         self.settings, self.basis, self.progress = settings, basis, progress
+        self._stated = settings
         self.problems = list(problems)
         self.solver = Solver(problems, settings, basis, progress)
         self.objective = self.solver.objective
@@ -157,6 +161,8 @@ class Annealing:
             while course.remaining and not converged:
                 gain = self._step(course)
                 bar.update(chi2=course.chi2)
+                if self._is_warm and len(self.history) == _EARLY:
+                    self._measure_drift(course.state)
                 converged = (self._anneal if course.modes else self._align)(course, gain)
         state, status = self._finish(course.best, converged)
         return conclude(
@@ -290,26 +296,27 @@ class Annealing:
 
     def _with_measured_drift(self, state: State) -> State:
         """Give the drift between frames the size that maximises the evidence, and go on with it."""
-        stated = self.settings
-        if not self.solver.priors.drift or self._unexplained(state):
-            return state
-        for _ in range(_DRIFT_ROUNDS):
-            self.solver.linear_model(state, 0.0, self._all_modes, math.inf, final=False)
-            ratios = self.solver.priors.ratios(self.solver.posterior(state))
-            changed = self.settings.with_drift_scales(ratios, stated)
-            if changed == self.settings:
-                break
-            _log.info("the drift between frames is %s times the stated one", ratios)
-            before = self.solver.priors.scales
-            self.settings = changed
-            self.solver.priors = ModePriors.of(
-                changed, self.basis, [each.observation for each in self.problems]
-            )
+        if not self._unexplained(state) and self._measure_drift(state):
             state = self._settled(state, _DRIFT_STEPS)
-            change = (self.solver.priors.scales / before).log().abs().max()
-            if float(change) < _SAME_DRIFT:
-                break
         return state
+
+    def _measure_drift(self, state: State) -> bool:
+        """Set the size of the drift to that of the highest evidence; False if it hardly changes."""
+        if not self.solver.priors.drift:
+            return False
+        self.solver.linear_model(state, 0.0, self._all_modes, math.inf, final=False)
+        ratios = self.solver.priors.ratios(self.solver.posterior(state))
+        changed = self.settings.with_drift_scales(ratios, self._stated)
+        if changed == self.settings:
+            return False
+        _log.info("the drift between frames is %s times the stated one", ratios)
+        before = self.solver.priors.scales
+        self.settings = changed
+        self.solver.priors = ModePriors.of(
+            changed, self.basis, [each.observation for each in self.problems]
+        )
+        change = (self.solver.priors.scales / before).log().abs().max()
+        return float(change) > _SAME_DRIFT
 
     def _with_wider_prior(self, state: State) -> State:
         """Raise the scales of a prior that is too narrow, and go on with them."""

@@ -1,0 +1,278 @@
+"""Frames of reference stars in one likelihood with those of the target."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+from astropy.io import fits
+from astropy.time import Time
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.detection import sources_of_references
+from pyklip_diffrender.linear.frames import FrameRows
+from pyklip_diffrender.pattern import PatternChoice, choose_systematics, pattern_for_visit
+from pyklip_diffrender.reduction import ReduceOptions, Visit
+from pyklip_diffrender.reduction.visit import rough_settings, with_references
+from pyklip_diffrender.refinement import GaussNewton, Refinement, join_frames, refine
+from pyklip_diffrender.refinement.mode_priors import ModePriors, exposure_sequences
+from pyklip_diffrender.scene import Observation, Planet
+from pyklip_diffrender.wavefront.bases import default_basis
+from pyklip_diffrender.wavefront.priors import WavefrontPrior
+
+SIZE, NPIX = 32, 64
+FLUX, FLAT, DRIFT = 1e8, 0.02, 1e-9
+PLANET = Planet(3e-5, 0.7, 40.0)
+SETTINGS = GaussNewton(
+    free=("star_offset", "flux", "background"), cycles=8.0, grow_basis=False,
+    prior=WavefrontPrior({"segment": 6.0, "texture": 3.0}, knee=1.0, fit_scales=False),
+    companions_if_stalled=False, min_model_error=0.002, robust=3.0,
+)  # fmt: skip
+OPD = dr.random_opd(1, npix=NPIX)
+
+
+@cache
+def model() -> dr.OpticalSystem:
+    return dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=NPIX, fov_pixels=SIZE)
+
+
+def image(change: int, place: tuple[float, float], drift: float = DRIFT) -> np.ndarray:
+    """A point source of flux 1 with a wavefront that differs from the map."""
+    now = OPD.data + dr.random_opd(90, npix=NPIX, rms=4e-9).data
+    now = now + dr.random_opd(100 + change, npix=NPIX, rms=drift).data
+    with torch.no_grad():
+        return np.asarray(model()(torch.from_numpy(now), star_offset=place).numpy())
+
+
+def frame(star: str, k: int, light: np.ndarray, **facts: Any) -> Observation:
+    """A frame with the flat-field errors of these pixels and noise of its own."""
+    flat = 1 + FLAT * np.random.default_rng(5).normal(size=light.shape)
+    error = np.sqrt(0.25 + 0.01 * np.abs(light))
+    data = flat * light + error * np.random.default_rng(k).normal(size=light.shape)
+    header = fits.Header(
+        {"INSTRUME": "NIRCAM", "DETECTOR": "NRCA2", "CORONMSK": "MASKA335R", "TARGPROP": star}
+    )
+    facts = {
+        "date": Time(f"2022-10-03T0{k}:00"),
+        "position_angles": np.array([facts.pop("angle", 0.0)]),
+        "reference": star != "HD 1",
+        "first_pixel": (600, 1600),
+        **facts,
+    }
+    return Observation.from_arrays(
+        data, error, unit=u.MJy / u.sr, pixelscale=model().detector.pixelscale, filter="F444W",
+        name=f"{star} {k}", header=header, **facts,
+    )  # fmt: skip
+
+
+@cache
+def science() -> tuple[Observation, ...]:
+    frames = []
+    for k, (roll, place) in enumerate([(0.0, (0.002, -0.003)), (10.0, (-0.003, 0.001))]):
+        x, y = PLANET.rotated(-roll).offset
+        light = image(k, place)
+        light = light + PLANET.contrast * image(k, (place[0] + x, place[1] + y))
+        frames.append(frame("HD 1", k + 1, FLUX * light, angle=roll))
+    return tuple(frames)
+
+
+def reference(k: int, brightness: float = 2.0, **changes: Any) -> Observation:
+    place = ((0.0, 0.0), (0.01, 0.01), (-0.01, 0.01))[k % 3]
+    companion = changes.pop("companion", 0.0)
+    light = image(10 + k, place, changes.pop("drift", DRIFT))
+    if companion:
+        light = light + companion * image(10 + k, (place[0] + 0.5, place[1] - 0.4))
+    return frame("HD 2", k + 4, brightness * FLUX * light, **{"angle": 50.0, **changes})
+
+
+@cache
+def alone() -> tuple[PatternChoice, Refinement]:
+    """The pattern of the rolls themselves, and the fit of the target with it."""
+    choice = choose_systematics(science(), (), model(), OPD, settings=SETTINGS)
+    assert choice.origin == "rolls"
+    fit = refine(model(), science(), OPD, systematics=choice.systematics, settings=SETTINGS)
+    return choice, fit
+
+
+def joined(*references: Observation, **keywords: Any) -> tuple[Refinement, Visit]:
+    choice, fit = alone()
+    return with_references(fit, choice, references, **keywords)
+
+
+def limit(fit: Refinement) -> float:
+    curve = dr.contrast_curve(fit, [0.5, 0.7], scatter=1.0)
+    return float(np.mean(curve["contrast"]))
+
+
+def test_references_make_the_limits_deeper_and_leave_the_planet_alone() -> None:
+    fit, visit = joined(*(reference(k) for k in range(3)))
+    assert [each.use for each in visit.contributions] == ["joint"] * 3
+    assert visit.gain == pytest.approx(limit(alone()[1]) / limit(fit), rel=0.1)
+    assert visit.gain > 1.15
+    for each in visit.contributions:
+        assert each.flux == pytest.approx(2.0, rel=0.05)
+        assert 0.4 < each.chi2 < 1.3
+        assert 0 < each.drift < 6
+    assert len(visit.table) == 3
+    assert visit.table["drift"].unit == u.nm
+    detection = dr.detect(fit)
+    assert len(detection.candidates) == 1
+    row = detection.candidates[0]
+    assert abs(float(row["contrast"]) - PLANET.contrast) < 3 * float(row["contrast_error"])
+    distant = np.hypot(*np.moveaxis(detection.grid, -1, 0)) > 0.3
+    assert 0.8 < np.nanstd(detection.residual_snr[distant]) < 1.2
+
+
+def test_a_companion_of_a_reference_is_masked_and_named() -> None:
+    fit, visit = joined(*(reference(k, companion=6e-4) for k in range(2)))
+    assert [each.use for each in visit.contributions] == ["joint"] * 2
+    for each in visit.contributions:
+        assert "arcsec is subtracted and masked" in each.reason
+    for part in fit.frames[2:]:
+        away = np.hypot(part.grid[..., 0] - 0.5, part.grid[..., 1] + 0.4)
+        assert not part.observation.valid[0, away < 0.15].any()
+        assert part.observation.valid[0, away > 0.4].mean() > 0.95
+    assert not sources_of_references(fit)
+    # Without the mask, the target would have a hole at the pixels of the companion.
+    detection = dr.detect(fit)
+    assert len(detection.candidates) == 1
+    assert np.nanmin(detection.residual_snr) > -5
+
+
+def test_a_reference_that_contradicts_the_target_is_left_out_by_name() -> None:
+    turned = reference(1)
+    turned = replace(turned, data=turned.data[:, ::-1].copy(), name="mirrored")
+    fit, visit = joined(reference(0), turned)
+    assert [each.use for each in visit.contributions] == ["joint", "left out"]
+    assert "chi-squared" in visit.contributions[1].reason
+    assert [part.observation.name for part in fit.frames] == ["HD 1 1", "HD 1 2", "HD 2 4"]
+
+
+def test_the_fit_of_the_target_is_kept_where_references_do_not_help() -> None:
+    faint = reference(0, brightness=0.01)
+    fit, visit = joined(faint)
+    assert fit is alone()[1]
+    assert [each.use for each in visit.contributions] == ["left out"]
+    assert "of the target's flux" in visit.contributions[0].reason
+    assert joined() == (alone()[1], Visit())
+
+
+def test_frames_that_do_not_fit_into_the_memory_are_left_out(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    derivatives = 4.0 * alone()[1].linear.frames[0].jacobian.numel()
+    # The process and the two rolls, and one frame more.
+    memory = (1.3e9 + (2 + 1.5 * 2.2) * derivatives) / 0.9
+    choice, fit = alone()
+    fit = replace(fit, settings=replace(fit.settings, memory=memory))
+    _, visit = with_references(fit, choice, [reference(0), reference(1)], memory=memory)
+    assert [each.use for each in visit.contributions] == ["joint", "left out"]
+    assert "memory" in visit.contributions[1].reason
+    assert "--memory" in caplog.text
+
+
+def test_bad_pixels_of_the_target_are_bad_in_the_references() -> None:
+    choice, fit = alone()
+    frames = list(fit.frames)
+    for k, part in enumerate(frames):
+        valid = part.observation.valid.copy()
+        valid[:, 20, 9] = False
+        frames[k] = replace(part, observation=replace(part.observation, valid=valid))
+    fit = replace(fit, frames=tuple(frames))
+    joint = join_frames(
+        fit, [reference(0)], rough_settings(SETTINGS), systematics=choice.systematics
+    )
+    assert not joint.frames[2].observation.valid[0, 20, 9]
+    assert joint.frames[2].observation.valid[0, 20, 10]
+
+
+def test_a_known_flux_of_the_target_is_not_that_of_a_reference() -> None:
+    choice, fit = alone()
+    frames = tuple(replace(each, start={**each.start, "flux": each.flux}) for each in fit.frames)
+    settings = replace(SETTINGS, deviations={"flux": 1e-3})
+    joint = join_frames(
+        replace(fit, frames=frames), [reference(0)], settings, systematics=choice.systematics
+    )
+    assert joint.frames[0].flux == pytest.approx(fit.frames[0].flux, rel=5e-3)
+    assert joint.frames[2].flux == pytest.approx(2 * FLUX, rel=0.05)
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_only_frames_of_the_same_pixels_share_a_pattern(other: bool) -> None:
+    place = (640, 1600) if other else (600, 1600)
+    choice, fit = alone()
+    joint = join_frames(
+        fit, [reference(0, first_pixel=place)], SETTINGS, systematics=choice.systematics
+    )
+    shares = [bool((part.common != 0).any()) for part in joint.linear.frames]
+    assert shares == [True, True, not other]
+    # Where its pixels are its own, the pattern is noise of the frame.
+    weight, noise = joint.linear.frames[2].weight, joint.frames[2].observation.error[0]
+    ratio = np.median((1 / weight[weight > 0]).numpy() / noise[weight.numpy() > 0])
+    assert (ratio > 1.05) == other
+
+
+def test_a_pattern_is_not_learned_twice_from_a_reference() -> None:
+    choice, _ = alone()
+    library = replace(choice, origin="library")
+    assert pattern_for_visit(library, science(), [reference(0)]) is not None
+    given = replace(choice, origin="given")
+    assert pattern_for_visit(given, science(), [reference(0)]) is choice.systematics
+    off = replace(choice, origin="off", systematics=None)
+    assert pattern_for_visit(off, science(), [reference(0)]) is None
+    elsewhere = [reference(0, first_pixel=(700, 1600))]
+    assert pattern_for_visit(replace(choice, origin="none"), science()[:1], elsewhere) is None
+
+
+def test_exposure_sequences() -> None:
+    frames = [*science(), *(reference(k) for k in range(3))]
+    assert exposure_sequences(frames) == [0, 1, 2, 2, 2]
+    late = reference(3, date=Time("2022-10-03T12:00"))
+    assert exposure_sequences([*frames, late]) == [0, 1, 2, 2, 2, 3]
+    rolled = reference(2, angle=60.0)
+    assert exposure_sequences([reference(0), rolled]) == [0, 1]
+
+
+def test_dithers_share_a_drift_and_have_one_of_their_own() -> None:
+    basis = default_basis(6.0, model().entrance)
+    drift = WavefrontPrior({"segment": 0.8, "texture": 0.5})
+    settings = replace(SETTINGS, drift=drift, drift_cycles=4.0)
+    frames = [*science(), reference(0), reference(1)]
+    every = ModePriors.of(settings, basis, frames)
+    assert every.blocks == ((0,), (1,), (2,), (3,))
+    shared = ModePriors.of(replace(settings, dither_drift=drift), basis, frames)
+    assert shared.blocks == ((0,), (1,), (2, 3), (2, 4))
+    assert len(shared.shape) == len(basis) + 5 * shared.drift
+    assert shared.names[-2:] == ("segment dither", "texture dither")
+    # Values by row and sums over rows are adjoint.
+    rng = torch.Generator().manual_seed(1)
+    part = FrameRows(torch.tensor([0, 1, 2, 3]), torch.tensor([[4, 5], [6, 7]]), first_mode=2)
+    unknowns = torch.randn(8, dtype=torch.float64, generator=rng)
+    rows = torch.randn(4, dtype=torch.float64, generator=rng)
+    assert torch.dot(part.of_unknowns(unknowns), rows) == pytest.approx(
+        float(torch.dot(unknowns, part.onto_unknowns(rows, 8))), rel=1e-12
+    )
+    assert part.of_unknowns(unknowns)[2] == unknowns[2] + unknowns[4] + unknowns[6]
+
+
+@pytest.mark.parametrize(("rms", "least", "most"), [(0.2e-9, 0.0, 0.9), (5e-9, 1.5, 5.0)])
+def test_the_size_of_the_drift_is_that_of_the_frames(rms: float, least: float, most: float) -> None:
+    choice, fit = alone()
+    stated = WavefrontPrior({"segment": 0.6, "texture": 0.3}, knee=1.0)
+    settings = replace(SETTINGS, drift=stated, dither_drift=stated, drift_cycles=6.0)
+    joint = join_frames(
+        fit, [reference(k, drift=rms) for k in range(3)], settings, systematics=choice.systematics
+    )
+    assert least < joint.scales["texture dither"] / 0.3 < most
+    assert joint.scales["texture dither"] <= 4.0001 * 0.3
+
+
+def test_use_of_references_is_one_of_three() -> None:
+    assert ReduceOptions().references == "joint"
+    with pytest.raises(dr.errors.IncompatibleSetupError, match="joint, pattern, off"):
+        ReduceOptions(references="both")
