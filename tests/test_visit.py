@@ -101,7 +101,7 @@ def alone() -> tuple[PatternChoice, Refinement]:
 
 def joined(*references: Observation, **keywords: Any) -> tuple[Refinement, Visit]:
     choice, fit = alone()
-    return with_references(fit, choice, references, **keywords)
+    return with_references(fit, choice, references, **keywords)[:2]
 
 
 def limit(fit: Refinement) -> float:
@@ -162,6 +162,24 @@ def test_the_fit_of_the_target_is_kept_where_references_do_not_help() -> None:
     assert joined() == (alone()[1], Visit())
 
 
+def test_limits_are_compared_as_they_are_stated() -> None:
+    choice, fit = alone()
+    searched = []
+
+    def search(one: Refinement) -> dr.Detection:
+        searched.append(one)
+        # With references, the S/N scatters by twice as much as it should.
+        return dr.detect(one, scatter=float(len(searched)), relinearise=1e9)
+
+    kept, visit, detection = with_references(fit, choice, [reference(0)], search=search)
+    assert searched[0] is fit
+    assert len(searched) == 2
+    assert kept is fit
+    assert detection is not None
+    assert detection.scatter == 1.0
+    assert "limits would be" in visit.contributions[0].reason
+
+
 def test_frames_that_do_not_fit_into_the_memory_are_left_out(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -170,7 +188,7 @@ def test_frames_that_do_not_fit_into_the_memory_are_left_out(
     memory = (1.3e9 + (2 + 1.5 * 2.2) * derivatives) / 0.9
     choice, fit = alone()
     fit = replace(fit, settings=replace(fit.settings, memory=memory))
-    _, visit = with_references(fit, choice, [reference(0), reference(1)], memory=memory)
+    _, visit, _ = with_references(fit, choice, [reference(0), reference(1)], memory=memory)
     assert [each.use for each in visit.contributions] == ["joint", "left out"]
     assert "memory" in visit.contributions[1].reason
     assert "--memory" in caplog.text

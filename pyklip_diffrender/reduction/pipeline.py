@@ -27,7 +27,7 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern import PatternChoice, fit_with_pattern
 from pyklip_diffrender.reduction.options import ReduceOptions
 from pyklip_diffrender.reduction.reduction_result import Reduction
-from pyklip_diffrender.reduction.visit import Visit, rough_settings, with_references
+from pyklip_diffrender.reduction.visit import Joined, rough_settings, with_references
 from pyklip_diffrender.refinement import (
     Refinement,
     refine,
@@ -197,7 +197,7 @@ class _Run:
             memory=options.memory,
             progress=self.progress,
         )
-        fit, visit = self._with_references(fit, choice)
+        fit, visit, detection = self._with_references(fit, choice)
         sequence = replace(self.preparation.sequence, science=choice.science)
         disk = wide = injections = fractions = None
         if options.disk:
@@ -205,14 +205,15 @@ class _Run:
                 disk = fit_disk(fit, progress=self.progress)
                 fit = disk.fit
         with stage("search"):
-            detection = self._search(fit, disk)
+            if detection is None or disk is not None:
+                detection = self._search(fit, disk)
             if options.wide:
                 wide = wide_field(detection, whole)
         cleaned = None if wide is None else wide.subtracted(whole, sequence.science)
         if cleaned is not None:
             with stage("star and search without the light of sources beyond the fitted pixels"):
-                fit, visit = self._with_references(self._fit(cleaned, choice), choice)
-                detection = self._search(fit)
+                fit, visit, searched = self._with_references(self._fit(cleaned, choice), choice)
+                detection = searched or self._search(fit)
                 wide = wide_field(detection, whole)
         if options.injections and len(detection.contrast_curve):
             with stage(f"{options.injections} injected planets"):
@@ -272,24 +273,29 @@ class _Run:
         """
         return bool(self._joining) and choice.origin != "library"
 
-    def _with_references(self, fit: Refinement, choice: PatternChoice) -> tuple[Refinement, Visit]:
+    def _with_references(self, fit: Refinement, choice: PatternChoice) -> Joined:
         """Fit target and reference stars together."""
         memory = self.preparation.options.memory
-        joint, visit = with_references(
+        joined = with_references(
             fit,
             choice,
             self._joining,
+            # A pattern of the library may describe these frames better than its linear model says.
+            search=None if self._joins_early(choice) else self._search,
             memory=None if memory is None else to_bytes(memory, "memory"),
             progress=self.progress,
         )
-        if joint is fit and self._joins_early(choice):
+        if joined.fit is fit and self._joins_early(choice):
             full = choice.settings or settings_for(choice.science[0])
             with stage("wavefront of the target alone"):
-                joint = refine_again(
-                    fit, tolerance=full.tolerance, widen_prior=full.widen_prior,
+                whole = refine_again(
+                    fit,
+                    tolerance=full.tolerance,
+                    widen_prior=full.widen_prior,
                     progress=self.progress,
-                )  # fmt: skip
-        return joint, visit
+                )
+            joined = joined._replace(fit=whole)
+        return joined
 
     def _search(self, fit: Refinement, disk: Disk | None = None) -> Detection:
         return detect(
@@ -306,7 +312,8 @@ class _Run:
 
         def search(science: Iterable[Observation]) -> Detection:
             if disk is None:
-                return self._search(self._with_references(self._fit(science, choice), choice)[0])
+                joined = self._with_references(self._fit(science, choice), choice)
+                return joined.detection or self._search(joined.fit)
             whole = [
                 replace(frame, data=frame.data + light)
                 for frame, light in zip(science, disk.light, strict=True)

@@ -16,15 +16,16 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from astropy.table import QTable
 from numpy.typing import NDArray
 
-from pyklip_diffrender.detection import contrast_curve, sources_of_references
+from pyklip_diffrender.detection import Detection, contrast_curve, sources_of_references
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.progress import stage
 from pyklip_diffrender.pattern import PatternChoice, pattern_for_visit, with_known_pattern
@@ -150,6 +151,23 @@ class Visit:
         return table
 
 
+class Joined(NamedTuple):
+    """The fit of a target that was kept, with or without the frames of reference stars.
+
+    Attributes
+    ----------
+    fit : Refinement
+        The target's frames come first.
+    visit : Visit
+    detection : Detection or None
+        Its search, if there was one.
+    """
+
+    fit: Refinement
+    visit: Visit
+    detection: Detection | None = None
+
+
 def rough_settings(settings: GaussNewton) -> GaussNewton:
     """Settings of a fit of the target from which the fit of all frames goes on."""
     return replace(settings, tolerance=max(settings.tolerance, _ROUGH), widen_prior=False)
@@ -160,9 +178,10 @@ def with_references(
     choice: PatternChoice,
     references: Sequence[Observation],
     *,
+    search: Callable[[Refinement], Detection] | None = None,
     memory: float | None = None,
     progress: bool = False,
-) -> tuple[Refinement, Visit]:
+) -> Joined:
     """Fit the frames of reference stars together with those of the target.
 
     Parameters
@@ -173,6 +192,9 @@ def with_references(
         Its flat-field pattern.
     references : sequence of Observation
         Cut like the target's frames.
+    search : callable, optional
+        Searches a fit. With it, limits are compared as they are stated, with errors scaled to the
+        scatter of the S/N; by default, as the linear models predict them.
     memory : float, optional
         Bytes that the process may take; frames that do not fit are left out.
     progress : bool
@@ -180,12 +202,10 @@ def with_references(
 
     Returns
     -------
-    fit : Refinement
-        The target's frames come first; that of the target alone if it has the deeper limits.
-    visit : Visit
+    Joined
     """
     if not references or not fit.status.usable:
-        return fit, Visit()
+        return Joined(fit, Visit())
     left_out: dict[str, str] = {}
     used = _that_fit_into(memory, fit, references, left_out)
     pattern = pattern_for_visit(choice, [each.observation for each in fit.frames], used)
@@ -222,17 +242,20 @@ def with_references(
             left_out |= contradicting
             used = [each for each in used if each.name not in contradicting]
     if joint is None or not joint.status.usable:
-        return fit, Visit(_left_out(references, left_out))
-    gain = _gain(fit, joint)
+        return Joined(fit, Visit(_left_out(references, left_out)))
+    searches = None if search is None else (search(fit), search(joint))
+    gain = _gain(fit, joint) if searches is None else _stated_gain(*searches)
     _log.info("limits with the reference frames are %.2f times deeper than without", gain)
-    if not gain > 1 or (fit.status.calibrated and not joint.status.calibrated):
-        reason = (
-            f"limits would be {1 / gain:.2f} times those without it"
-            if gain <= 1 else "the model does not explain it together with the target"
-        )  # fmt: skip
-        left_out |= {each.name: reason for each in used}
-        return fit, Visit(_left_out(references, left_out))
-    return joint, Visit(_contributions(joint, references, left_out, remarks), gain)
+    if gain > 1 and (joint.status.calibrated or not fit.status.calibrated):
+        visit = Visit(_contributions(joint, references, left_out, remarks), gain)
+        return Joined(joint, visit, searches and searches[1])
+    reason = (
+        "the model does not explain it together with the target"
+        if gain > 1
+        else f"limits would be {1 / gain:.2f} times those without it"
+    )
+    left_out |= {each.name: reason for each in used}
+    return Joined(fit, Visit(_left_out(references, left_out)), searches and searches[0])
 
 
 def _that_fit_into(
@@ -334,6 +357,18 @@ def _gain(alone: Refinement, joint: Refinement) -> float:
         separations = [each for each in _SEPARATIONS if each < edge] or [edge / 2]
         curve = contrast_curve(fit, separations, angles=_ANGLES, scatter=1.0)
         curves.append(fit.frames[0].flux * np.asarray(curve["contrast"]))
+    return float(np.nanmedian(curves[0] / curves[1]))
+
+
+def _stated_gain(alone: Detection, joint: Detection) -> float:
+    """The same for limits as they are stated."""
+    curves = []
+    for detection in (alone, joint):
+        curve = detection.contrast_curve
+        separations = curve["separation"].to_value("arcsec")
+        chosen = (separations >= _SEPARATIONS[0]) & (separations <= _SEPARATIONS[-1])
+        flux = detection.fits[0].frames[0].flux
+        curves.append(flux * np.asarray(curve["contrast"])[chosen if chosen.any() else ...])
     return float(np.nanmedian(curves[0] / curves[1]))
 
 
