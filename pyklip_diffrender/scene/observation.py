@@ -150,7 +150,11 @@ class Observation:
 
     @classmethod
     def from_fits(
-        cls, path: str | os.PathLike[str], *, every_integration: bool = False
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        every_integration: bool = False,
+        star: tuple[float, float] | None = None,
     ) -> Observation:
         """Read a JWST stage-2 coronagraphic file (calints).
 
@@ -170,6 +174,8 @@ class Observation:
         path : path
         every_integration : bool
             Keep a frame for every integration; those that are left out have no valid pixel.
+        star : tuple of float, optional
+            x, y of the star in the file, pixels from 0, in place of what the header says.
 
         Raises
         ------
@@ -181,7 +187,7 @@ class Observation:
         ShapeError, NoValidPixelsError
             As `from_arrays`.
         """
-        return cls(**frames_of_file(path, every_integration=every_integration))
+        return cls(**frames_of_file(path, every_integration=every_integration, star=star))
 
     def part(self, which: NDArray[np.intp]) -> Observation:
         """Select frames by their indices."""
