@@ -41,6 +41,10 @@ EPOCH = 5.0
 """Days between frames that may share a wavefront map."""
 
 
+_TWO_STARS = 1.0
+"""arcsec between stars with other names on one date that are not one star."""
+
+
 def choose_filter(files: Sequence[FrameFile], filter: str | None) -> str:
     """Exclude frames of other filters; returns the one that is left.
 
@@ -169,6 +173,7 @@ def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
         alike = [
             group for group in groups
             if any(each.exposure.star.is_same(other.exposure.star) for other in group)
+            and not any(_are_two_stars(each.exposure, other.exposure) for other in group)
         ]  # fmt: skip
         groups = [group for group in groups if group not in alike]
         groups.append([other for group in alike for other in group] + [each])
@@ -184,6 +189,20 @@ def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
             name = f"{name} {at}"
         stars[name] = group
     return stars
+
+
+def _are_two_stars(one: Exposure, other: Exposure) -> bool:
+    """Whether two exposures of one epoch show stars with other names, more than an arcsec apart.
+
+    The stars of a binary are; coordinates of one star may differ by more between epochs.
+    """
+    apart = one.star.separation(other.star)
+    if apart is None or apart <= _TWO_STARS or not (one.star.names and other.star.names):
+        return False
+    if any(other.star.is_called(name) for name in one.star.names):
+        return False
+    dates = one.date, other.date
+    return None not in dates and abs(one.date.mjd - other.date.mjd) <= EPOCH
 
 
 def _namesake(star: CatalogueStar, target: CatalogueStar) -> str:

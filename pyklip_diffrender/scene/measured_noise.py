@@ -202,8 +202,8 @@ def why_odd_noise(ratios: Iterable[float]) -> str:
             return (
                 f"far from the star, where the frame is darkest, its pixels scatter {ratio:.2g} "
                 f"times as much as ERR says, expected {low:g} to {high:g} times. ERR is probably "
-                "in another unit than SCI, a variance, or of other frames; or SCI was multiplied by a "
-                "factor; or a crowded field or a nebula leaves no dark part of the frame"
+                "in another unit than SCI, a variance, or of other frames; or SCI was multiplied "
+                "by a factor; or a crowded field or a nebula leaves no dark part of the frame"
             )
     return ""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -192,6 +193,43 @@ class Observation:
     def part(self, which: NDArray[np.intp]) -> Observation:
         """Select frames by their indices."""
         return replace(self, **selected(vars(self), which))
+
+    def continues_in(self, other: Observation) -> bool:
+        """Whether the frames of another observation can be added to these, as one pointing."""
+        if (self.position_angles is None) != (other.position_angles is None):
+            return False
+        if (self.shape, self.unit, self.first_pixel) != (
+            other.shape, other.unit, other.first_pixel,
+        ):  # fmt: skip
+            return False
+        return len(self.followed_by([other]).pointings()) == 1
+
+    def followed_by(self, others: Sequence[Observation]) -> Observation:
+        """Add the frames of other observations of the exposure; see `continues_in`."""
+        if not others:
+            return self
+        every = (self, *others)
+        changed: dict[str, Any] = {
+            key: np.concatenate([getattr(each, key) for each in every])
+            for key in ("data", "error", "valid", "center", "position_angles")
+            if getattr(self, key) is not None
+        }
+        offsets = [each.star_offset for each in every if each.star_offset is not None]
+        if len(offsets) == len(every):
+            x, y = np.average(offsets, axis=0, weights=[len(each) for each in every])
+            changed["star_offset"] = (float(x), float(y))
+        middles = [each.mid_date for each in every if each.mid_date is not None]
+        if len(middles) == len(every):
+            changed["mid_date"] = Time(middles).mean()
+        dates = [each.date for each in every if each.date is not None]
+        return replace(
+            self,
+            date=min(dates) if dates else None,
+            name=f"{self.name} and {len(others)} more",
+            remarks=tuple(remark for each in every for remark in each.remarks),
+            noise_ratios=tuple(ratio for each in every for ratio in each.noise_ratios),
+            **changed,
+        )
 
     def pointings(self) -> tuple[Observation, ...]:
         """Split frames that show the star at different places or orientations.

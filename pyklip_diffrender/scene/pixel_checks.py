@@ -179,8 +179,8 @@ def why_no_star(observation: Observation) -> str:
 
 
 _INSIST = (
-    "Look at the frames. If the star is behind the mask, say where: star=(x, y) or --star x,y, in "
-    "pixels from 0"
+    "Look at the frames. If the star is behind the mask, give its place in the file as star "
+    "(--star), x and y in pixels from 0"
 )
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -190,7 +191,7 @@ class Sequence:
         tuple of Sequence
             In order of time.
         """
-        return cls._by_epoch(_usable(files, references, star), target, filter)
+        return cls._by_epoch(_usable(files, references, star, target), target, filter)
 
     @classmethod
     def by_filter_and_epoch(
@@ -211,7 +212,7 @@ class Sequence:
         tuple of Sequence
             In order of time.
         """
-        listed = _usable(files, references, star)
+        listed = _usable(files, references, star, target)
         if filter is not None:
             return cls._by_epoch(listed, target, filter)
         science, _ = choose_target([replace(each) for each in listed], target)
@@ -267,6 +268,7 @@ class Sequence:
         dates = [each.exposure.date for each in chosen if each.exposure.date is not None]
         rows, excluded = [], []
         used: dict[str, list[Observation]] = {"target": [], "reference": []}
+        exposures: dict[str, str] = {}
         for each in listed:
             reason = each.reason
             if not reason and each not in chosen and (each in science or not _near(each, dates)):
@@ -281,13 +283,14 @@ class Sequence:
             for part in () if observation is None else observation.pointings():
                 part = replace(part, reference=use == "reference")
                 used[use].append(part)
+                exposures[part.name] = re.sub(r"-seg\d+", "", each.exposure.identity or part.name)
                 remark = "; ".join(part.remarks)
                 rows.append(Row(use, each.star, each.exposure, part, remark, each.path))
         rows.sort(key=lambda row: (("target", "reference", "excluded").index(row.use), row.time))
         return cls(
             star,
-            tuple(sorted(used["target"], key=_time)),
-            tuple(sorted(used["reference"], key=_time)),
+            tuple(sorted(_with_segments_joined(used["target"], exposures), key=_time)),
+            tuple(sorted(_with_segments_joined(used["reference"], exposures), key=_time)),
             tuple(excluded),
             tuple(rows),
         )
@@ -332,17 +335,39 @@ def _usable(
     files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     references: Iterable[str | os.PathLike[str]],
     star: tuple[float, float] | None = None,
+    target: str | None = None,
 ) -> list[FrameFile]:
     """Files with the reasons of those that cannot be used, of which some are left."""
     listed = exposures_in(files, references)
     if star is not None:
         place = _star_place(star)
+        marked = all(each.exposure.reference for each in listed if not each.reason)
         for each in listed:
-            if not each.exposure.reference:
+            named = target is not None and each.exposure.star.is_called(target)
+            if named or (target is None and (marked or not each.exposure.reference)):
                 each.place = place
     exclude_unusable(listed, judge_frames)
     require_some(listed)
     return listed
+
+
+def _with_segments_joined(
+    observations: Iterable[Observation], exposures: Mapping[str, str]
+) -> list[Observation]:
+    """Join the segments of an exposure that show the star at one place and angle.
+
+    `exposures` is the exposure of every observation by name. How an exposure was cut into files
+    then makes no difference.
+    """
+    joined: list[list[Observation]] = []
+    for each in observations:
+        for group in joined:
+            if exposures[group[0].name] == exposures[each.name] and group[0].continues_in(each):
+                group.append(each)
+                break
+        else:
+            joined.append([each])
+    return [group[0].followed_by(group[1:]) for group in joined]
 
 
 def _star_place(star: object) -> tuple[float, float]:
