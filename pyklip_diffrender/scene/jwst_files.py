@@ -305,7 +305,8 @@ def on_detector_pixels(
     good &= np.roll(usable, (up, right), axis=(1, 2))
     column, row = (int(each) for each in begin - pixels)
     sure = mask is not None and on_detector((column, row), data.shape[1:])
-    if sure and is_measured and not _records_agree(arguments, center - mask - shifts):
+    agree = mask is not None and _records_agree(arguments, center - mask - shifts)
+    if sure and is_measured and not agree:
         # The whole pixels of the place are those of the star's stated position.
         frame = shifted[0], sigma[0], good[0]
         scale = float(np.mean(arguments["pixelscale"]))
