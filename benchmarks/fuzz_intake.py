@@ -193,9 +193,8 @@ def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation])
                 faults.append(f"{name} is used")
             continue
         several = len(sequence.science) > 1
-        if name in folder.segments:
-            if not each.name.endswith(" and 1 more"):
-                faults.append(f"{name} is not joined with its second segment")
+        if name in folder.segments and not each.name.endswith(" and 1 more"):
+            faults.append(f"{name} is not joined with its second segment")
         lit = name in folder.lit
         if lit and name not in folder.doubtful and each.first_pixel != twin[source].first_pixel:
             faults.append(f"{name}: its place on the detector is not known any more")
