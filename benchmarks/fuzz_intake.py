@@ -119,7 +119,8 @@ def check(
                 warnings.simplefilter("ignore")
                 sequence = _sequence(folder.path)
         except DiffrenderError as error:
-            return record | {"outcome": "refused", "message": str(error)}
+            outcome = "wrongly refused" if _is_usable(folder) else "refused"
+            return record | {"outcome": outcome, "message": str(error)}
         except Exception as error:
             return record | {"outcome": "crash", "message": repr(error)}
         faults = _faults(sequence, folder, twin)
@@ -153,8 +154,17 @@ def _mutated(frames: Path, place: Path, seed: int, rng: np.random.Generator) -> 
     return folder
 
 
+def _is_usable(folder: Folder) -> bool:
+    """Whether some frames of the target are as they were, and no others contradict them."""
+    good = set(folder.sources) - folder.bad - folder.doubtful
+    with_target = {source for source in folder.sources.values() if source in sorted(
+        {*folder.sources.values()}
+    )[:2]}  # fmt: skip
+    return bool(good & with_target) and not folder.unlike and not folder.doubtful
+
+
 def _source(name: str) -> str:
-    return name.partition(" (pointing")[0]
+    return name.partition(" (pointing")[0].partition(" and ")[0]
 
 
 def _all(sequence: dr.Sequence) -> list[Observation]:
@@ -183,7 +193,12 @@ def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation])
                 faults.append(f"{name} is used")
             continue
         several = len(sequence.science) > 1
-        faults += [f"{name}: {fault}" for fault in _differences(each, twin[source], several)]
+        if name in folder.segments and not each.name.endswith(" and 1 more"):
+            faults.append(f"{name} is not joined with its second segment")
+        lit = name in folder.lit
+        if lit and name not in folder.doubtful and each.first_pixel != twin[source].first_pixel:
+            faults.append(f"{name}: its place on the detector is not known any more")
+        faults += [f"{name}: {f}" for f in _differences(each, twin[source], several, lit=lit)]
     faults += [f"{source} is used {n} times" for source, n in used.items() if n > 1]
     reasons = dict(sequence.excluded)
     lone = any(_source(each.name) in folder.other for each in sequence.science)
@@ -191,15 +206,20 @@ def _faults(sequence: dr.Sequence, folder: Folder, twin: dict[str, Observation])
         untouched = not lone and name not in folder.bad | folder.doubtful
         if untouched and name == source and not used[source]:
             faults.append(f"{name} is not used: {reasons.get(name)}")
-        if name not in reasons and name not in {_source(e.name) for e in _all(sequence)}:
+        joined = name in folder.segments.values()
+        used_names = {_source(e.name) for e in _all(sequence)}
+        if name not in reasons and name not in used_names and not joined:
             faults.append(f"{name} is in no list")
     return faults + [f"{name}: no reason" for name, reason in reasons.items() if not reason]
 
 
-def _differences(got: Observation, expected: Observation, several: bool) -> list[str]:
+def _differences(
+    got: Observation, expected: Observation, several: bool, *, lit: bool = False
+) -> list[str]:
     """In what an observation is not that of the untouched file.
 
-    The orientation and the date need not be known of one roll alone.
+    The orientation and the date need not be known of one roll alone. With `lit`, there are other
+    sources in the field, and the pixels are not compared.
     """
     faults = []
     if got.reference != expected.reference:
@@ -229,7 +249,7 @@ def _differences(got: Observation, expected: Observation, several: bool) -> list
     both = mine.valid & other.valid
     if both.mean() < 0.9 * other.valid.mean():
         faults.append(f"only {both.mean():.0%} of the pixels")
-    if got.first_pixel is not None and got.first_pixel == expected.first_pixel:
+    if not lit and got.first_pixel is not None and got.first_pixel == expected.first_pixel:
         # Frames whose shift is known no longer are resampled otherwise, and compared in brightness.
         away = np.abs(mine.data - other.data)[both] / other.error[both]
         if np.quantile(away, 0.99) > 1.0 or (away > 5).mean() > 1e-3:
@@ -247,18 +267,18 @@ def _fit(sequence: dr.Sequence) -> np.ndarray:
 
 
 def _table(records: list[dict[str, Any]]) -> str:
-    outcomes = ("as untouched", "excluded", "refused", "wrong", "crash")
+    outcomes = ("as untouched", "excluded", "refused", "wrongly refused", "wrong", "crash")
     counts = {kind: Counter[str]() for kind in sorted(MUTATIONS)}
     for record in records:
         for kind in record["mutations"]:
             counts[kind][record["outcome"]] += 1
-    lines = [f"{'mutation':62s}" + "".join(f"{each:>13s}" for each in outcomes)]
+    lines = [f"{'mutation':62s}" + "".join(f"{each:>16s}" for each in outcomes)]
     lines += [
-        f"{kind:62s}" + "".join(f"{count[each]:13d}" for each in outcomes)
+        f"{kind:62s}" + "".join(f"{count[each]:16d}" for each in outcomes)
         for kind, count in counts.items()
     ]
     total = Counter(record["outcome"] for record in records)
-    lines.append(f"{f'{len(records)} folders':62s}" + "".join(f"{total[e]:13d}" for e in outcomes))
+    lines.append(f"{f'{len(records)} folders':62s}" + "".join(f"{total[e]:16d}" for e in outcomes))
     return "\n".join(lines)
 
 
@@ -278,7 +298,7 @@ def main() -> None:
         records = run(frames, seeds, options.output, options.fits)
     print(_table(records))
     for record in records:
-        if record["outcome"] in ("wrong", "crash"):
+        if record["outcome"] in ("wrong", "wrongly refused", "crash"):
             print(record)
 
 

@@ -9,11 +9,15 @@ from __future__ import annotations
 import gzip
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.io import fits
+from scipy.ndimage import shift
+
+import pyklip_diffrender as dr
 
 __all__ = ["MUTATIONS", "Folder"]
 
@@ -37,6 +41,10 @@ class Folder:
         Files that are wrong in a way which only other frames of the star show.
     other : set of str
         Files that belong to another set-up or epoch: wrong beside others, right alone.
+    lit : set of str
+        Files with other sources, which must be used on the same pixels of the detector.
+    segments : dict of str to str
+        Files that are the first part of an exposure, and those with the second.
     done : list of str
         What was done.
     """
@@ -47,6 +55,8 @@ class Folder:
     doubtful: set[str] = field(default_factory=set)
     unlike: set[str] = field(default_factory=set)
     other: set[str] = field(default_factory=set)
+    lit: set[str] = field(default_factory=set)
+    segments: dict[str, str] = field(default_factory=dict)
     done: list[str] = field(default_factory=list)
 
     def change(self, name: str, change: Change, rng: np.random.Generator) -> None:
@@ -170,6 +180,182 @@ def _copy(folder: Folder, name: str, rng: np.random.Generator) -> None:
 
     folder.add(f"z_{rng.integers(100)}.fits", name, change, rng)
     folder.bad.add(next(reversed(folder.sources)))
+
+
+# -- other sources in the field, products, segments ------------------------------------------------
+
+_TRANSMISSION = ((0.0, 0.3, 0.5, 0.8, 1.2, 9.0), (0.01, 0.055, 0.26, 0.71, 0.95, 1.0))
+"""Transmission of a source behind MASK335R at distances in arcsec, by the model."""
+
+_BRIGHTEST = 900.0
+"""Peaks of a source and of the star behind the mask, for sources as bright as the star."""
+
+
+@cache
+def _point_source() -> np.ndarray:
+    """Image of a source outside the mask, with its peak of 1 in the middle, (201, 201)."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=512, fov_pixels=281)
+    image = model(dr.random_opd(1, npix=512), (0.0, 2.5)).double().detach().numpy()
+    row, column = np.unravel_index(int(image.argmax()), image.shape)
+    return np.asarray(image[row - 100 : row + 101, column - 100 : column + 101] / image.max())
+
+
+def _with_source(contrast: float, separation: float, angle: float) -> Change:
+    """Add a source at a position angle from north, degrees, to every integration."""
+
+    def change(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+        del rng
+        data, header = hdus["SCI"].data, hdus["SCI"].header
+        x, y = (float(_card(hdus, key)[key]) - 1 for key in ("CRPIX1", "CRPIX2"))
+        roll = float(header["ROLL_REF"]) + float(header.get("V3I_YANG", 0.0))
+        turned = np.deg2rad(angle - roll)
+        away = np.array([np.cos(turned), -np.sin(turned)]) * separation / 0.0628
+        rows, columns = np.indices(data.shape[1:])
+        near = np.hypot(columns - x, rows - y) < 9
+        peak = float(np.nanmax(data[0][near]))
+        place = np.array([y, x]) + away
+        whole = np.round(place).astype(int)
+        source = shift(_point_source(), place - whole, order=3)
+        light = np.pad(np.zeros(data.shape[1:]), 400)
+        row, column = whole + 400
+        light[row - 100 : row + 101, column - 100 : column + 101] = source
+        scale = contrast * _BRIGHTEST * peak * np.interp(separation, *_TRANSMISSION)
+        data += (scale * light[400:-400, 400:-400]).astype(data.dtype)
+
+    return change
+
+
+def _everywhere(change: Change) -> Callable[[Folder, np.random.Generator], None]:
+    """Change all frames of the target, which must then be used as before."""
+
+    def mutate(folder: Folder, rng: np.random.Generator) -> None:
+        names = sorted(folder.sources)
+        with fits.open(folder.path / names[0]) as hdus:
+            target = hdus[0].header["TARGPROP"]
+        for name in names:
+            if name in folder.bad | folder.doubtful or not (folder.path / name).exists():
+                continue
+            with fits.open(folder.path / name) as hdus:
+                own = hdus[0].header.get("TARGPROP") == target
+            if own:
+                folder.change(name, change, rng)
+                folder.lit.add(name)
+
+    return mutate
+
+
+def _neighbours(count: int, contrasts: tuple[float, float], least: float, most: float) -> Mutation:
+    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
+        del name
+        for _ in range(count):
+            contrast = float(np.exp(rng.uniform(*np.log(contrasts))))
+            place = rng.uniform(least, most), rng.uniform(0.0, 360.0)
+            _everywhere(_with_source(contrast, *place))(folder, rng)
+
+    return mutate
+
+
+MUTATIONS["a neighbour"] = _neighbours(1, (1e-4, 0.03), 0.3, 6.0)
+MUTATIONS["a binary"] = _neighbours(1, (0.03, 0.1), 0.3, 6.0)
+MUTATIONS["two neighbours"] = _neighbours(2, (1e-4, 0.01), 0.5, 5.0)
+
+
+def _crowd(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    data = hdus["SCI"].data
+    rows, columns = np.indices(data.shape[1:])
+    x, y = (float(_card(hdus, key)[key]) - 1 for key in ("CRPIX1", "CRPIX2"))
+    peak = float(np.nanmax(data[0][np.hypot(columns - x, rows - y) < 9]))
+    light = np.zeros(data.shape[1:])
+    for a, b in rng.uniform(0, 1, (300, 2)) * data.shape[:0:-1]:
+        light += 10 ** rng.uniform(-3, 0) * np.exp(
+            -((columns - a) ** 2 + (rows - b) ** 2) / (2 * 1.1**2)
+        )
+    data += (peak * light).astype(data.dtype)
+
+
+def _nebula(hdus: fits.HDUList, rng: np.random.Generator) -> None:
+    data, error = hdus["SCI"].data, float(np.nanmedian(hdus["ERR"].data))
+    rows, columns = np.indices(data.shape[1:])
+    a, b = rng.uniform(0, 1, 2) * data.shape[:0:-1]
+    width = rng.uniform(15, 60)
+    light = np.exp(-((columns - a) ** 2 + (rows - b) ** 2) / (2 * width**2))
+    data += (error * rng.uniform(3, 30) * light).astype(data.dtype)
+
+
+def _in_all(change: Change) -> Mutation:
+    def mutate(folder: Folder, name: str, rng: np.random.Generator) -> None:
+        del name
+        _everywhere(change)(folder, rng)
+
+    return mutate
+
+
+MUTATIONS["300 field stars"] = _in_all(_crowd)
+MUTATIONS["a nebula"] = _in_all(_nebula)
+
+
+@_mutation("products of the package, several")
+def _products(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    for k in range(int(rng.integers(1, 6))):
+        keep = ("detection", "images", "fit")[k % 3]
+
+        def change(hdus: fits.HDUList, _: np.random.Generator, keep: str = keep) -> None:
+            hdus[0].header["DRVERS"] = "1.0"
+            if keep != "images":
+                del hdus["SCI"]
+            hdus[-1].header["EXTNAME"] = keep.upper()
+
+        folder.add(f"{keep}{k}.fits", name, change, rng)
+        folder.bad.add(f"{keep}{k}.fits")
+
+
+@_mutation("products of pyKLIP, several")
+def _klip_products(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    def change(hdus: fits.HDUList, _: np.random.Generator) -> None:
+        hdus[0].header["PSFSUB"], hdus[0].header["PYKLIPV"] = "pyKLIP", "2.8"
+
+    for k in range(int(rng.integers(1, 6))):
+        folder.add(f"klip{k}-KLmodes-all.fits", name, change, rng)
+        folder.bad.add(f"klip{k}-KLmodes-all.fits")
+
+
+@_mutation("unusable files of another set-up, several")
+def _unusable_others(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    cards: dict[str, Any] = [
+        {"CORONMSK": "MASKA430R", "SUBARRAY": "SUB320A430R", "APERNAME": "NRCA5_MASK430R"},
+        {"FILTER": "F356W"}, {"BUNIT": "Jy"}, {"PUPIL": "MASKBAR"},
+    ][rng.integers(4)]  # fmt: skip
+
+    def change(hdus: fits.HDUList, _: np.random.Generator) -> None:
+        _set(hdus, **cards, OBSERVTN=f"{rng.integers(20, 90):03d}", FILENAME="other.fits")
+        if rng.random() < 0.5:
+            del hdus["ERR"]
+        else:
+            hdus["SCI"].data = np.zeros_like(hdus["SCI"].data)
+
+    for k in range(int(rng.integers(1, 6))):
+        folder.add(f"other{k}.fits", name, change, rng)
+        folder.bad.add(f"other{k}.fits")
+
+
+@_mutation("segments of an exposure")
+def _segments(folder: Folder, name: str, rng: np.random.Generator) -> None:
+    # Two independent halves with the noise of a longer exposure each.
+    with fits.open(folder.path / name) as hdus:
+        error = np.nan_to_num(hdus["ERR"].data)
+        noise = (rng.normal(size=error.shape) * np.abs(error)).astype(np.float32)
+
+    def changed(sign: float, segment: int) -> Change:
+        def change(hdus: fits.HDUList, _: np.random.Generator) -> None:
+            hdus["SCI"].data = (hdus["SCI"].data + sign * noise).astype(np.float32)
+            hdus["ERR"].data = (hdus["ERR"].data * np.sqrt(2)).astype(np.float32)
+            _set(hdus, EXSEGNUM=segment, EXSEGTOT=2)
+
+        return change
+
+    folder.add(f"z-seg002_{name}", name, changed(-1.0, 2), rng)
+    folder.change(name, changed(1.0, 1), rng)
+    folder.segments[name] = f"z-seg002_{name}"
 
 
 # -- cards -----------------------------------------------------------------------------------------

@@ -587,3 +587,182 @@ def test_a_cube_of_several_rolls_is_split(tmp_path: Path) -> None:
     assert [each.name for each in turned.pointings()] == [
         "x.fits (pointing 1)", "x.fits (pointing 2)",
     ]  # fmt: skip
+
+
+# -- other sources in the field --------------------------------------------------------------------
+
+
+def neighbour(contrast: float, separation: float, angle: float) -> Any:
+    """Add a source next to the star, by the image of the coronagraph's model, to real frames."""
+    from pyklip_diffrender.instrument.nircam import nircam_coronagraph
+
+    model = nircam_coronagraph("F444W", monochromatic=4.4e-6, npix=256, fov_pixels=161)
+    place = separation * np.array([np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))])
+    opd = dr.random_opd(3, npix=256)
+    star, source = (
+        model(opd, tuple(offset)).double().detach().numpy() for offset in ((0.0, 0.0), place)
+    )
+
+    def change(hdus: fits.HDUList) -> None:
+        header, data = hdus["SCI"].header, hdus["SCI"].data
+        x, y = (round(header[key]) - 1 for key in ("CRPIX1", "CRPIX2"))
+        window = np.s_[:, y - 80 : y + 81, x - 80 : x + 81]
+        rows, columns = np.indices(star.shape) - 80
+        near = np.hypot(rows, columns) < 20
+        flux = np.nansum(data[window][0][near]) / star[near].sum()
+        data[window] += (contrast * flux * source).astype(data.dtype)
+
+    return change
+
+
+def real_roll(shared_data: Path, path: Path, change: Any) -> Path:
+    """G 7-34 in F444W, an aligned file, changed."""
+    name = "jw01184005001_03106_00001_nrcalong_calints.fits.gz"
+    with fits.open(shared_data / "gto1184" / name) as hdus:
+        change(hdus)
+        hdus.writeto(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("contrast", "separation", "angle"),
+    [(1e-3, 0.8, 10.0), (1e-3, 1.3, 100.0), (0.01, 0.5, 300.0), (0.03, 4.0, 40.0),
+     (0.1, 0.3, 70.0), (0.1, 1.0, 200.0), (0.1, 1.5, 20.0), (0.1, 2.5, 250.0)],
+)  # fmt: skip
+def test_a_neighbour_is_not_taken_for_the_star(
+    shared_data: Path, tmp_path: Path, contrast: float, separation: float, angle: float
+) -> None:
+    path = real_roll(shared_data, tmp_path / "a.fits", neighbour(contrast, separation, angle))
+    (frame,) = dr.Sequence.from_files(path).science
+    assert frame.first_pixel == (490, 1500)
+
+
+@pytest.mark.parametrize("unocculted", [False, True])
+def test_a_star_off_the_mask_is_refused_unless_the_user_insists(
+    shared_data: Path, tmp_path: Path, unocculted: bool
+) -> None:
+    def change(hdus: fits.HDUList) -> None:
+        data = hdus["SCI"].data.copy()
+        if unocculted:
+            neighbour(1.0, 1.5, 160.0)(hdus)
+            hdus["SCI"].data -= data
+            hdus["SCI"].data += np.random.default_rng(1).normal(size=data.shape) * hdus["ERR"].data
+        else:
+            hdus["SCI"].data[:] = np.roll(data, (17, -17), axis=(1, 2))
+
+    path = real_roll(shared_data, tmp_path / "a.fits", change)
+    with pytest.raises(NoValidPixelsError, match=r"a\.fits: its light is centred 1\.5.*--star"):
+        dr.Sequence.from_files(path)
+    (frame,) = dr.Sequence.from_files(path, star=(150.0, 174.5)).science
+    # The whole pixels of the alignment are undone.
+    assert np.abs((frame.center[0] - (150.0, 174.5) + 0.5) % 1 - 0.5).max() < 0.6
+    with pytest.raises(IncompatibleSetupError, match="star: got 'here', expected two finite"):
+        dr.Sequence.from_files(path, star="here")  # type: ignore[arg-type]
+
+
+def test_a_crowded_field_and_a_nebula_are_admitted(folder: Path) -> None:
+    rng = np.random.default_rng(7)
+    y, x = np.indices((SIDE, SIDE))
+    stars = sum(
+        10 ** rng.uniform(-0.5, 2.0) * np.exp(-(((x - a) ** 2 + (y - b) ** 2) / 2.4))
+        for a, b in rng.uniform(0, SIDE, (300, 2)) if np.hypot(a - 88, b - 91) > 12
+    )  # fmt: skip
+    nebula = 20 * np.exp(-(((x - 150) ** 2 + (y - 30) ** 2) / 2 / 40**2))
+    for k, light in ((5, stars), (6, nebula)):
+        calints(
+            folder / f"f{k}.fits", observation=k, roll=70.0 + k, date=f"2022-10-03T1{k}:00:00",
+            light=starlight() + light,
+        )  # fmt: skip
+    assert reasons(dr.Sequence.from_files(folder)) == {}
+
+
+# -- who votes -------------------------------------------------------------------------------------
+
+
+OTHER = {"CORONMSK": "MASKA430R", "SUBARRAY": "SUB320A430R", "APERNAME": "NRCA5_MASK430R"}
+
+
+def without(key: str) -> Any:
+    def spoil(path: Path) -> None:
+        with fits.open(path) as hdus:
+            del hdus[key]
+            hdus.writeto(path, overwrite=True)
+
+    return spoil
+
+
+def truncated(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:20000])
+
+
+def product(path: Path) -> None:
+    fits.setval(path, "DRVERS", value="0.1")
+
+
+def klip(path: Path) -> None:
+    fits.setval(path, "PSFSUB", value="pyKLIP")
+
+
+def empty(path: Path) -> None:
+    with fits.open(path) as hdus:
+        hdus["SCI"].data[:] = 0
+        hdus.writeto(path, overwrite=True)
+
+
+@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize("spoil", [without("SCI"), without("ERR"), truncated, product, klip, empty])
+@pytest.mark.parametrize("cards", [OTHER, {"FILTER": "F356W"}, {"TARGPROP": "HD 9"}])
+def test_files_that_cannot_be_used_do_not_vote(
+    folder: Path, spoil: Any, count: int, cards: dict[str, Any]
+) -> None:
+    names = [f"k{k}.fits" for k in range(count)]
+    star = cards.get("TARGPROP", "HD 1")
+    for k, name in enumerate(names):
+        spoil(calints(folder / name, star, observation=20 + k, roll=90.0 + k, cards=cards))
+    sequence = dr.Sequence.from_files(folder)
+    assert as_before(sequence, folder)
+    assert sorted(reasons(sequence)) == names
+    assert all(reasons(sequence).values())
+
+
+def test_a_copy_of_an_exposure_that_can_be_used_stands_in_for_it(folder: Path) -> None:
+    path = folder / FIRST
+    (folder / FIRST.replace("calints", "crfints")).write_bytes(path.read_bytes())
+    without("ERR")(path)
+    sequence = dr.Sequence.from_files(folder)
+    assert uses(sequence)[FIRST.replace("calints", "crfints")] == "target"
+    assert "ERR" in reasons(sequence)[FIRST]
+
+
+# -- segments and binaries -------------------------------------------------------------------------
+
+
+def test_segments_of_an_exposure_are_one_roll(folder: Path) -> None:
+    calints(folder / "seg2.fits", cards={"EXSEGNUM": 2}, date="2022-10-03T06:20:00", integrations=2)
+    first, second = dr.Sequence.from_files(folder).science
+    assert (len(first), len(second)) == (3, 1)
+    assert first.name == f"{FIRST} and 1 more"
+    assert len(first.noise_ratios) == 3
+    assert dict(zip(*(dr.Sequence.from_files(folder).table[k] for k in ("file", "use")),
+                    strict=True))["seg2.fits"] == "target"  # fmt: skip
+
+
+@pytest.mark.parametrize("arcsec", [1.5, 4.9])
+@pytest.mark.parametrize("keys", [("TARG_RA", "TARG_DEC"), ("RA_REF", "DEC_REF")])
+def test_the_stars_of_a_binary_are_two_stars(
+    folder: Path, arcsec: float, keys: tuple[str, str]
+) -> None:
+    none = {"TARG_RA": None, "TARG_DEC": None}
+    for path, name, away in ((FIRST, "HD 1A", 0.0), (SECOND, "HD 1B", arcsec)):
+        (folder / path).unlink()
+        k = 1 + (path == SECOND)
+        calints(
+            folder / path, name, observation=k, roll=60.0 + 10 * k,
+            date=f"2022-10-03T0{3 * k}:00:00",
+            cards=none | {keys[0]: 100.0, keys[1]: 20.0 + away / 3600},
+        )  # fmt: skip
+    with pytest.raises(IncompatibleSetupError, match=r"HD 1A \(1\), HD 1B \(1\)"):
+        dr.Sequence.from_files(folder)
+    sequence = dr.Sequence.from_files(folder, target="HD 1A")
+    assert uses(sequence)[FIRST] == "target"
+    assert uses(sequence)[SECOND] == "reference"

@@ -101,6 +101,7 @@ def test_help_of_a_command_has_sections_and_examples(
         (["detect", "x", "-o", "y", "--opd", "z", "--star-flux", "9 parsec"], "--star-flux: got"),
         (["detect", "x", "-o", "y", "--opd", "z", "--star-flux-error", "20"], "20 % are 0.2"),
         (["detect", "x", "-o", "y", "--opd", "z", "--memory", "2 lightyears"], "--memory: got"),
+        (["reduce", "x", "-o", "y", "--opd", "z", "--star", "12"], "'12', expected x,y"),
         (["detect", "x", "-o", "y", "--opd", "z", "--disk", "--wide"], "--wide, --disk: got both"),
         (["detect", "x", "-o", "y", "--opd", "z", "--systematics", "no.fits"], "--systematics"),
         (["detect", "x", "-o", "y", "--opd", "z", "--opd-folder", "x"], "--opd-folder"),
@@ -753,7 +754,7 @@ def test_a_written_configuration_gives_the_same_run(
 ) -> None:
     config, products = tmp_path / "run.toml", tmp_path / "products"
     arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(products), "-q"]
-    arguments += ["--size", "8", "--target", "HIP-1"]
+    arguments += ["--size", "8", "--target", "HIP-1", "--star", "5.2,3.5"]
     assert main([*arguments, "--write-config", str(config)]) == 0
     assert capsys.readouterr().out == f"wrote {config}\n"
     assert reduced == []
@@ -766,6 +767,7 @@ def test_a_written_configuration_gives_the_same_run(
     assert main(["--config", str(config), "reduce", "--threshold", "6", "--overwrite"]) == 0
     assert [call.given.options.threshold for call in reduced] == [5, 6]
     assert reduced[0].given.sequence.target == "HIP-1"
+    np.testing.assert_allclose(reduced[0].given.whole.science[0].center[0], (5.2, 3.5))
     assert capsys.readouterr().err == ""
     # It is a product like others.
     assert main([*arguments, "--write-config", str(config)]) == 2

@@ -140,21 +140,23 @@ def test_rolls_share_an_unknown_pattern_where_nothing_is_known() -> None:
         choice = choose_systematics(rolls, [], model(), OPD, systematics=systematics)  # type: ignore[arg-type]
         return choice.systematics
 
-    roll = frame("TARGET", ELSEWHERE)
-    pattern = chosen(roll, roll)
+    roll, turned = (frame("TARGET", ELSEWHERE, seed=k) for k in (1, 2))
+    pattern = chosen(roll, turned)
     assert pattern is not None
     assert pattern.name == "the rolls themselves"
     values, errors = pattern.at(roll)
     assert (values == 0).all()
     assert (errors == 0.03).all()
     assert pattern.pedestal == 1.9
-    assert chosen(roll, replace(roll, unit=u.DN / u.s)) is not None
-    # One roll, different pixels, pixels that are not known, other instruments, and "off".
-    elsewhere = replace(roll, first_pixel=(601, 1600))
-    lost, simulated = replace(roll, first_pixel=None), replace(roll, header=fits.Header())
-    for rolls in ((roll,), (roll, elsewhere), (lost, lost), (simulated, simulated)):
+    assert chosen(roll, replace(turned, unit=u.DN / u.s)) is not None
+    # One roll, in one file or two, different pixels, pixels that are not known, other instruments,
+    # and "off".
+    elsewhere = replace(turned, first_pixel=(601, 1600))
+    lost = [replace(each, first_pixel=None) for each in (roll, turned)]
+    simulated = [replace(each, header=fits.Header()) for each in (roll, turned)]
+    for rolls in ([roll], [roll, roll], [roll, elsewhere], lost, simulated):
         assert chosen(*rolls) is None
-    assert chosen(roll, roll, systematics="off") is None
+    assert chosen(roll, turned, systematics="off") is None
 
 
 @pytest.mark.parametrize("shown", [1.0, 0.0])

@@ -96,6 +96,29 @@ def demo(
     click.echo(f"\nwrote {figure} and {len(written)} more files")
 
 
+def _star_callback(
+    ctx: click.Context, parameter: click.Parameter, text: str | None
+) -> tuple[float, float] | None:
+    """The position of a star from "x,y"."""
+    if text is None:
+        return None
+    try:
+        x, y = (float(part) for part in str(text).strip("()[] ").split(","))
+    except ValueError:
+        raise click.BadParameter(
+            f"got {text!r}, expected x,y of the star in pixels from 0, such as 150,174.2",
+            ctx, parameter,
+        ) from None  # fmt: skip
+    return x, y
+
+
+_STAR = option(
+    "--star", metavar="X,Y", section="Frames", callback=_star_callback,
+    help="Where the target's star is in its files, pixels from 0, in place of what the headers say "
+         "and whatever else the frames show.",
+)  # fmt: skip
+
+
 @click.command(
     "reduce",
     cls=Command,
@@ -115,6 +138,7 @@ Examples:
     section="Frames",
     help="Which filter; default: all of the target's, one by one.",
 )
+@_STAR
 @archive
 @wavefront
 @search
@@ -126,6 +150,7 @@ def reduce_frames(
     frames: tuple[Path, ...],
     target: str | None,
     filter: str | None,
+    star: tuple[float, float] | None,
     program: int | None,
     cache: Path | None,
     **options: Any,
@@ -149,7 +174,7 @@ def reduce_frames(
             files = fetch_calints(
                 program, target, filter=filter, folder=cache, progress=run.progress
             )
-        return Sequence.by_filter_and_epoch(files, target=target, filter=filter)
+        return Sequence.by_filter_and_epoch(files, target=target, filter=filter, star=star)
 
     from pyklip_diffrender.cli.reducing import run_reduction
 
@@ -166,11 +191,14 @@ Examples:
   pyklip-diffrender detect calints.fits --opd maps -o products --json | jq .sentence""",
 )
 @click.argument("frames", type=file_type())
+@_STAR
 @wavefront
 @search
 @outputs()
 @click.pass_obj
-def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
+def detect_in_file(
+    run: Run, /, frames: Path, star: tuple[float, float] | None, **options: Any
+) -> None:
     """Subtract the star from a single file and search for planets.
 
     FRAMES is a calints file.
@@ -183,7 +211,7 @@ def detect_in_file(run: Run, /, frames: Path, **options: Any) -> None:
             raise IncompatibleSetupError(
                 f"{frames} is a folder, expected a file; the command reduce takes folders"
             )
-        return (Sequence.from_files([frames]),)
+        return (Sequence.from_files([frames], star=star),)
 
     from pyklip_diffrender.cli.reducing import run_reduction
 

@@ -66,6 +66,9 @@ _ROUGH: dict[str, Any] = {
 does as soon as it dominates the residual. In thirteen frames of four stars, places differed by at
 most 0.05 pixel from those of the headers or of full fits."""
 
+_TURNED = 1.0
+"""Degrees between rolls from which they tell a planet from the pattern: a pixel at 3.6 arcsec."""
+
 _TYPICAL_PATTERN = 0.03
 _TYPICAL_PEDESTAL = 1.9
 """Rms of the pattern, and pedestal in MJy/sr, that describe the residuals of the library's stars at
@@ -320,7 +323,9 @@ def _unknown_pattern(science: Sequence[Observation]) -> Systematics | None:
     same = all(
         each.first_pixel == first.first_pixel and each.shape == first.shape for each in science
     )
-    if len(science) < 2 or not first.is_nircam or first.first_pixel is None or not same:
+    # Files of one roll, such as the segments of an exposure, show a planet on the same pixels.
+    turned = max(abs(each.roll_from(first)) for each in science) > _TURNED
+    if not turned or not first.is_nircam or first.first_pixel is None or not same:
         return None
     zeros = np.zeros(first.shape)
     x, y = first.center[0]

@@ -41,6 +41,10 @@ EPOCH = 5.0
 """Days between frames that may share a wavefront map."""
 
 
+_TWO_STARS = 1.0
+"""arcsec between stars with other names on one date that are not one star."""
+
+
 def choose_filter(files: Sequence[FrameFile], filter: str | None) -> str:
     """Exclude frames of other filters; returns the one that is left.
 
@@ -55,6 +59,9 @@ def choose_filter(files: Sequence[FrameFile], filter: str | None) -> str:
         if each.exposure.filter is None:
             each.reason = "the header does not say through which FILTER it was taken"
     require_some(files)
+    if filter is None and len({each.exposure.filter for each in admissible(files)}) > 1:
+        judge_frames(files)
+        require_some(files)
     filter = _the_only("filter", filter, [each.exposure.filter for each in admissible(files)])
     for each in admissible(files):
         if not same_name(each.exposure.filter, filter):
@@ -74,6 +81,12 @@ def choose_target(
     """
     usable = admissible(files)
     stars = frames_by_star(usable)
+    if target is None and len(stars) > 1:
+        # Which star is the target must not depend on files that cannot be used.
+        judge_frames(usable)
+        require_some(files)
+        usable = admissible(files)
+        stars = frames_by_star(usable)
     for star, frames in stars.items():
         for each in frames:
             each.star = star
@@ -138,6 +151,7 @@ def _require_no_lost_target(
     lost = [
         each for each in files
         if not each.exposure.reference
+        and not each.is_product
         # Of some files it is not known which star they show.
         and (each.reason or not each.exposure.star.is_known)
         and not any(each.exposure.star.is_same(star) for star in marked)
@@ -159,6 +173,7 @@ def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
         alike = [
             group for group in groups
             if any(each.exposure.star.is_same(other.exposure.star) for other in group)
+            and not any(_are_two_stars(each.exposure, other.exposure) for other in group)
         ]  # fmt: skip
         groups = [group for group in groups if group not in alike]
         groups.append([other for group in alike for other in group] + [each])
@@ -176,6 +191,20 @@ def frames_by_star(files: Sequence[FrameFile]) -> dict[str, list[FrameFile]]:
     return stars
 
 
+def _are_two_stars(one: Exposure, other: Exposure) -> bool:
+    """Whether two exposures of one epoch show stars with other names, more than an arcsec apart.
+
+    The stars of a binary are; coordinates of one star may differ by more between epochs.
+    """
+    apart = one.star.separation(other.star)
+    if apart is None or apart <= _TWO_STARS or not (one.star.names and other.star.names):
+        return False
+    if any(other.star.is_called(name) for name in one.star.names):
+        return False
+    dates = one.date, other.date
+    return None not in dates and abs(one.date.mjd - other.date.mjd) <= EPOCH
+
+
 def _namesake(star: CatalogueStar, target: CatalogueStar) -> str:
     away = star.separation(target)
     distance = "somewhere else" if away is None else f"{away / 3600:.2f} deg from the target"
@@ -183,7 +212,10 @@ def _namesake(star: CatalogueStar, target: CatalogueStar) -> str:
 
 
 def exclude_other_setups(science: Sequence[FrameFile], references: Sequence[FrameFile]) -> None:
-    """Keep the set-up that most of the target's frames have."""
+    """Keep the set-up that most of the target's usable frames have."""
+    science, references = admissible(science), admissible(references)
+    if not science:
+        return
     counts = Counter(each.exposure.setup for each in science)
     everywhere = Counter(each.exposure.setup for each in (*science, *references))
     lengths: Counter[tuple[str | None, ...]] = Counter()
@@ -236,28 +268,26 @@ def exclude_unoriented(science: Sequence[FrameFile]) -> None:
             )
 
 
-def judge_frames(files: Iterable[FrameFile], frames: Mapping[int, Observation | None]) -> None:
-    """Exclude frames whose pixels cannot be those of a star behind the mask.
+def judge_frames(files: Iterable[FrameFile]) -> None:
+    """Read files, and exclude those whose pixels cannot be those of a star behind the mask.
 
-    Parameters
-    ----------
-    files : iterable of FrameFile
-    frames : mapping of int to Observation
-        By the `id` of the file.
+    A file is read and judged once. Of frames whose star's position was stated by the user, it is
+    not judged whether the star is there.
     """
-    for each in files:
-        observation = frames[id(each)]
+    for each in admissible(files):
+        if each.observation is not None:
+            continue
+        observation = each.read()
         if observation is not None:
             each.reason = (
                 why_odd_noise(observation.noise_ratios)
                 or why_odd_unit(observation)
-                or why_no_star(observation)
+                or ("" if each.place is not None else why_no_star(observation))
             )
 
 
 def exclude_contradicting(
     files: Iterable[FrameFile],
-    frames: Mapping[int, Observation | None],
     why: Callable[[Sequence[Observation]], Mapping[int, str]],
 ) -> None:
     """Exclude frames that contradict the others.
@@ -265,8 +295,7 @@ def exclude_contradicting(
     Parameters
     ----------
     files : iterable of FrameFile
-    frames : mapping of int to Observation
-        By the `id` of the file.
+        Files that were read.
     why : callable
         Reasons by index, such as `pixel_checks.why_turned`.
 
@@ -276,7 +305,7 @@ def exclude_contradicting(
         If half of the target's frames or more are, and nothing says which are right.
     """
     usable = admissible(files)
-    odd = why([_known(frames[id(each)]) for each in usable])
+    odd = why([_frames(each) for each in usable])
     if 2 * len(odd) >= len(usable) and odd and not usable[0].exposure.reference:
         names = ", ".join(each.name for each in usable)
         raise IncompatibleSetupError(
@@ -287,16 +316,16 @@ def exclude_contradicting(
         usable[k].reason = reason
 
 
-def exclude_copies(files: Iterable[FrameFile], frames: Mapping[int, Observation | None]) -> None:
+def exclude_copies(files: Iterable[FrameFile]) -> None:
     """Exclude frames whose pixels are those of another file, whatever the headers say."""
     usable = admissible(files)
-    for k, j in copies([_known(frames[id(each)]) for each in usable]).items():
+    for k, j in copies([_frames(each) for each in usable]).items():
         usable[k].reason = f"its pixels are those of {usable[j].name}: a copy of the exposure"
 
 
-def _known(observation: Observation | None) -> Observation:
-    assert observation is not None  # A file that could not be read has a reason.
-    return observation
+def _frames(file: FrameFile) -> Observation:
+    assert file.observation is not None  # A file that could not be read has a reason.
+    return file.observation
 
 
 def epochs_of(dates: Sequence[Time | None]) -> list[list[int]]:

@@ -20,7 +20,12 @@ __all__ = ["frames_of_file"]
 _log = logging.getLogger(__name__)
 
 
-def frames_of_file(path: str | os.PathLike[str], *, every_integration: bool) -> dict[str, Any]:
+def frames_of_file(
+    path: str | os.PathLike[str],
+    *,
+    every_integration: bool,
+    star: tuple[float, float] | None = None,
+) -> dict[str, Any]:
     """Read and judge a calints file; see `Observation.from_fits`.
 
     Returns
@@ -28,12 +33,12 @@ def frames_of_file(path: str | os.PathLike[str], *, every_integration: bool) -> 
     dict
         The attributes of the observation.
     """
-    arguments, shifts = read_calints(path)
+    arguments, shifts = read_calints(path, star)
     arguments, shifts, empty = without_empty(arguments, shifts)
     frames = checked_frames(**arguments)
     name = frames["name"]
     if shifts is not None:
-        frames |= on_detector_pixels(arguments, frames["center"], shifts)
+        frames |= on_detector_pixels(arguments, frames["center"], shifts, is_measured=star is None)
     if instrument_of(frames["header"], name) == "NIRCAM":
         frames["error"], frames["noise_ratios"] = calibrated_errors(
             frames["data"], frames["error"], frames["valid"], frames["center"],

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from astropy.io import fits
 
 from pyklip_diffrender.errors import DiffrenderError, NoValidPixelsError
 from pyklip_diffrender.io.files import open_fits
@@ -54,6 +55,12 @@ class FrameFile:
         Why the file is excluded; empty for those that are not.
     for_reference : bool
         Whether it was asked for as a file of a reference star, whatever its header says.
+    is_product : bool
+        Whether the file holds something that was made from frames, and no frames.
+    place : tuple of float or None
+        x, y of the star in the file, 0-indexed pixels, which replaces that of the header.
+    observation : Observation or None
+        The frames, once they were read.
     """
 
     path: Path
@@ -61,6 +68,9 @@ class FrameFile:
     star: str = ""
     reason: str = field(default="", repr=False)
     for_reference: bool = False
+    is_product: bool = False
+    place: tuple[float, float] | None = None
+    observation: Observation | None = field(default=None, repr=False)
 
     @property
     def name(self) -> str:
@@ -68,12 +78,13 @@ class FrameFile:
         return self.path.name
 
     def read(self) -> Observation | None:
-        """Read the frames; if they cannot be read, None, with the reason."""
-        try:
-            return Observation.from_fits(self.path)
-        except DiffrenderError as error:
-            self.reason = _without_name(error, self.name)
-            return None
+        """Read the frames, once; if they cannot be read, None, with the reason."""
+        if self.observation is None and not self.reason:
+            try:
+                self.observation = Observation.from_fits(self.path, star=self.place)
+            except DiffrenderError as error:
+                self.reason = _without_name(error, self.name)
+        return self.observation
 
 
 def _without_name(error: Exception, name: str) -> str:
@@ -124,13 +135,33 @@ def exposures_in(
 def _frame_file(path: Path) -> FrameFile:
     try:
         with open_fits(path) as hdus:
-            header, shape = hdus[0].header, ()
-            if "SCI" in hdus:
-                header = merged_header(header, hdus["SCI"].header, path.name)
-                shape = np.shape(hdus["SCI"].data)
+            product = _why_a_product(hdus)
+            if product:
+                return FrameFile(path, Exposure(path.name), reason=product, is_product=True)
+            header = merged_header(hdus[0].header, hdus["SCI"].header, path.name)
+            shape = np.shape(hdus["SCI"].data)
             return FrameFile(path, Exposure.of(header, path.name, shape))
     except DiffrenderError as error:
         return FrameFile(path, Exposure(path.name), reason=_without_name(error, path.name))
+
+
+def _why_a_product(hdus: fits.HDUList) -> str:
+    """Why a file holds no frames but something made from them; empty for frames.
+
+    Only the contents count: products keep cards of the frames, and may have any name.
+    """
+    first = hdus[0].header
+    what = ""
+    if any(key in first for key in ("DRVERS", "DRMETH", "PATVERS")):
+        what = "a product of pyklip_diffrender"
+    elif any(key in hdu.header for hdu in hdus[:2] for key in ("PYKLIPV", "PSFSUB")):
+        what = "an image from which pyKLIP has subtracted the star"
+    elif "SCI" not in hdus:
+        names = ", ".join(hdu.name or "unnamed" for hdu in hdus)
+        what = f"a file without an SCI extension ({names})"
+        if any(key in first for key in ("OPD", "PUPILOPD", "PUPLSCAL", "WFSGUID", "TSTAMP")):
+            what = f"a wavefront map or an image of a model ({names}), without an SCI extension"
+    return f"it is {what}; expected frames of stage 2 (calints)" if what else ""
 
 
 def admissible(files: Iterable[FrameFile]) -> list[FrameFile]:
@@ -138,8 +169,18 @@ def admissible(files: Iterable[FrameFile]) -> list[FrameFile]:
     return [each for each in files if not each.reason]
 
 
-def exclude_unusable(files: Sequence[FrameFile]) -> None:
-    """Exclude files that cannot be frames of a star behind a mask, and duplicates."""
+def exclude_unusable(
+    files: Sequence[FrameFile], judge: Callable[[Iterable[FrameFile]], None]
+) -> None:
+    """Exclude files that cannot be frames of a star behind a mask, and duplicates.
+
+    Parameters
+    ----------
+    files : sequence of FrameFile
+    judge : callable
+        Reads files and excludes those with wrong pixels. Of several files of one exposure, it
+        decides which is the best that can be used.
+    """
     for each in admissible(files):
         each.reason = _why_unusable(each.exposure)
     _exclude_duplicates(admissible(files), lambda each: str(each.path.resolve()), _same_file)
@@ -147,7 +188,7 @@ def exclude_unusable(files: Sequence[FrameFile]) -> None:
     _exclude_duplicates(
         admissible(files), lambda each: str(each.path.resolve()).removesuffix(".gz"), _same_file
     )
-    _exclude_duplicates(admissible(files), _moment, _same_exposure)
+    _exclude_duplicates(admissible(files), _moment, _same_exposure, judge)
 
 
 def _why_unusable(exposure: Exposure) -> str:
@@ -200,17 +241,25 @@ def _exclude_duplicates(
     files: Sequence[FrameFile],
     key: Callable[[FrameFile], object],
     reason: Callable[[FrameFile], str],
+    judge: Callable[[Iterable[FrameFile]], None] | None = None,
 ) -> None:
-    """Keep the file of the best level among those with one key."""
+    """Keep the file of the best level among those with one key, of those that can be used."""
     groups: dict[object, list[FrameFile]] = {}
     for each in files:
         value = key(each)
         if value is not None:
             groups.setdefault(value, []).append(each)
     for group in groups.values():
-        best = min(group, key=lambda each: _rank(each.exposure))
-        for each in group:
-            if each is not best:
+        ranked = sorted(group, key=lambda each: _rank(each.exposure))
+        best = ranked[0]
+        if judge is not None and len(ranked) > 1:
+            for each in ranked:
+                judge([each])
+                if not each.reason:
+                    best = each
+                    break
+        for each in ranked:
+            if each is not best and not each.reason:
                 each.reason = reason(best)
 
 

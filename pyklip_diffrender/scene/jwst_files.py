@@ -61,12 +61,23 @@ _MISPLACED = 0.3
 """Pixels of a star from its stated position beyond which that may be wrong by a pixel: the star is
 measured to a tenth of a pixel, and is within 0.2 pixel of the mask."""
 
+_CONSISTENT = 0.02
+"""Pixels by which the records of an alignment may differ: they agree to 0.001 in real files."""
+
 _CROPPED = 32
 """Whole pixels beyond which frames were cropped, and not only aligned."""
 
 
-def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[Any] | None]:
+def read_calints(
+    path: str | os.PathLike[str], star: tuple[float, float] | None = None
+) -> tuple[dict[str, Any], NDArray[Any] | None]:
     """Read a calints file; see `Observation.from_fits`.
+
+    Parameters
+    ----------
+    path : path
+    star : tuple of float, optional
+        x, y of the star, in place of what the header says.
 
     Returns
     -------
@@ -108,6 +119,8 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
             quality = np.zeros(data.shape, dtype=np.uint32)
         mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
         details = _details(header, 1 if data.ndim == 2 else len(data), path.name)
+        if star is not None:
+            details["center"] = np.array(star, dtype=float)
         frames = data.reshape(-1, *data.shape[-2:]).shape
         shifts = recorded_shifts(hdus, np.asarray(details["center"], float), frames, path.name)
         # A star whose position is stated was moved, unless the file has shifts not yet applied.
@@ -127,14 +140,14 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
         offset = dither(header, path.name)
         if offset is not None:
             arguments["star_offset"] = offset
-            if arguments["center"] is not None:
+            if arguments["center"] is not None and star is None:
                 arguments["center"] += np.divide(offset, arguments["pixelscale"])
     if shifts is None and not moved and data.ndim > 1:  # Other shapes are refused with the frames.
         ny, nx = data.shape[-2:]
-        star = arguments["center"]
-        if star is None:
-            star = np.array([nx - 1, ny - 1]) / 2
-        arguments["first_pixel"] = first_pixel(header, star, (ny, nx), path.name)
+        place = arguments["center"]
+        if place is None:
+            place = np.array([nx - 1, ny - 1]) / 2
+        arguments["first_pixel"] = first_pixel(header, place, (ny, nx), path.name)
     return arguments, shifts
 
 
@@ -230,8 +243,24 @@ def _details(header: fits.Header, frames: int, name: str) -> dict[str, Any]:
     }
 
 
+def _records_agree(arguments: dict[str, Any], left: NDArray[np.float64]) -> bool:
+    """Whether shifts and the star's positions in the array and behind the mask are of one place.
+
+    Frames are cropped by whole pixels; what is left of the star's position, (frames, 2), less that
+    of the mask and the shift, is otherwise the star's position behind the mask.
+    """
+    if arguments.get("star_offset") is None:
+        return False
+    rest = left.mean(axis=0) - np.divide(arguments["star_offset"], arguments["pixelscale"])
+    return bool(np.abs(rest - np.round(rest)).max() < _CONSISTENT)
+
+
 def on_detector_pixels(
-    arguments: dict[str, Any], center: NDArray[np.float64], shifts: NDArray[Any]
+    arguments: dict[str, Any],
+    center: NDArray[np.float64],
+    shifts: NDArray[Any],
+    *,
+    is_measured: bool = True,
 ) -> dict[str, Any]:
     """Undo the shifts by which frames were aligned, up to whole pixels.
 
@@ -243,6 +272,9 @@ def on_detector_pixels(
         x, y of the star, 0-indexed.
     shifts : ndarray, (frames, 2)
         x, y in pixels.
+    is_measured : bool
+        Whether the star's position is compared with its light, unless the file's own records agree
+        with each other.
 
     Returns
     -------
@@ -273,7 +305,8 @@ def on_detector_pixels(
     good &= np.roll(usable, (up, right), axis=(1, 2))
     column, row = (int(each) for each in begin - pixels)
     sure = mask is not None and on_detector((column, row), data.shape[1:])
-    if sure:
+    agree = mask is not None and _records_agree(arguments, center - mask - shifts)
+    if sure and is_measured and not agree:
         # The whole pixels of the place are those of the star's stated position.
         frame = shifted[0], sigma[0], good[0]
         scale = float(np.mean(arguments["pixelscale"]))

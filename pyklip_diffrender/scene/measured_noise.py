@@ -12,10 +12,10 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve
+from scipy.ndimage import convolve, uniform_filter
 from scipy.stats import median_abs_deviation
 
-__all__ = ["calibrated_errors", "weighted_mean", "why_odd_noise"]
+__all__ = ["calibrated_errors", "dark_pixels", "weighted_mean", "why_odd_noise"]
 
 _log = logging.getLogger(__name__)
 
@@ -32,6 +32,15 @@ _PLAUSIBLE = (0.1, 5.0)
 """Ratio of scatter and errors beyond which the errors are not those of these pixels. It was 0.4 to
 1.2 in the real frames at hand."""
 
+_SMOOTHED = 15
+"""Side of the squares, pixels, whose mean light tells which parts of a frame are dark."""
+
+_BRIGHT = 4.0
+"""Standard deviations of these means above their median from which a part is not dark."""
+
+_DARKEST = 0.25
+"""Least share of the far pixels that is taken as dark, in a field that is full of sources."""
+
 _NEIGHBOURS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]]) / 4.0
 
 
@@ -45,7 +54,8 @@ def calibrated_errors(
 ) -> tuple[Image, tuple[float, ...]]:
     """Correct the part of the errors that does not depend on the light.
 
-    Pixels are compared with the mean of their four neighbours, 6 arcsec or more from the star. The
+    Pixels are compared with the mean of their four neighbours, 6 arcsec or more from the star and
+    where the frame is dark, see `dark_pixels`. The
     robust scatter of these differences over what the errors predict is the factor f by which the
     errors there are wrong. Let b be the median of these errors: (f^2 - 1) b^2 is added to the
     variance of every pixel, which leaves the photon noise of the star as it is.
@@ -135,6 +145,49 @@ def weighted_mean(
     return mean, np.where(covered, deviation, 1.0), covered
 
 
+def dark_pixels(frame: Image, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Find the pixels of a frame that show noise, and no other stars, galaxies or nebulae.
+
+    The light is averaged over squares of 15 pixels, so that the noise of a pixel does not decide
+    whether it counts. Dark is what is at most four standard deviations above the median of these
+    means, or the darkest quarter of a field that is full of sources.
+
+    Parameters
+    ----------
+    frame : ndarray, (ny, nx)
+    usable : ndarray of bool, (ny, nx)
+        Pixels that may be chosen.
+
+    Returns
+    -------
+    ndarray of bool, (ny, nx)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frame = np.random.default_rng(1).normal(size=(60, 60))
+    >>> frame[:, :10] += 5.0
+    >>> dark = dark_pixels(frame, np.ones((60, 60), dtype=bool))
+    >>> bool(dark[:, :10].any()), bool(dark[:, 20:].mean() > 0.98)
+    (False, True)
+    """
+    if not usable.any():
+        return usable
+    # A single bright pixel is an outlier, and no source.
+    median = np.median(frame[usable])
+    limit = 5 * median_abs_deviation(frame[usable], scale="normal")
+    clipped = np.where(usable, np.clip(frame - median, -limit, limit), 0.0)
+    weight = uniform_filter(usable.astype(float), _SMOOTHED, mode="constant")
+    smooth = uniform_filter(clipped, _SMOOTHED, mode="constant") / np.maximum(weight, 1e-3)
+    values = smooth[usable]
+    middle = float(np.median(values))
+    below = middle - values[values <= middle]
+    # The scatter of the darker half, which sources do not reach.
+    spread = float(np.median(below)) / 0.6745
+    threshold = max(middle + _BRIGHT * spread, float(np.quantile(values, _DARKEST)))
+    return usable & (smooth <= threshold)
+
+
 def why_odd_noise(ratios: Iterable[float]) -> str:
     """Why errors cannot be those of the pixels; empty if they can.
 
@@ -147,9 +200,10 @@ def why_odd_noise(ratios: Iterable[float]) -> str:
     for ratio in ratios:
         if np.isfinite(ratio) and not low < ratio < high:
             return (
-                f"far from the star its pixels scatter {ratio:.2g} times as much as ERR says, "
-                f"expected {low:g} to {high:g} times. ERR is probably in another unit than SCI, a "
-                "variance, or of other frames"
+                f"far from the star, where the frame is darkest, its pixels scatter {ratio:.2g} "
+                f"times as much as ERR says, expected {low:g} to {high:g} times. ERR is probably "
+                "in another unit than SCI, a variance, or of other frames; or SCI was multiplied "
+                "by a factor; or a crowded field or a nebula leaves no dark part of the frame"
             )
     return ""
 
@@ -167,7 +221,7 @@ def _measured(
         away = np.hypot((x - center[k, 0]) * pixelscale[0], (y - center[k, 1]) * pixelscale[1])
         # A pixel is compared only where all of its neighbours are usable.
         complete = convolve(usable.astype(float), _NEIGHBOURS, mode="constant") > 0.99
-        far = usable & complete & (away > _FAR)
+        far = dark_pixels(frame, usable & complete & (away > _FAR))
         if far.sum() < _ENOUGH:
             yield np.nan, np.nan
             continue

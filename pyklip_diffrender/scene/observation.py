@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -150,7 +151,11 @@ class Observation:
 
     @classmethod
     def from_fits(
-        cls, path: str | os.PathLike[str], *, every_integration: bool = False
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        every_integration: bool = False,
+        star: tuple[float, float] | None = None,
     ) -> Observation:
         """Read a JWST stage-2 coronagraphic file (calints).
 
@@ -170,6 +175,8 @@ class Observation:
         path : path
         every_integration : bool
             Keep a frame for every integration; those that are left out have no valid pixel.
+        star : tuple of float, optional
+            x, y of the star in the file, pixels from 0, in place of what the header says.
 
         Raises
         ------
@@ -181,11 +188,48 @@ class Observation:
         ShapeError, NoValidPixelsError
             As `from_arrays`.
         """
-        return cls(**frames_of_file(path, every_integration=every_integration))
+        return cls(**frames_of_file(path, every_integration=every_integration, star=star))
 
     def part(self, which: NDArray[np.intp]) -> Observation:
         """Select frames by their indices."""
         return replace(self, **selected(vars(self), which))
+
+    def continues_in(self, other: Observation) -> bool:
+        """Whether the frames of another observation can be added to these, as one pointing."""
+        if (self.position_angles is None) != (other.position_angles is None):
+            return False
+        if (self.shape, self.unit, self.first_pixel) != (
+            other.shape, other.unit, other.first_pixel,
+        ):  # fmt: skip
+            return False
+        return len(self.followed_by([other]).pointings()) == 1
+
+    def followed_by(self, others: Sequence[Observation]) -> Observation:
+        """Add the frames of other observations of the exposure; see `continues_in`."""
+        if not others:
+            return self
+        every = (self, *others)
+        changed: dict[str, Any] = {
+            key: np.concatenate([getattr(each, key) for each in every])
+            for key in ("data", "error", "valid", "center", "position_angles")
+            if getattr(self, key) is not None
+        }
+        offsets = [each.star_offset for each in every if each.star_offset is not None]
+        if len(offsets) == len(every):
+            x, y = np.average(offsets, axis=0, weights=[len(each) for each in every])
+            changed["star_offset"] = (float(x), float(y))
+        middles = [each.mid_date for each in every if each.mid_date is not None]
+        if len(middles) == len(every):
+            changed["mid_date"] = Time(middles).mean()
+        dates = [each.date for each in every if each.date is not None]
+        return replace(
+            self,
+            date=min(dates) if dates else None,
+            name=f"{self.name} and {len(others)} more",
+            remarks=tuple(remark for each in every for remark in each.remarks),
+            noise_ratios=tuple(ratio for each in every for ratio in each.noise_ratios),
+            **changed,
+        )
 
     def pointings(self) -> tuple[Observation, ...]:
         """Split frames that show the star at different places or orientations.

@@ -10,13 +10,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import torch
 from astropy import units as u
 from numpy.typing import NDArray
-from scipy.ndimage import convolve, shift
+from scipy.ndimage import convolve, gaussian_filter, map_coordinates, shift, uniform_filter
 from scipy.stats import median_abs_deviation
 
+from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.scene.measured_noise import dark_pixels
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.star_place import center_of_symmetry, stamp_about
+from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.star_place import center_of_pattern, center_of_symmetry, stamp_about
+from pyklip_diffrender.wavefront.opd import random_opd
 
 __all__ = [
     "brightness",
@@ -32,10 +37,36 @@ Image = NDArray[np.float64]
 _CORE = 1.0
 """Radius, arcsec, in which the light of a star behind a mask is summed."""
 
+_SOFT = 0.2
+"""Half of the width, arcsec, of the edge of that circle."""
+
 _BEHIND = 0.5
 """Largest distance, arcsec, of the pattern's centre of symmetry from where the star should be. It
 is measured to half a pixel; stars are put behind the mask to .02 arcsec, and headers may be wrong
 by a few pixels. Half of a star's light passes a mask at 0.4 to 0.8 arcsec from its centre."""
+
+_PATTERN_BEHIND = 0.25
+"""Largest distance, arcsec, of the centre of the star's pattern, see `center_of_pattern`, from
+where the star should be. It was at most 0.06 with sources that leave the pattern visible, and 0.33
+to 0.6 for real frames moved by 24 pixels, of which the field contains a part."""
+
+_OUTSIDE = 0.35
+"""Distance, arcsec, from the star beyond which another source is looked for."""
+
+_SOURCE = 0.8
+"""Radius, arcsec, in which light is compared with the image of a point source."""
+
+_LIKE_A_SOURCE = 0.79
+"""Least correlation of the square roots. It was 0.88 to 0.98 for sources that hide the star in real
+frames, and at most 0.75 for stars behind the mask."""
+
+_SYMMETRIC = 0.7
+"""Share of the light of a point source that is symmetric about it, as far as it is used."""
+
+_AS_BRIGHT = 0.12
+"""Contrast from which a source that hides the star is taken for the star itself. It was at most
+0.1 for sources of 0.1 beside real stars, and 0.14 or more for a star 1.5 arcsec off the mask; a
+displacement of 1.2 arcsec and less cannot be told from such a source."""
 
 _POSITIVE = 0.5
 """Least share of light that is positive: 1 for a star, 0 where it was subtracted."""
@@ -47,6 +78,10 @@ behind the mask. The ratio of rolls was at most 1.05 for the real stars at hand.
 _COPY = 0.95
 """Correlation of the noise of two frames above which they are one. Flat-field errors correlate the
 frames of different stars by up to 0.6."""
+
+_SAME_NOISE = 0.3
+"""Median difference of two frames, in standard deviations, below which their noise is the same: 1.1
+for two exposures."""
 
 _ENOUGH = 2000
 """Least number of pixels for a correlation or a scatter."""
@@ -63,6 +98,10 @@ _SPECKLES = 1.5
 _TURNED = 0.1
 """Gain in correlation above which frames are not of one orientation. Real frames of one filter
 correlate by 0.99, mirrored or turned ones by 0.2 to 0.7."""
+
+_ALONE = 0.15
+"""Distance, arcsec, between the centres of all light and of the star's pattern beyond which the
+light is also that of another source."""
 
 _ALIKE = 0.8
 """Least correlation of a pattern with another when it is turned back."""
@@ -84,7 +123,12 @@ def why_no_star(observation: Observation) -> str:
     """Why these cannot be frames of a star behind the mask; empty if they can.
 
     The diffraction pattern of a star is nearly symmetric about the star, see
-    `pyklip_diffrender.scene.star_place.center_of_symmetry`.
+    `pyklip_diffrender.scene.star_place`. Where another source is so bright that the centre of
+    all light is elsewhere, the pattern about the star's position decides, in which a point source
+    is a small part. Where the source hides that, too, it is compared with the model's image of a
+    point source. What does not look like one is a star's pattern in the wrong place. A source
+    next to which there is less light behind the mask than that of a star ten times as bright is
+    the star itself, off the mask.
 
     Parameters
     ----------
@@ -99,31 +143,128 @@ def why_no_star(observation: Observation) -> str:
     bright = np.abs(image) > 3 * noise
     if np.count_nonzero(bright & core) < 10:
         return (
-            f"no light of a star within {_CORE:g} arcsec of where the header has the star (CRPIX "
-            "or STARCEN). Look at the frames, and correct the position"
+            f"no light of a star within {_CORE:g} arcsec of where the header has the star: the "
+            "position (CRPIX or STARCEN) is wrong, the star is not behind the mask, or the "
+            f"exposure is too short. {_INSIST}"
         )
     light = np.where(bright, image, 0.0)
     share = float(light[core].sum() / np.abs(light[core]).sum())
     if share < _POSITIVE:
         return (
             f"the light around the star's position is as much negative as positive ({share:.0%} "
-            "remain): the star was subtracted. Use frames before the subtraction (calints)"
+            "remain): the star was subtracted, or the background was subtracted with a neighbour "
+            f"in it. Use frames before the subtraction (calints). {_INSIST}"
         )
-    away = center_of_symmetry(light)
-    x, y = away * observation.pixelscale
-    if np.hypot(x, y) > _BEHIND:
-        return (
-            f"its light is centred {np.hypot(x, y):.1f} arcsec from the star's position ({x:+.1f} "
-            f"in x, {y:+.1f} in y), expected less than {_BEHIND:g}: the star is not behind the "
-            "mask, or the position (CRPIX or STARCEN) is wrong"
-        )
-    return ""
+    scale = observation.pixelscale
+    away = center_of_symmetry(light) * scale
+    if np.hypot(*away) <= _BEHIND:
+        return ""
+    if np.hypot(*(center_of_pattern(light, distance) * scale)) <= _PATTERN_BEHIND:
+        return ""
+    contrast = _contrast_of_source(observation)
+    if contrast < _AS_BRIGHT:
+        return ""
+    x, y = away
+    what = (
+        "does not look like a star's companion or neighbour"
+        if np.isinf(contrast)
+        else f"would be a source of at least {contrast:.2g} times the flux of a star there"
+    )
+    return (
+        f"its light is centred {np.hypot(x, y):.1f} arcsec from the star's position ({x:+.1f} "
+        f"in x, {y:+.1f} in y), expected less than {_BEHIND:g}, and {what}: the position (CRPIX or "
+        "STARCEN) is wrong, the star is not behind the mask, or something brighter than the star "
+        f"behind the mask (a star, a galaxy) is in the field. {_INSIST}"
+    )
+
+
+_INSIST = (
+    "Look at the frames. If the star is behind the mask, give its place in the file as star "
+    "(--star), x and y in pixels from 0"
+)
+
+
+def _contrast_of_source(observation: Observation) -> float:
+    """Least contrast of the brightest point source beside the star; infinite if it is not one."""
+    try:
+        star, source = _images(observation)
+    except DiffrenderError:
+        return np.inf
+    scale = float(np.mean(observation.pixelscale))
+    data, _, valid = _mean(observation)
+    image = np.where(valid, data - float(np.quantile(data[valid], 0.25)), 0.0)
+    rows, columns = np.indices(image.shape)
+    x, y = observation.center.mean(axis=0)
+    outside = np.hypot(columns - x, rows - y) * scale > _OUTSIDE
+    peak = _peak(np.where(outside, gaussian_filter(image, 1.0), -np.inf))
+    if _likeness(image, peak, source, _peak(source), scale) < _LIKE_A_SOURCE:
+        return np.inf
+    mirrored = map_coordinates(
+        image, [2 * peak[1] - rows, 2 * peak[0] - columns], order=1, mode="constant"
+    )
+    symmetric = np.clip(np.minimum(image, mirrored), 0.0, None)
+    # What may be light of the star: the model of the source's wings is not perfect.
+    left = uniform_filter(image - _SYMMETRIC * symmetric, 3)
+    behind = np.hypot(columns - x, rows - y) * scale < _BEHIND / 2
+    most = max(float(left[behind].max()), 0.0) / float(uniform_filter(star, 3).max())
+    own = float(uniform_filter(image, 3)[tuple(np.round(peak[::-1]).astype(int))])
+    flux = own / float(uniform_filter(source, 3).max())
+    return flux / most if most > 0 else np.inf
+
+
+def _images(observation: Observation) -> tuple[Image, Image]:
+    """Model images, (n, n), of a star behind the mask and of a source outside it."""
+    scale = float(np.mean(observation.pixelscale))
+    size = 2 * int(np.ceil((_CORE + _SOURCE) / scale)) + 1
+    model = model_for(observation, size, nlambda=1, npix=128)
+    # Without a wavefront error the star would be too faint.
+    wavefront = random_opd(1, npix=128)
+    with torch.no_grad():
+        images = [model(wavefront, (0.0, y)).double().cpu().numpy() for y in (0.0, _CORE)]
+    return images[0], images[1]
+
+
+def _peak(image: Image) -> Image:
+    """x, y of the brightest pixel, to a fraction of a pixel where it is not at the edge."""
+    row, column = np.unravel_index(int(image.argmax()), image.shape)
+    place = np.array([column, row], dtype=float)
+    for axis, (values, k) in enumerate(((image[row], column), (image[:, column], row))):
+        if 0 < k < len(values) - 1 and np.isfinite(values[k - 1 : k + 2]).all():
+            low, middle, high = values[k - 1 : k + 2]
+            curvature = low - 2 * middle + high
+            place[axis] += 0.5 * (low - high) / curvature if curvature < 0 else 0.0
+    return place
+
+
+def _likeness(image: Image, place: Image, other: Image, there: Image, scale: float) -> float:
+    """Correlation of the square roots of two images about two points, within 0.8 arcsec."""
+    reach = int(_SOURCE / scale)
+    rows, columns = np.indices((2 * reach + 1, 2 * reach + 1)) - reach
+    disk = np.hypot(rows, columns) <= reach
+    roots = [
+        np.sqrt(np.maximum(map_coordinates(
+            values, [y + rows[disk], x + columns[disk]], order=1, mode="nearest"
+        ), 0.0))
+        for values, (x, y) in ((image, place), (other, there))
+    ]  # fmt: skip
+    return float(np.corrcoef(*roots)[0, 1]) if np.ptp(roots[0]) > 0 else 0.0
 
 
 def brightness(observation: Observation) -> float:
-    """Light within 1 arcsec of the star, in the frames' unit; NaN for frames that are too small."""
+    """Light within 1 arcsec of the star, in the frames' unit; NaN for frames that are too small.
+
+    The edge is soft and moves with the star by fractions of a pixel, so that a neighbour on it
+    counts alike in all rolls.
+    """
     stamp = _stamp(observation)
-    return np.nan if stamp is None else float(stamp[0][stamp[1] < _CORE].sum())
+    if stamp is None:
+        return np.nan
+    image = stamp[0]
+    center = observation.center.mean(axis=0)
+    x, y = center - np.round(center)
+    rows, columns = np.indices(image.shape) - len(image) // 2
+    distance = np.hypot(columns - x, rows - y) * float(np.mean(observation.pixelscale))
+    return float((image * np.clip((_CORE + _SOFT - distance) / (2 * _SOFT), 0.0, 1.0)).sum())
 
 
 def why_other_brightness(observations: Sequence[Observation]) -> dict[int, str]:
@@ -165,7 +306,8 @@ def why_turned(observations: Sequence[Observation]) -> dict[int, str]:
     Parameters
     ----------
     observations : sequence of Observation
-        Of one set-up. Frames that are too small are not compared.
+        Of one set-up. Frames that are too small, or that show another source as bright as the star
+        behind the mask, which turns with the sky, are not compared.
 
     Returns
     -------
@@ -193,9 +335,17 @@ def _pattern(observation: Observation) -> Image | None:
     if stamp is None:
         return None
     image, _, noise = stamp
-    x, y = center_of_symmetry(np.where(np.abs(image) > 3 * noise, image, 0.0))
+    scale = float(np.mean(observation.pixelscale))
+    light = np.where(np.abs(image) > 3 * noise, image, 0.0)
+    x, y = center_of_symmetry(light)
+    if np.hypot(x, y) * scale > _BEHIND:
+        return None
+    rows, columns = np.indices(image.shape) - len(image) // 2
+    about = center_of_pattern(light, np.hypot(columns - x, rows - y) * scale)
+    if np.hypot(*(about - (x, y))) * scale > _ALONE:
+        return None
     image = shift(image, (-y, -x), order=1)
-    reach, middle = int(_SPECKLES / np.mean(observation.pixelscale)), len(image) // 2
+    reach, middle = int(_SPECKLES / scale), len(image) // 2
     window = slice(max(middle - reach, 0), middle + reach + 1)
     image = image[window, window]
     return np.sign(image) * np.sqrt(np.abs(image))
@@ -225,22 +375,25 @@ def why_odd_unit(observation: Observation) -> str:
     difference, usable = _noise(observation, clipped=False)
     if usable.sum() < _ENOUGH or observation.unit != u.MJy / u.sr:
         return ""
+    dark = dark_pixels(_mean(observation)[0], usable)
     # A pixel less the mean of four.
-    scatter = float(median_abs_deviation(difference[usable], scale="normal")) / 1.25**0.5
+    scatter = float(median_abs_deviation(difference[dark], scale="normal")) / 1.25**0.5
     low, high = _SCATTER
     if low < scatter < high:
         return ""
     return (
-        f"far from the star its pixels scatter by {scatter:.2g} MJy/sr, expected {low:g} to "
-        f"{high:g}. BUNIT is probably wrong, or the pixels were multiplied by a factor"
+        f"far from the star, where the frame is darkest, its pixels scatter by {scatter:.2g} "
+        f"MJy/sr, expected {low:g} to {high:g}. BUNIT is probably wrong, the pixels were "
+        "multiplied by a factor, or a crowded field or a nebula leaves no dark part of the frame"
     )
 
 
 def copies(observations: Sequence[Observation]) -> dict[int, int]:
     """Find observations that show the same pixels as an earlier one, whatever their headers say.
 
-    Noise far from the star is compared, so that copies in another unit, or with a few other pixels,
-    are seen as such. Frames with fewer than 2000 pixels of noise are not compared.
+    Pixels far from the star are compared, so that copies in another unit, or with a few other
+    pixels, are seen as such. Exposures of one bright field are alike, too, but differ by their
+    noise. Frames with fewer than 2000 pixels far from the star are not compared.
 
     Returns
     -------
@@ -257,10 +410,24 @@ def copies(observations: Sequence[Observation]) -> dict[int, int]:
             both = usable & too
             if both.sum() < _ENOUGH:
                 continue
-            if np.corrcoef(values[both], others[both])[0, 1] > _COPY:
+            if np.corrcoef(values[both], others[both])[0, 1] > _COPY and not _differ_by_noise(
+                observations[k], observations[j], both
+            ):
                 result[k] = j
                 break
     return result
+
+
+def _differ_by_noise(
+    observation: Observation, other: Observation, usable: NDArray[np.bool_]
+) -> bool:
+    """Whether two frames differ by as much as their errors say, up to a factor."""
+    (data, error, _), (others, _, _) = _mean(observation), _mean(other)
+    rough = [each - convolve(each, _NEIGHBOURS, mode="nearest") for each in (data, others)]
+    mine, theirs = (each[usable] for each in rough)
+    factor = float((mine * theirs).sum() / (theirs**2).sum())
+    # Of two exposures the noise of the difference is 1.6 times the error of one.
+    return float(np.median(np.abs(mine - factor * theirs) / error[usable])) > _SAME_NOISE
 
 
 def _mean(observation: Observation) -> tuple[Image, Image, NDArray[np.bool_]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -106,6 +107,7 @@ class Sequence:
         filter: str | None = None,
         epoch: str | Time | None = None,
         references: Iterable[str | os.PathLike[str]] = (),
+        star: tuple[float, float] | None = None,
     ) -> Sequence:
         """Sort JWST coronagraphic files into target and reference stars.
 
@@ -128,6 +130,10 @@ class Sequence:
             Frames of one epoch are at most 5 days apart, and share a wavefront.
         references : iterable of path
             Further files, of reference stars even if their headers do not say so.
+        star : tuple of float, optional
+            x, y of the target's star in its files, pixels from 0, in place of what the headers
+            say. The files are then not judged by whether their light is that of a star there. For
+            frames in which something else is brighter than the star behind the mask.
 
         Returns
         -------
@@ -142,7 +148,9 @@ class Sequence:
         NoValidPixelsError
             If no frame of the target is left.
         """
-        sequences = cls.by_epoch(files, target=target, filter=filter, references=references)
+        sequences = cls.by_epoch(
+            files, target=target, filter=filter, references=references, star=star
+        )
         if epoch is not None:
             date = Time(epoch)
             near = [
@@ -171,6 +179,7 @@ class Sequence:
         target: str | None = None,
         filter: str | None = None,
         references: Iterable[str | os.PathLike[str]] = (),
+        star: tuple[float, float] | None = None,
     ) -> tuple[Sequence, ...]:
         """Sort files as `from_files` does, into one sequence for each epoch.
 
@@ -182,7 +191,7 @@ class Sequence:
         tuple of Sequence
             In order of time.
         """
-        return cls._by_epoch(_usable(files, references), target, filter)
+        return cls._by_epoch(_usable(files, references, star, target), target, filter)
 
     @classmethod
     def by_filter_and_epoch(
@@ -192,6 +201,7 @@ class Sequence:
         target: str | None = None,
         filter: str | None = None,
         references: Iterable[str | os.PathLike[str]] = (),
+        star: tuple[float, float] | None = None,
     ) -> tuple[Sequence, ...]:
         """Sort files into one sequence for each filter and epoch of the target.
 
@@ -202,10 +212,13 @@ class Sequence:
         tuple of Sequence
             In order of time.
         """
-        listed = _usable(files, references)
+        listed = _usable(files, references, star, target)
         if filter is not None:
             return cls._by_epoch(listed, target, filter)
         science, _ = choose_target([replace(each) for each in listed], target)
+        if len({each.exposure.filter for each in science}) > 1:
+            judge_frames(listed)
+            science, _ = choose_target([replace(each) for each in listed], target)
         names = {each.exposure.filter for each in science} - {None}
         if len(names) < 2:
             return cls._by_epoch(listed, target, next(iter(names), None))
@@ -224,15 +237,15 @@ class Sequence:
         """Sort files that were listed, whose reasons this fills in."""
         choose_filter(listed, filter)
         science, others = choose_target(listed, target)
-        exclude_other_setups(science, others)
         star = science[0].star
         together = [*science, *others]
-        frames = {id(each): each.read() for each in together if not each.reason}
-        judge_frames([each for each in together if not each.reason], frames)
-        exclude_copies(together, frames)
-        exclude_contradicting(together, frames, why_turned)
+        # Only frames that can be used vote for the set-up.
+        judge_frames(together)
+        exclude_other_setups(science, others)
+        exclude_copies(together)
+        exclude_contradicting(together, why_turned)
         for group in (science, *_by_star(others)):
-            exclude_contradicting(group, frames, why_other_brightness)
+            exclude_contradicting(group, why_other_brightness)
         exclude_unoriented(science)
         if all(each.reason for each in science):
             reasons = "; ".join(f"{each.name}: {each.reason}" for each in science)
@@ -240,8 +253,7 @@ class Sequence:
         kept = [each for each in science if not each.reason]
         epochs = epochs_of([each.exposure.date for each in kept])
         return tuple(
-            cls._of_epoch(star, [kept[k] for k in epoch], listed, science, frames)
-            for epoch in epochs
+            cls._of_epoch(star, [kept[k] for k in epoch], listed, science) for epoch in epochs
         )
 
     @classmethod
@@ -251,12 +263,12 @@ class Sequence:
         chosen: list[FrameFile],
         listed: list[FrameFile],
         science: list[FrameFile],
-        frames: Mapping[int, Observation | None],
     ) -> Sequence:
         """Make the sequence of one epoch, of which `chosen` are the target's frames."""
         dates = [each.exposure.date for each in chosen if each.exposure.date is not None]
         rows, excluded = [], []
         used: dict[str, list[Observation]] = {"target": [], "reference": []}
+        exposures: dict[str, str] = {}
         for each in listed:
             reason = each.reason
             if not reason and each not in chosen and (each in science or not _near(each, dates)):
@@ -267,17 +279,18 @@ class Sequence:
                 rows.append(Row("excluded", each.star, each.exposure, None, reason, each.path))
                 continue
             use: Literal["target", "reference"] = "target" if each in chosen else "reference"
-            observation = frames[id(each)]
+            observation = each.observation
             for part in () if observation is None else observation.pointings():
                 part = replace(part, reference=use == "reference")
                 used[use].append(part)
+                exposures[part.name] = re.sub(r"-seg\d+", "", each.exposure.identity or part.name)
                 remark = "; ".join(part.remarks)
                 rows.append(Row(use, each.star, each.exposure, part, remark, each.path))
         rows.sort(key=lambda row: (("target", "reference", "excluded").index(row.use), row.time))
         return cls(
             star,
-            tuple(sorted(used["target"], key=_time)),
-            tuple(sorted(used["reference"], key=_time)),
+            tuple(sorted(_with_segments_joined(used["target"], exposures), key=_time)),
+            tuple(sorted(_with_segments_joined(used["reference"], exposures), key=_time)),
             tuple(excluded),
             tuple(rows),
         )
@@ -325,12 +338,54 @@ class Sequence:
 def _usable(
     files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     references: Iterable[str | os.PathLike[str]],
+    star: tuple[float, float] | None = None,
+    target: str | None = None,
 ) -> list[FrameFile]:
     """Files with the reasons of those that cannot be used, of which some are left."""
     listed = exposures_in(files, references)
-    exclude_unusable(listed)
+    if star is not None:
+        place = _star_place(star)
+        marked = all(each.exposure.reference for each in listed if not each.reason)
+        for each in listed:
+            named = target is not None and each.exposure.star.is_called(target)
+            if named or (target is None and (marked or not each.exposure.reference)):
+                each.place = place
+    exclude_unusable(listed, judge_frames)
     require_some(listed)
     return listed
+
+
+def _with_segments_joined(
+    observations: Iterable[Observation], exposures: Mapping[str, str]
+) -> list[Observation]:
+    """Join the segments of an exposure that show the star at one place and angle.
+
+    `exposures` is the exposure of every observation by name. How an exposure was cut into files
+    then makes no difference.
+    """
+    joined: list[list[Observation]] = []
+    for each in observations:
+        for group in joined:
+            if exposures[group[0].name] == exposures[each.name] and group[0].continues_in(each):
+                group.append(each)
+                break
+        else:
+            joined.append([each])
+    return [group[0].followed_by(group[1:]) for group in joined]
+
+
+def _star_place(star: object) -> tuple[float, float]:
+    """Check the position of a star, x, y in pixels."""
+    try:
+        place = np.asarray(star, dtype=float)
+    except (TypeError, ValueError):
+        place = np.array([])
+    if place.shape != (2,) or not np.isfinite(place).all():
+        raise IncompatibleSetupError(
+            f"star: got {star!r}, expected two finite numbers, x and y of the star in the target's "
+            "files in pixels from 0, such as (150, 174)"
+        )
+    return float(place[0]), float(place[1])
 
 
 def _rows(

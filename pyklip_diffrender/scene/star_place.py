@@ -6,7 +6,7 @@ import numpy as np
 from astropy.convolution import Gaussian2DKernel, interpolate_replace_nans
 from numpy.typing import NDArray
 
-__all__ = ["center_of_symmetry", "measured_offset", "stamp_about"]
+__all__ = ["center_of_pattern", "center_of_symmetry", "measured_offset", "stamp_about"]
 
 Image = NDArray[np.float64]
 
@@ -22,11 +22,27 @@ _SKY = 3.0
 _ENOUGH = 2000
 """Least number of pixels for that; with fewer, it is the faintest fifth of all."""
 
+_RING, _ENOUGH_OF_RING = 1.8, 300
+"""Distance, arcsec, and number of pixels of a ring about the star, whose darkest quarter is no
+darker than the background."""
+
 _INNER, _OUTER, _CONCENTRATED = 1.0, 2.0, 5.0
 """Ratio of the light within 1 arcsec and beyond 2 arcsec from which an image is that of a star."""
 
 _SEEN = 3.0
 """S/N of the pixels that are looked at."""
+
+_PATTERN = 1.2
+"""Radius, arcsec, of the star's light in which other sources count little, see
+`center_of_pattern`."""
+
+_AGREE = 0.05
+"""Difference, arcsec, between the centres of all light and of that near the star beyond which
+another source contributes to them."""
+
+_NEAR = 0.5
+"""Largest distance, arcsec, of a star from its stated place that its light tells from that of
+another source."""
 
 
 def stamp_about(
@@ -60,7 +76,12 @@ def stamp_about(
     all_rows, all_columns = np.indices(data.shape)
     outside = valid & (np.hypot(all_columns - x, all_rows - y) * pixelscale > _SKY)
     sky = data[outside] if outside.sum() > _ENOUGH else np.sort(data[valid])[: valid.sum() // 5 + 1]
-    image = np.where(valid[window], data[window] - float(np.median(sky)), np.nan)
+    # A nebula or a neighbour may be brighter elsewhere than about the star.
+    ring = data[window][valid[window] & (distance > _RING)]
+    level = float(np.median(sky))
+    if ring.size > _ENOUGH_OF_RING:
+        level = min(level, float(np.quantile(ring, 0.25)))
+    image = np.where(valid[window], data[window] - level, np.nan)
     # A pixel that is missing in the core would move the centre of symmetry.
     image = np.nan_to_num(interpolate_replace_nans(image, Gaussian2DKernel(1.0)))
     return image, distance, error[window]
@@ -106,6 +127,35 @@ def _vertex(values: Image, peak: int) -> float:
     return float(0.5 * (low - high) / curvature) if curvature < 0 else 0.0
 
 
+def center_of_pattern(image: Image, distance: Image) -> Image:
+    """Find the centre of a star's diffraction pattern where another source may outshine it.
+
+    Square roots, within 1.2 arcsec of the middle, are compared: a point source is then a small
+    part of the light, and the star's pattern, which fills the field, most of it.
+
+    Parameters
+    ----------
+    image, distance : ndarray, (n, n)
+        See `stamp_about`; pixels without a signal are 0.
+
+    Returns
+    -------
+    ndarray, (2,)
+        x, y from the middle, pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rows, columns = np.indices((31, 31)) - 15
+    >>> distance = 0.06 * np.hypot(rows, columns)
+    >>> image = np.exp(-((distance / 0.6) ** 2))
+    >>> image[20, 24] += 30
+    >>> print(np.abs(center_of_symmetry(image)).max(), center_of_pattern(image, distance).round(1))
+    9.0 [0. 0.]
+    """
+    return center_of_symmetry(np.sqrt(np.maximum(np.where(distance < _PATTERN, image, 0.0), 0.0)))
+
+
 def measured_offset(
     data: Image, error: Image, valid: NDArray[np.bool_], center: Image, pixelscale: float
 ) -> Image | None:
@@ -116,7 +166,8 @@ def measured_offset(
     Returns
     -------
     ndarray, (2,), or None
-        None if the image is too small, or is not that of a star.
+        None if the image is too small, is not that of a star, or is also that of another source
+        whose light cannot be told from the star's.
     """
     stamp = stamp_about(data, error, valid, center, pixelscale)
     if stamp is None:
@@ -130,4 +181,11 @@ def measured_offset(
     bright = np.where(image > _SEEN * noise, image, 0.0)
     if np.count_nonzero(bright) < 10:
         return None
-    return np.asarray(np.round(center) + center_of_symmetry(bright) - center)
+    away = center_of_symmetry(bright)
+    if np.hypot(*away) * pixelscale > _NEAR:
+        return None
+    rows, columns = np.indices(image.shape) - len(image) // 2
+    about = np.hypot(columns - away[0], rows - away[1]) * pixelscale
+    if np.hypot(*(center_of_pattern(bright, about) - away)) * pixelscale > _AGREE:
+        return None
+    return np.asarray(np.round(center) + away - center)
