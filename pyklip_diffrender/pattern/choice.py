@@ -324,7 +324,8 @@ def _unknown_pattern(science: Sequence[Observation]) -> Systematics | None:
         each.first_pixel == first.first_pixel and each.shape == first.shape for each in science
     )
     # Files of one roll, such as the segments of an exposure, show a planet on the same pixels.
-    turned = max(abs(each.roll_from(first)) for each in science) > _TURNED
+    # Frames of another star do not show it at all.
+    turned = any(abs(each.roll_from(first)) > _TURNED or each.reference for each in science)
     if not turned or not first.is_nircam or first.first_pixel is None or not same:
         return None
     zeros = np.zeros(first.shape)
