@@ -179,7 +179,7 @@ def test_a_failure_is_reported_after_the_others(
     }
     database = StandIn(tmp_path, obs)
 
-    def reduced(key: str, table: Table, frames: QTable, folder: Path, *others: Any) -> Any:
+    def reduced(key: str, table: Table, judged: Any, folder: Path, *others: Any) -> Any:
         if key == "bad":
             raise IncompatibleSetupError("no such filter")
         header = {name: good[name][0] for name in good.colnames if len(name) <= 8
@@ -223,9 +223,9 @@ def test_files_are_judged_before_any_is_fitted(tmp_path: Path) -> None:
     table = concatenation([*rolls, str(confirmation), str(own), str(other)])
     table["TYPE"] = ["SCI"] * 3 + ["REF"] * 2
     with pytest.warns(DiffrenderWarning) as caught:
-        left, frames = run._admitted(KEY, table)
+        left, judged = run._admitted(KEY, table)
     assert list(left["FITSFILE"]) == [*rolls, str(other)]
-    uses = {row["file"]: row["use"] for row in frames}
+    uses = {row["file"]: row["use"] for row in judged.sequence.table}
     assert uses == {
         "1_calints.fits": "target", "2_calints.fits": "target", "psf.fits": "reference",
         "own.fits": "excluded", "ta.fits": "excluded",
@@ -285,7 +285,7 @@ def test_a_concatenation_from_frames_to_sources(
     )  # fmt: skip
     database.obs[KEY] = concatenation(files)
     detections = spaceklip.run_obs(
-        database, opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED, save_rolls=True,
+        database, opd=OPD, model=model, systematics="off", fit=ALIGNED, save_rolls=True,
         image="subtracted",
     )  # fmt: skip
     assert list(detections) == list(database.red) == [KEY]
@@ -320,14 +320,14 @@ def test_a_catalogues_star_is_that_of_the_search(
     model, files = two_rolls(tmp_path, monkeypatch)
     tied: list[tuple[float, float]] = []
 
-    def with_star_flux(fit: Refinement, jansky: float, error: float) -> Refinement:
+    def with_star_flux(fit: Refinement, jansky: float, error: float, **options: Any) -> Refinement:
         tied.append((jansky, error))
         return replace(fit, catalogue_error=error)
 
-    monkeypatch.setattr(run, "with_star_flux", with_star_flux)
+    monkeypatch.setattr("pyklip_diffrender.reduction.pipeline.with_star_flux", with_star_flux)
     detections = spaceklip.run_obs(
         StandIn(tmp_path, {KEY: concatenation(files)}), opd=OPD, model=model, systematics="off",
-        plan="off", fit=ALIGNED, star_flux={"F444W": "450 mJy"}, star_flux_error=0.3,
+        fit=ALIGNED, star_flux={"F444W": "450 mJy"}, star_flux_error=0.3,
     )  # fmt: skip
     assert tied == [(pytest.approx(0.45), 0.3)]
     table = detections[KEY].candidates
@@ -357,7 +357,7 @@ def test_spaceklips_own_subtraction(
     table["ROLL_REF"], reference["ROLL_REF"] = SKY_ANGLES, [0.0]
     real_database.obs[KEY] = vstack([table, reference])
     monkeypatch.setattr(pipeline, "get_transmission", lambda *args: None, raising=False)
-    with backend(opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED):
+    with backend(opd=OPD, model=model, systematics="off", fit=ALIGNED):
         pipeline.run_obs(
             real_database,
             kwargs={"mode": ["ADI+RDI"], "annuli": [1], "subsections": [1], "numbasis": [1],
@@ -379,9 +379,7 @@ def test_spaceklips_own_injections_need_one_fit(
         "mode": "ADI", "annuli": 1, "subsections": 1, "numbasis": [1], "movement": 1,
         "calibrate_flux": False, "highpass": False, "verbose": False, "outputdir": f"{tmp_path}/",
     }  # fmt: skip
-    with backend(
-        opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED, image="subtracted"
-    ):
+    with backend(opd=OPD, model=model, systematics="off", fit=ALIGNED, image="subtracted"):
         dataset = JWST.JWSTData(files, None, highpass=False)
         before = copy.deepcopy(dataset)
         klip_dataset(dataset, fileprefix="once", **options)

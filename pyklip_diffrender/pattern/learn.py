@@ -33,7 +33,7 @@ from pyklip_diffrender.pattern.presence import pattern_size
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.settings import GaussNewton, settings_for
-from pyklip_diffrender.scene.admission import frames_by_star
+from pyklip_diffrender.scene.admission import frames_by_star, judge_frames
 from pyklip_diffrender.scene.archive_names import detector_of
 from pyklip_diffrender.scene.exposure import image_mask
 from pyklip_diffrender.scene.frame_files import (
@@ -285,7 +285,7 @@ def _epochs(
 ) -> Iterable[_Epoch]:
     """Sort files, and read the frames of every star, epoch and set-up."""
     listed = exposures_in(files)
-    exclude_unusable(listed)
+    exclude_unusable(listed, judge_frames)
     require_some(listed)
     for each in listed:
         if each.reason:

@@ -147,14 +147,8 @@ class Annealing:
         self._first_scales = self.solver.priors.scales
         self.history: list[dict[str, Any]] = []
 
-    def run(self, seed: int) -> Refinement:
-        """Fit the alignment, then alignment and wavefront; return the best iterate.
-
-        Parameters
-        ----------
-        seed : int
-            Recorded with the result.
-        """
+    def run(self) -> Refinement:
+        """Fit the alignment, then alignment and wavefront; return the best iterate."""
         began = time.perf_counter()
         course, converged = self._beginning(), False
         with ProgressBar("wavefront", shown=self.progress) as bar:
@@ -173,7 +167,6 @@ class Annealing:
             status,
             history=self.history,
             seconds=time.perf_counter() - began,
-            seed=seed,
         )
 
     def _beginning(self) -> Course:

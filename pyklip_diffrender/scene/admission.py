@@ -201,8 +201,9 @@ def _are_two_stars(one: Exposure, other: Exposure) -> bool:
         return False
     if any(other.star.is_called(name) for name in one.star.names):
         return False
-    dates = one.date, other.date
-    return None not in dates and abs(one.date.mjd - other.date.mjd) <= EPOCH
+    if one.date is None or other.date is None:
+        return False
+    return bool(abs(one.date.mjd - other.date.mjd) <= EPOCH)
 
 
 def _namesake(star: CatalogueStar, target: CatalogueStar) -> str:

@@ -17,7 +17,14 @@ from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["FrameFile", "admissible", "exclude_unusable", "exposures_in", "require_some"]
+__all__ = [
+    "FrameFile",
+    "admissible",
+    "exclude_unusable",
+    "exposures_in",
+    "require_some",
+    "with_references",
+]
 
 _SUFFIXES = (".fits", ".fits.gz")
 
@@ -59,8 +66,11 @@ class FrameFile:
         Whether the file holds something that was made from frames, and no frames.
     place : tuple of float or None
         x, y of the star in the file, 0-indexed pixels, which replaces that of the header.
+    frames : Observation or DiffrenderError, optional
+        Its frames, one for every integration, or why they cannot be read; None for a file that is
+        read when its frames are needed.
     observation : Observation or None
-        The frames, once they were read.
+        The frames of integrations that are used, once they were read.
     """
 
     path: Path
@@ -70,7 +80,35 @@ class FrameFile:
     for_reference: bool = False
     is_product: bool = False
     place: tuple[float, float] | None = None
+    frames: Observation | DiffrenderError | None = field(default=None, repr=False)
     observation: Observation | None = field(default=None, repr=False)
+
+    @classmethod
+    def in_hdus(cls, hdus: fits.HDUList, path: Path, *, frames: bool) -> FrameFile:
+        """Read the header of an open file, and its frames if they are asked for."""
+        product = _why_a_product(hdus)
+        if product:
+            return cls(path, Exposure(path.name), reason=product, is_product=True)
+        try:
+            header = merged_header(hdus[0].header, hdus["SCI"].header, path.name)
+            file = cls(path, Exposure.of(header, path.name, np.shape(hdus["SCI"].data)))
+        except DiffrenderError as error:
+            file = cls(path, Exposure(path.name), reason=_without_name(error, path.name))
+        if frames:
+            try:
+                file.frames = Observation.from_hdus(hdus, path.name)
+            except DiffrenderError as error:
+                file.frames = error
+        return file
+
+    @classmethod
+    def opened(cls, path: Path, *, frames: bool) -> FrameFile:
+        """Open a file once, and read its header, and its frames if they are asked for."""
+        try:
+            with open_fits(path) as hdus:
+                return cls.in_hdus(hdus, path, frames=frames)
+        except DiffrenderError as error:
+            return cls(path, Exposure(path.name), reason=_without_name(error, path.name))
 
     @property
     def name(self) -> str:
@@ -78,13 +116,22 @@ class FrameFile:
         return self.path.name
 
     def read(self) -> Observation | None:
-        """Read the frames, once; if they cannot be read, None, with the reason."""
+        """The frames of integrations that are used, read once; None, with the reason, if none."""
         if self.observation is None and not self.reason:
             try:
-                self.observation = Observation.from_fits(self.path, star=self.place)
+                self.observation = self._used()
             except DiffrenderError as error:
                 self.reason = _without_name(error, self.name)
         return self.observation
+
+    def _used(self) -> Observation:
+        """The frames of integrations that are used."""
+        if isinstance(self.frames, DiffrenderError):
+            raise self.frames
+        if self.frames is None:
+            return Observation.from_fits(self.path, star=self.place)
+        used = self.frames.valid.any(axis=(1, 2))
+        return self.frames if used.all() else self.frames.part(np.flatnonzero(used))
 
 
 def _without_name(error: Exception, name: str) -> str:
@@ -121,8 +168,14 @@ def exposures_in(
             paths.append(each)
     if not paths:
         raise NoValidPixelsError("files: got none, expected at least one")
-    listed = [_frame_file(path) for path in paths]
-    marked = [_frame_file(Path(path)) for path in references]
+    listed = [FrameFile.opened(path, frames=False) for path in paths]
+    return with_references(
+        listed, [FrameFile.opened(Path(path), frames=False) for path in references]
+    )
+
+
+def with_references(listed: list[FrameFile], marked: list[FrameFile]) -> list[FrameFile]:
+    """Add files of reference stars, whatever their headers say, see `exposures_in`."""
     if marked and all(file.exposure.reference for file in listed):
         for file in listed:
             file.exposure = replace(file.exposure, reference=False)
@@ -130,19 +183,6 @@ def exposures_in(
         file.exposure = replace(file.exposure, reference=True)
         file.for_reference = True
     return listed + marked
-
-
-def _frame_file(path: Path) -> FrameFile:
-    try:
-        with open_fits(path) as hdus:
-            product = _why_a_product(hdus)
-            if product:
-                return FrameFile(path, Exposure(path.name), reason=product, is_product=True)
-            header = merged_header(hdus[0].header, hdus["SCI"].header, path.name)
-            shape = np.shape(hdus["SCI"].data)
-            return FrameFile(path, Exposure.of(header, path.name, shape))
-    except DiffrenderError as error:
-        return FrameFile(path, Exposure(path.name), reason=_without_name(error, path.name))
 
 
 def _why_a_product(hdus: fits.HDUList) -> str:

@@ -32,9 +32,11 @@ from pyklip_diffrender.scene.frame_files import (
     exclude_unusable,
     exposures_in,
     require_some,
+    with_references,
 )
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.pixel_checks import why_other_brightness, why_turned
+from pyklip_diffrender.scene.window import Window
 
 __all__ = ["Sequence"]
 
@@ -151,6 +153,26 @@ class Sequence:
         sequences = cls.by_epoch(
             files, target=target, filter=filter, references=references, star=star
         )
+        return cls._only(sequences, epoch)
+
+    @classmethod
+    def of_opened(
+        cls,
+        files: list[FrameFile],
+        references: list[FrameFile],
+        *,
+        target: str | None = None,
+        filter: str | None = None,
+    ) -> Sequence:
+        """Sort files that were opened, see `from_files`, and fill in their reasons."""
+        listed = with_references(files, references)
+        exclude_unusable(listed, judge_frames)
+        require_some(listed)
+        return cls._only(cls._by_epoch(listed, target, filter), None)
+
+    @staticmethod
+    def _only(sequences: tuple[Sequence, ...], epoch: str | Time | None) -> Sequence:
+        """The sequence of an epoch, or the only one."""
         if epoch is not None:
             date = Time(epoch)
             near = [
@@ -222,11 +244,11 @@ class Sequence:
         names = {each.exposure.filter for each in science} - {None}
         if len(names) < 2:
             return cls._by_epoch(listed, target, next(iter(names), None))
-        star = target or science[0].star
+        name = target or science[0].star
         sequences = [
             each
-            for name in sorted(filter_ for filter_ in names if filter_ is not None)
-            for each in cls._by_epoch([replace(file) for file in listed], star, name)
+            for chosen in sorted(filter_ for filter_ in names if filter_ is not None)
+            for each in cls._by_epoch([replace(file) for file in listed], name, chosen)
         ]
         return tuple(sorted(sequences, key=lambda each: _time(each.science[0])))
 
@@ -311,28 +333,60 @@ class Sequence:
         rows = self.rows or (*_rows("target", self.science), *_rows("reference", self.references))
         return rows_table(rows)
 
-    def cutout(self, size: int) -> Sequence:
-        """Cut the `size` x `size` pixels about the star out of every frame.
+    def windows(self, shape: tuple[int, int]) -> tuple[tuple[Window, ...], tuple[Window, ...]]:
+        """Boxes of `shape` about the star, one for each observation of target and references.
 
-        Frames whose stars are on nearly the same pixel of the detector as in the first one are cut
-        alike, so that they share its pattern.
+        Frames whose stars are on nearly the same pixel of the detector as in the first one have
+        boxes of the same pixels, so that they share its pattern.
+
+        Returns
+        -------
+        science, references : tuple of Window
         """
-        first = self.science[0].cutout(size)
+        frames = (*self.science, *self.references)
+        windows = [Window.about(each.center.mean(axis=0), shape) for each in frames]
+        places = [
+            None if each.first_pixel is None else np.add(each.first_pixel, (window.x, window.y))
+            for each, window in zip(frames, windows, strict=True)
+        ]
+        first = places[0]
+        for k, place in enumerate(places):
+            if first is None or place is None:
+                continue
+            x, y = first - place
+            if max(abs(x), abs(y)) <= _NEARLY_THE_SAME:
+                windows[k] = Window(windows[k].y + int(y), windows[k].x + int(x), shape)
+        count = len(self.science)
+        return tuple(windows[:count]), tuple(windows[count:])
 
-        def cut(frame: Observation) -> Observation:
-            alone = frame.cutout(size)
-            if first.first_pixel is None or alone.first_pixel is None:
-                return alone
-            away = np.abs(np.subtract(alone.first_pixel, first.first_pixel)).max()
-            if not 0 < away <= _NEARLY_THE_SAME:
-                return alone
-            return frame.cutout(size, first_pixel=first.first_pixel)
+    def cutout(self, size: int | tuple[int, int], *, beyond_edges: bool = False) -> Sequence:
+        """Cut the pixels about the star out of every frame, see `windows`.
 
-        return replace(
-            self,
-            science=tuple(map(cut, self.science)),
-            references=tuple(map(cut, self.references)),
+        Parameters
+        ----------
+        size : int or tuple of int
+            Rows and columns; one number for a square.
+        beyond_edges : bool
+            Allow pixels beyond the edges of the frames, which are masked.
+
+        Raises
+        ------
+        ShapeError
+            If the pixels are not inside a frame, unless they may be beyond its edges.
+        NoValidPixelsError
+            If a frame has no valid pixel there.
+        """
+        shape = (size, size) if isinstance(size, int) else size
+        science, references = (
+            tuple(
+                each.within(window, beyond_edges=beyond_edges)
+                for each, window in zip(frames, windows, strict=True)
+            )
+            for frames, windows in zip(
+                (self.science, self.references), self.windows(shape), strict=True
+            )
         )
+        return replace(self, science=science, references=references)
 
 
 def _usable(
