@@ -610,7 +610,7 @@ def test_a_failure_raises_and_leaves_everything_as_it_was(
         if len(calls) == 3 and where == "fit":
             raise RefinementError("diverged", found)
         star = {"shape": found.star[:, 1:], "nothing": found.star * np.nan}.get(where, found.star)
-        return Subtraction(star, "m", 0, found.fits)
+        return Subtraction(star, found.fits)
 
     if where == "writing":
         save = dataset.savedata

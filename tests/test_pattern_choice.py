@@ -26,6 +26,8 @@ SIZE, NPIX = 32, 64
 ALIGNED = GaussNewton(free=("flux", "background"), wavefront=False, companions_if_stalled=False)
 OPD = dr.random_opd(1, npix=NPIX)
 LIBRARY = {"INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "CORONMSK": "MASKA335R"}
+SAME_FLAT = {**LIBRARY, "R_FLAT": "crds://jwst_nircam_flat_0465.fits"}
+OTHER_FLAT = {**LIBRARY, "R_FLAT": "crds://jwst_nircam_flat_0999.fits"}
 ELSEWHERE = {**LIBRARY, "DETECTOR": "NRCA2"}
 PLACE = (625, 1659)
 """Pixels in the middle of those that the library has."""
@@ -103,15 +105,19 @@ def test_a_known_pattern_takes_the_place_of_most_of_the_models_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shown", "references", "labels"),
+    ("cards", "shown", "references", "labels"),
     [
-        (1.0, 2, [f"library ({STARS})"]),
-        (0.0, 2, [f"library ({STARS})", "references (REF)"]),
-        (0.0, 0, [f"library ({STARS})", "the rolls themselves"]),
+        (SAME_FLAT, 1.0, 2, [f"library ({STARS})"]),
+        (SAME_FLAT, 0.0, 2, [f"library ({STARS})", "references (REF)"]),
+        (SAME_FLAT, 0.0, 0, [f"library ({STARS})", "the rolls themselves"]),
+        # The first frame tells as much where the header names another flat field, or none.
+        (LIBRARY, 0.0, 2, ["references (REF)"]),
+        (OTHER_FLAT, 0.0, 0, ["the rolls themselves"]),
+        (OTHER_FLAT, 1.0, 2, [f"library ({STARS})"]),
     ],
 )
 def test_a_library_of_another_flat_field_is_replaced(
-    shown: float, references: int, labels: list[str]
+    cards: dict[str, str], shown: float, references: int, labels: list[str]
 ) -> None:
     """The fit is repeated with what there is besides the library."""
     fitted: list[str] = []
@@ -124,8 +130,8 @@ def test_a_library_of_another_flat_field_is_replaced(
         )
 
     choice, last = fit_with_pattern(
-        [frame("TARGET", LIBRARY, shown=shown, seed=k) for k in (1, 2)],
-        [frame("REF", LIBRARY, shown=shown, seed=3 + k) for k in range(references)],
+        [frame("TARGET", cards, shown=shown, seed=k) for k in (1, 2)],
+        [frame("REF", cards, shown=shown, seed=3 + k) for k in range(references)],
         model(),
         OPD,
         fit,
@@ -177,7 +183,7 @@ def test_a_rough_fit_tells_which_pixels_a_frame_shows(
     [
         ({}, 1.0, "none"),
         pytest.param(LIBRARY, 1.0, f"library ({STARS})", marks=pytest.mark.slow),
-        (LIBRARY, 0.0, "none"),
+        (SAME_FLAT, 0.0, "none"),
     ],
 )
 def test_pyklip_chooses_as_a_reduction_does(
