@@ -54,6 +54,7 @@ OWNERS = {
     "astroquery": ("archive",),
     "dask": ("surveys",),
     "distributed": ("surveys",),
+    "jinja2": ("reduction.pages",),
     "matplotlib": ("drawing",),
     "mpl_toolkits": ("drawing",),
     "poppy": ("bridges",),

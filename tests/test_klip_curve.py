@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics import OpticalSystem
@@ -80,13 +81,15 @@ def curve_of(
     references: list[FrameFit] | tuple[FrameFit, ...] = (),
     separations: Any = None,
     hidden: Any = False,
+    sources: Candidates | None = None,
 ) -> QTable:
-    """KLIP's curve for fitted frames, as if they had been searched but where `hidden`."""
+    """KLIP's curve for fitted frames, as if a search but where `hidden` had these `sources`."""
     curve = SimpleNamespace(meta={"resolution_arcsec": RESOLUTION})
     searched: Any = SimpleNamespace(
         fits=(SimpleNamespace(frames=tuple(science)),),
         contrast_curve=curve,
         grid=science[0].grid,
+        sources=Candidates.at([], []) if sources is None else sources,
         has_limits=~np.broadcast_to(hidden, science[0].grid.shape[:2]),
     )
     return klip_curve(searched, [each.observation for each in references], separations)
@@ -138,17 +141,24 @@ def test_stars_are_aligned() -> None:
     assert (curve_of(science, wrong, SEPARATIONS)["contrast"] > 1.2 * quiet()).any()
 
 
-def test_companions_of_the_fit_are_not_noise() -> None:
+def test_candidates_are_not_noise() -> None:
+    """Neither a companion of the fit nor a planet that only the search found, in one ring."""
     science, references = frames()
+    sources = Candidates.at([[0.5, 0.0], [-0.3, 0.4]], [1e-2, 4e-3])
     templates = Templates(SimpleNamespace(frames=science), science[0])  # type: ignore[arg-type]
-    light = templates.at(torch.tensor([[0.5, 0.0]], dtype=torch.float64))
-    known = []
+    light = templates.at(sources.offsets)
+    seen = []
     for k, each in enumerate(science):
-        planet = 1e-2 * light[k][0].numpy()
-        observation = replace(each.observation, data=each.observation.data + planet)
-        known.append(replace(each, observation=observation, companion_image=planet))
-    curve = curve_of(known, references, SEPARATIONS)
+        companion, planet = (sources.contrasts[:, None, None] * light[k]).numpy()
+        data = each.observation.data + companion + planet
+        observation = replace(each.observation, data=data)
+        seen.append(replace(each, observation=observation, companion_image=companion))
+    curve = curve_of(seen, references, SEPARATIONS, sources=sources)
     assert curve["contrast"] == pytest.approx(quiet(), rel=1e-6)
+    # With either of the two in the frames, the ring at 0.5 arcsec has a worse limit.
+    for k in range(2):
+        left = curve_of(seen, references, SEPARATIONS, sources=sources.without(k))
+        assert left["contrast"][0] > 2 * quiet()[0]
 
 
 def test_noise_is_that_of_the_places_that_have_limits() -> None:

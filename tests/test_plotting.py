@@ -8,11 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from astropy import units as u
+from astropy.table import QTable
 from matplotlib import pyplot
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import QuadMesh
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
+from pyklip_diffrender import drawing
 from pyklip_diffrender.detection import Candidates, Detection
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.optics.system import OpticalSystem
@@ -285,3 +290,98 @@ def test_absorption_does_not_spoil_the_wavefront(model: OpticalSystem) -> None:
     opd = torch.from_numpy(random_opd(3, npix=NPIX).data)
     both = model.plot(opd=torch.complex(opd, 1e-8 * torch.ones_like(opd)))[1]
     np.testing.assert_array_equal(shown(both), shown(model.plot(opd=opd)[1]))
+
+
+# -- curves --------------------------------------------------------------------------------------
+
+
+def curve_table() -> QTable:
+    contrast = np.array([1e-4, 2e-5, 5e-6])
+    table = QTable({"separation": [0.3, 0.6, 1.0] * u.arcsec}, meta={"sigmas": 5.0})
+    for name, factor in {"contrast": 1.0, "lowest": 0.7, "highest": 1.5, "known_star": 0.6,
+                         "small_sample": 1.2}.items():  # fmt: skip
+        table[name] = factor * contrast
+    return table
+
+
+def test_klip_is_in_view_and_nothing_hides_it() -> None:
+    klip = QTable(
+        {
+            "separation": [0.3, 0.6, 1.0] * u.arcsec, "contrast": [3e-3, 8e-5, 2e-5],
+            "small_sample": [np.inf, 1e-4, 2.2e-5],
+        },
+        meta={"label": "KLIP RDI (4 reference frames, 2 modes)"},
+    )  # fmt: skip
+    figure, ax = drawing.wide_panel()
+    candidates = QTable({"separation": [] * u.arcsec})
+    drawing.contrast_curve(
+        ax, curve_table(), candidates, small_sample=True, klip=klip, legend_below=True
+    )
+    FigureCanvasAgg(figure).draw()
+    low, high = ax.get_ylim()
+    assert low < 5e-6
+    assert high > 3e-3
+    legend = ax.get_legend()
+    assert legend is not None
+    box = legend.get_window_extent()
+    assert not box.overlaps(ax.get_window_extent())
+    assert figure.bbox.contains(box.x0, box.y0)
+    assert figure.bbox.contains(box.x1, box.y1)
+
+
+def test_a_contrast_has_its_magnitude_on_the_other_axis() -> None:
+    figure, ax = drawing.wide_panel()
+    drawing.contrast_curve(
+        ax, curve_table(), QTable({"separation": [] * u.arcsec}), small_sample=False
+    )
+    FigureCanvasAgg(figure).draw()
+    (right,) = ax.child_axes
+    assert right.get_ylabel() == "magnitude difference"
+    height = right.transData.transform([[0, 12.5]])[0, 1]
+    assert height == pytest.approx(ax.transData.transform([[0.3, 1e-5]])[0, 1])
+    shown = [float(label.get_text()) for label in right.get_yticklabels()]
+    assert len(shown) >= 3
+    assert np.allclose(np.diff(shown, 2), 0)
+
+
+@pytest.mark.parametrize("separations", [[0.4], [0.4, 0.6, 1.0]])
+def test_cells_of_completeness_have_the_contrasts_of_their_separation(
+    separations: list[float],
+) -> None:
+    """Every separation has its own contrasts, and these need not rise."""
+    strengths = np.array([2.0, 0.5, 1.0])
+    rows = [(s, k * 1e-5 / s, k / 2) for s in separations for k in strengths]
+    place, contrast, fraction = np.transpose(rows)
+    table = QTable({"separation": place * u.arcsec, "contrast": contrast, "completeness": fraction})
+    figure, ax = drawing.panel()
+    flat = [1e-5] * len(separations)
+    drawing.completeness(ax, table, curve_table(), flat, flat)
+    FigureCanvasAgg(figure).draw()
+    meshes = [each for each in ax.collections if isinstance(each, QuadMesh)]
+    assert len(meshes) == len(separations)
+    for separation, mesh in zip(separations, meshes, strict=True):
+        corners = mesh.get_coordinates()
+        # Upright rectangles, each about its contrast.
+        assert np.ptp(corners[..., 1], axis=1).max() == 0
+        edges = corners[:, 0, 1]
+        for cell, strength in enumerate(np.sort(strengths)):
+            assert edges[cell] < strength * 1e-5 / separation < edges[cell + 1]
+        assert corners[0, 0, 0] < separation < corners[0, 1, 0]
+        assert mesh.get_array().ravel().tolist() == [0.25, 0.5, 1.0]
+
+
+def test_ellipses_of_a_corner_are_those_of_the_covariance() -> None:
+    values = np.array([2.0, 400.0, -300.0])
+    covariance = np.array([[0.04, 0.3, 0.0], [0.3, 9.0, 4.0], [0.0, 4.0, 16.0]])
+    figure = drawing.corner(["a", "b", "c"], values, covariance, ["2.0", "400", "-300"])
+    axes = np.reshape(figure.axes, (3, 3))
+    for row, column in ((1, 0), (2, 0), (2, 1)):
+        pair = [column, row]
+        inverse = np.linalg.inv(covariance[np.ix_(pair, pair)])
+        for line, sigmas in zip(axes[row, column].lines, (1.0, 2.0), strict=False):
+            away = np.stack(line.get_data(), axis=1) - values[pair]
+            chi2 = np.einsum("ni,ij,nj->n", away, inverse, away)
+            np.testing.assert_allclose(chi2, sigmas**2)
+    bell = axes[1, 1].lines[0]
+    x, y = bell.get_data()
+    assert y[np.abs(x - 403.0).argmin()] == pytest.approx(np.exp(-0.5), abs=0.03)

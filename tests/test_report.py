@@ -9,7 +9,6 @@ import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
-from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,20 +22,26 @@ from astropy.io import fits
 from astropy.table import QTable
 from astropy.time import Time
 from astropy.wcs import WCS
+from markupsafe import escape
 from numpy.typing import NDArray
 
 import pyklip_diffrender as dr
+from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidates import Candidates
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.geometry import full_circle, half_circle
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.pattern import pattern_size
-from pyklip_diffrender.reduction import summarise, write_report
+from pyklip_diffrender.reduction import existing_products, summarise, write_report
 from pyklip_diffrender.reduction.extended import looks_extended
 from pyklip_diffrender.reduction.overview import Klip, Overview
-from pyklip_diffrender.reduction.page import page
+from pyklip_diffrender.reduction.pages import Picture, write_figures
+from pyklip_diffrender.reduction.pictures import ReportPictures, _measured, _stamps
+from pyklip_diffrender.reduction.report import page
 from pyklip_diffrender.reduction.sky_images import SkyImages
 from pyklip_diffrender.reduction.words import (
     advice,
+    depth_against_klip,
     plus_minus,
     probability,
     scientific,
@@ -389,7 +394,7 @@ def test_calibrated_frames_have_flux_densities_on_the_page() -> None:
         "flux_density_Jy": 0.41, "flux_density_error_Jy": 0.05, "source": "diffracted light"
     }  # fmt: skip
     summary["candidates"][0] |= {"flux_density_Jy": 1.2e-4, "flux_density_error_Jy": 1e-5}
-    words = Tags(page(summary, [], [], [], [])).words
+    words = Tags(page(summary, ReportPictures())).words
     assert "0.41 ± 0.05 Jy, from its diffracted light" in words
     assert scientific(1.2e-4, 1e-5) in words
 
@@ -403,15 +408,16 @@ def test_pixels_that_the_fit_left_out_are_named() -> None:
     summary = summarise(replace(whole, fit=replace(whole.fit, frames=(fitted,))))
     (place,) = summary["frames"][0]["bad_pixels"]
     assert place == pytest.approx(frame.grid[3, 5], abs=6e-4)
-    assert f"({place[0]:+.2f}, {place[1]:+.2f})" in page(summary, [], [], [], [])
+    assert f"({place[0]:+.2f}, {place[1]:+.2f})" in page(summary, ReportPictures())
     assert summarise(whole)["frames"][0]["bad_pixels"] == []
-    assert "left out because" not in page(summarise(whole), [], [], [], [])
+    assert "left out because" not in page(summarise(whole), ReportPictures())
 
 
 def test_every_picture_has_words_and_nothing_is_loaded(folder: Path) -> None:
     page = Tags((folder / "report.html").read_text(encoding="utf-8"))
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]
-    assert len(pictures) == 9
+    # Three of the whole, the curve, two of the candidate, three of the frame and of the wavefront.
+    assert len(pictures) == 12
     for attributes in pictures:
         assert len(attributes["alt"] or "") > 30
         assert (attributes["src"] or "").startswith("data:image/png;base64,iVBOR")
@@ -439,10 +445,10 @@ def test_a_header_cannot_write_into_the_page(tmp_path: Path) -> None:
     )
     html, data = write_report(result, tmp_path, [tmp_path / HOSTILE.replace("/", "")])
     text = html.read_text(encoding="utf-8")
-    assert text.count(escape(HOSTILE)) > 8
+    assert text.count(str(escape(HOSTILE))) > 8
     tags = Tags(text).tags
     assert not [tag for tag, attributes in tags if tag == "script" or "onerror" in attributes]
-    assert len([tag for tag, _ in tags if tag == "img"]) == 9
+    assert len([tag for tag, _ in tags if tag == "img"]) == 12
     assert json.loads(data.read_text(encoding="utf-8"))["target"] == HOSTILE
 
 
@@ -467,8 +473,8 @@ def test_names_beyond_ascii_do_not_end_a_reduction(tmp_path: Path) -> None:
 @pytest.fixture
 def _few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw the S/N map and the contrast curve alone."""
-    for name in ("star_pictures", "wavefront_pictures"):
-        monkeypatch.setattr(f"pyklip_diffrender.reduction.products.{name}", lambda *_: [])
+    for name in ("_candidate", "_star", "_wavefront"):
+        monkeypatch.setattr(f"pyklip_diffrender.reduction.pictures.{name}", lambda *_: [])
 
 
 @pytest.mark.usefixtures("_few_pictures")
@@ -633,7 +639,7 @@ def test_completeness_has_a_section(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["completeness"]
     assert summary["contrast_50"] == [2e-5, 1.75e-5]
     assert summary["contrast_95"] == [3.8e-5, None]
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    text = " ".join((tmp_path / "report.html").read_text(encoding="utf-8").split())
     assert "has a false candidate in 0.01 % of such fields" in text
 
 
@@ -655,6 +661,152 @@ def test_a_report_that_fails_leaves_the_old_one(tmp_path: Path) -> None:
         write_report(replace(reduction(), wide=cast(Any, "broken")), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "old"
+
+
+# -- pictures and sentences ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("klip", "said"),
+    [
+        (
+            [4e-5, 4e-6, 1e-5],
+            "Without a small-sample correction of either, this reduction is 4.0 times deeper at "
+            "0.40 arcsec and KLIP is 1.2 times deeper at 0.80 arcsec; with it, this reduction is "
+            "2.0 to 10.0 times deeper at 0.40 to 0.80 arcsec.",
+        ),
+        ([None, None, None], "no limits can be compared; with it, this reduction is 2.0 to 10.0"),
+    ],
+    ids=["both", "KLIP has none"],
+)
+def test_the_report_says_who_is_deeper_where(klip: list[float | None], said: str) -> None:
+    curve = {
+        "separation_arcsec": [0.4, 0.8], "contrast": [1e-5, 4.8e-6], "small_sample": [2e-5, 5e-6]
+    }  # fmt: skip
+    # The last of KLIP's separations is beyond the curve.
+    other = {
+        "separation_arcsec": [0.4, 0.8, 1.2], "contrast": klip, "small_sample": [2e-4, 1e-5, 1e-5]
+    }  # fmt: skip
+    assert said in depth_against_klip(curve, other)
+    assert depth_against_klip(curve, None) == ""
+    assert depth_against_klip(curve | {"separation_arcsec": [0.1, 0.2]}, other) == ""
+
+
+def test_the_first_lines_are_the_result_and_the_status(folder: Path) -> None:
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    status = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["status"]
+    sentence, name, picture = (
+        text.index(each)
+        for each in ('class="result"', f"<code>{status['name']}</code>", "<figure>")
+    )
+    assert sentence < name < picture
+
+
+def test_settings_are_a_table(folder: Path) -> None:
+    words = Tags((folder / "report.html").read_text(encoding="utf-8")).words
+    at = words.index("Settings of the fit")
+    assert words[words.index("cycles", at) + 2] == "6"
+    assert words[words.index("prior.knee", at) + 2] == "8"
+    assert not [each for each in words if "GaussNewton(" in each or "{'" in each]
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_reference_frames_are_said_to_be_used_for_what_they_are_used_for(own: bool) -> None:
+    """A pattern of a library needs none of them, and only its stars are named."""
+    whole = reduction()
+    star = replace(
+        whole.sequence.science[0], reference=True, header=fits.Header({"TARGPROP": "HD 2"})
+    )
+    flat = np.zeros((4, 4))
+    names = ["HD 2", "HD 7"] if own else ["HD 7", "HD 8"]
+    pattern = dr.Systematics(flat, flat, (1.0, 1.0), 0.02, provenance={"stars": names})
+    part = replace(whole.fit.frames[0], observation=star)
+    result = replace(
+        whole, systematics=pattern,
+        references=(replace(whole.fit, frames=(part,)),) if own else (),
+        sequence=replace(whole.sequence, references=(star,)),
+    )  # fmt: skip
+    text = page(summarise(result), ReportPictures())
+    if own:
+        assert "1 frame of reference stars, for the pattern and KLIP" in text
+        assert "measured on the reference frames of HD 2 and from earlier frames of HD 7" in text
+    else:
+        assert "1 frame of reference stars, for KLIP alone" in text
+        assert "from earlier frames of HD 7, HD 8" in text
+        assert "measured on" not in text
+
+
+def test_without_candidates_those_farther_out_are_mentioned() -> None:
+    summary = summarise(reduction(planet=False))
+    (row,) = summarise(reduction())["candidates"]
+    far = {**row, "fit_chi2": 1.1}
+    summary["wide_field"] = {"candidates": [far, far], "contrast_curve": {}}
+    text = " ".join(page(summary, ReportPictures()).split())
+    assert "No candidate has an S/N above 5 in the pixels in which the star was fitted." in text
+    assert "Farther out there are 2 candidates, in the section on the whole frames." in text
+
+
+def test_the_corner_has_the_errors_of_the_table() -> None:
+    detection = reduction().detection
+    (row,) = detection.candidates
+    names, values, covariance = _measured(detection, 0)
+    assert names == ("ΔRA cos Dec", "ΔDec")
+    keys = ("contrast", "delta_ra", "delta_dec")
+    for k, key in enumerate(keys):
+        assert values[k] == pytest.approx(getattr(row[key], "value", row[key]), rel=1e-6)
+        error = row[f"{key}_error"]
+        assert np.sqrt(covariance[k, k]) == pytest.approx(getattr(error, "value", error))
+    correlation = covariance[1, 2] / np.sqrt(covariance[1, 1] * covariance[2, 2])
+    assert correlation == pytest.approx(row["radec_corr"], abs=1e-6)
+
+
+def test_stamps_show_the_planet_and_what_the_model_leaves_of_it() -> None:
+    detection = reduction().detection
+    (stamp,) = _stamps(detection, 0)
+    middle = len(stamp.x) // 2
+    place = np.array([stamp.x[middle], stamp.y[middle]])
+    on_frame = replace(PLANET, position_angle=PLANET.position_angle - ROLL).offset
+    assert np.abs(place - on_frame).max() < 0.05  # A pixel has 0.063 arcsec.
+    assert np.unravel_index(np.nanargmax(stamp.model), stamp.model.shape) == (middle, middle)
+    left = (stamp.subtracted - stamp.model) / stamp.noise
+    assert 0.7 < np.nanstd(left) < 1.3
+    assert np.nanmax(stamp.subtracted / stamp.noise) > 2 * np.nanmax(left)
+    # Without the star, but with the planet.
+    assert np.nanmedian(np.abs(stamp.subtracted)) < 0.1 * np.nanmedian(stamp.data)
+
+
+def test_captions_say_how_much_of_a_source_is_kept(folder: Path) -> None:
+    images = SkyImages(reduction())
+    ring = np.abs(np.hypot(*np.moveaxis(images.grid, -1, 0)) - 0.5)
+    resolution = reduction().detection.contrast_curve.meta["resolution_arcsec"]
+    kept = np.nanmedian(images.throughput[ring < resolution / 2])
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    assert f"A faint source keeps {100 * kept:.0f} % of its light at 0.5 arcsec" in text
+
+
+@pytest.mark.parametrize(
+    ("form", "begins"), [("pdf", b"%PDF"), ("png", b"\x89PNG"), ("svg", b"<?xml")]
+)
+def test_every_figure_is_a_file_of_its_own(tmp_path: Path, form: Any, begins: bytes) -> None:
+    whole = reduction()
+    if form != "pdf":  # One format shows that all figures are written.
+        pictures = [Picture("snr", drawing.panel()[0], "", "")]
+        (path,) = write_figures(pictures, tmp_path, form)
+        assert path.read_bytes().startswith(begins)
+        return
+    written = whole.write(tmp_path, figures=form)
+    drawn = sorted(path for path in written if path.parent.name == "figures")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert len(drawn) == text.count("<figure>") == 12
+    assert all(path.read_bytes().startswith(begins) for path in drawn)
+    assert 'href="figures/"' in text
+    mine = tmp_path / "figures" / "mine.pdf"
+    mine.write_bytes(b"mine")
+    assert set(existing_products(tmp_path)) == set(written)
+    whole.write(tmp_path, overwrite=True)
+    assert list((tmp_path / "figures").iterdir()) == [mine]
+    with pytest.raises(IncompatibleSetupError, match="figures: got 'eps', expected one of pdf"):
+        whole.write(tmp_path, overwrite=True, figures=cast(Any, "eps"))
 
 
 # -- in a notebook ---------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import replace
 from json import dumps, loads
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
@@ -47,6 +47,7 @@ def run_reduction(
     output: Path,
     overwrite: bool,
     derivatives: bool,
+    figures: Literal["pdf", "png", "svg"] | None,
     json: bool,
     dry_run: bool,
     opd: str,
@@ -100,7 +101,9 @@ def run_reduction(
             with numbered_stages(dict(steps_of(preparation.sequence, preparation.options))):
                 reduction = preparation.run(progress=run.progress)
                 with stage("products"):
-                    written = reduction.write(folder, overwrite=overwrite, derivatives=derivatives)
+                    written = reduction.write(
+                        folder, overwrite=overwrite, derivatives=derivatives, figures=figures
+                    )
             summary = loads((folder / "summary.json").read_text(encoding="utf-8"))
             summaries[folder.name] = summary
             click.echo(f"wrote {folder / 'report.html'} and {len(written) - 1} more files")

@@ -55,7 +55,9 @@ def draw_search(axes: Sequence[Any], search: _Search) -> None:
     draw_curve(axes[1], search)
 
 
-def draw_curve(ax: Any, search: _Search, klip: QTable | None = None) -> None:
+def draw_curve(
+    ax: Any, search: _Search, klip: QTable | None = None, *, legend_below: bool = False
+) -> None:
     """Draw the contrast curve with the candidates.
 
     Parameters
@@ -64,8 +66,10 @@ def draw_curve(ax: Any, search: _Search, klip: QTable | None = None) -> None:
     search : Detection or WideField
     klip : QTable, optional
         Contrast curve of KLIP on the same frames, see `klip_curve`.
+    legend_below : bool
+        See `drawing.contrast_curve`.
     """
     drawing.contrast_curve(
         ax, search.contrast_curve, search.candidates, small_sample=search.error_factor.is_measured,
-        klip=klip,
+        klip=klip, legend_below=legend_below,
     )  # fmt: skip

@@ -10,7 +10,14 @@ from pyklip_diffrender.drawing.curves import (
     injected_planets,
     survey_limits,
 )
-from pyklip_diffrender.drawing.figures import axes_for, new_figure, panel, save, to_png
+from pyklip_diffrender.drawing.figures import (
+    axes_for,
+    new_figure,
+    panel,
+    save,
+    to_png,
+    wide_panel,
+)
 from pyklip_diffrender.drawing.images import (
     SNR_LINEAR,
     light_norm,
@@ -21,13 +28,17 @@ from pyklip_diffrender.drawing.images import (
     wavefront_map,
 )
 from pyklip_diffrender.drawing.marks import compass, halo, unit_label
+from pyklip_diffrender.drawing.measurements import Epoch, Stamp, corner, sky_track, stamp_panels
 
 __all__ = [
     "SNR_LINEAR",
+    "Epoch",
+    "Stamp",
     "axes_for",
     "compass",
     "completeness",
     "contrast_curve",
+    "corner",
     "halo",
     "injected_planets",
     "light_norm",
@@ -36,10 +47,13 @@ __all__ = [
     "pupil_image",
     "save",
     "signed_image",
+    "sky_track",
     "snr_map",
+    "stamp_panels",
     "star_image",
     "survey_limits",
     "to_png",
     "unit_label",
     "wavefront_map",
+    "wide_panel",
 ]

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import QTable
 from numpy.typing import NDArray
 
-from pyklip_diffrender.drawing.marks import ACCENT, INK
+from pyklip_diffrender.drawing.marks import ACCENT, INK, halo
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,9 +26,12 @@ _DASHES = ("-", "--", "-.", ":")
 
 
 def contrast_curve(
-    ax: Axes, curve: QTable, candidates: QTable, *, small_sample: bool, klip: QTable | None = None
-) -> None:
+    ax: Axes, curve: QTable, candidates: QTable, *, small_sample: bool, klip: QTable | None = None,
+    legend_below: bool = False,
+) -> None:  # fmt: skip
     """Draw contrast limits against separation: median, range of angles, and star known exactly.
+
+    The axis on the right has the magnitude differences.
 
     Parameters
     ----------
@@ -42,6 +45,9 @@ def contrast_curve(
         Draw limits with the correction for few samples: of the median, and of KLIP.
     klip : QTable, optional
         Columns separation, contrast and small_sample of KLIP; `meta` may have a "label".
+    legend_below : bool
+        Put the legend below the axes, where it hides nothing; the figure must have room for it. By
+        default it is in the upper right corner, and the axes are square.
     """
     separation = curve["separation"].value
     ax.fill_between(
@@ -64,11 +70,35 @@ def contrast_curve(
             candidates["separation"].value, candidates["contrast"], candidates["contrast_error"],
             candidates["separation_error"].value, "o", color=INK, mfc="white", label="candidates",
         )  # fmt: skip
-    ax.set_box_aspect(1.0)
     ax.set_xlabel("separation (arcsec)")
     ax.set_ylabel(f"contrast at {curve.meta['sigmas']:g} sigma")
+    _magnitude_axis(ax)
+    if legend_below:
+        ax.grid(alpha=0.25, lw=0.5)
+        ax.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2,
+                  fontsize="small")  # fmt: skip
+        return
+    ax.set_box_aspect(1.0)
     # Limits are high at small separations alone, so that there is room in this corner.
     ax.legend(frameon=False, loc="upper right", fontsize="small")
+
+
+def _magnitude_axis(ax: Axes) -> None:
+    """Give an axis of contrasts another one on the right, with magnitude differences."""
+    from matplotlib.ticker import MaxNLocator, NullLocator, ScalarFormatter
+
+    # The scale is logarithmic in the contrast, and the ticks are at round magnitudes.
+    axis = ax.secondary_yaxis(
+        "right",
+        functions=(
+            lambda contrast: -2.5 * np.log10(np.maximum(contrast, 1e-300)),
+            lambda magnitude: 10 ** (-0.4 * np.asarray(magnitude)),
+        ),
+    )
+    axis.yaxis.set_major_locator(MaxNLocator(7))
+    axis.yaxis.set_minor_locator(NullLocator())
+    axis.yaxis.set_major_formatter(ScalarFormatter())
+    axis.set_ylabel("magnitude difference")
 
 
 def completeness(
@@ -86,25 +116,43 @@ def completeness(
     half, most : sequence of float
         Contrasts at which 50 and 95 % are found, by separation; may be NaN.
     """
-    separation = np.unique(table["separation"].value)
-    x, y, fraction = (
-        np.asarray(each).reshape(len(separation), -1)
-        for each in (table["separation"].value, table["contrast"], table["completeness"])
-    )
-    mesh = ax.pcolormesh(x, y, fraction, cmap="cividis", vmin=0, vmax=1, shading="nearest")
+    place, contrast = table["separation"].value, np.asarray(table["contrast"])
+    fraction = np.asarray(table["completeness"])
+    separation = np.unique(place)
+    sides = _edges(separation)
+    # Every separation has contrasts of its own, about its limit: a mesh would be skewed.
+    for inner, outer, middle in zip(sides[:-1], sides[1:], separation, strict=True):
+        at = np.flatnonzero(place == middle)
+        at = at[np.argsort(contrast[at])]
+        mesh = ax.pcolormesh(
+            [inner, outer], np.exp(_edges(np.log(contrast[at]))), fraction[at][:, None],
+            cmap="cividis", vmin=0, vmax=1, shading="flat",
+        )  # fmt: skip
     ax.figure.colorbar(mesh, ax=ax, label="fraction found", fraction=0.046, pad=0.03)
-    ax.plot(separation, most, "-", color="white", label="95 %")
-    ax.plot(separation, half, "--", color="white", label="50 %")
-    ax.plot(curve["separation"].value, curve["contrast"], ":", color="white", label="5 sigma")
+    for values, dash, label in (
+        (np.asarray(most), "-", "95 %"),
+        (np.asarray(half), "--", "50 %"),
+        (np.interp(separation, curve["separation"].value, curve["contrast"]), ":", "5 sigma"),
+    ):
+        ax.plot(separation, values, dash, color=INK, marker="o", ms=3, label=label,
+                path_effects=halo())  # fmt: skip
     ax.set_yscale("log")
-    ax.set_xlim(x.min(), x.max())
-    ax.set_ylim(y.min(), y.max())
+    ax.set_xlim(sides[0], sides[-1])
     ax.set_box_aspect(1.0)
+    ax.set_facecolor("0.9")
     ax.set_xlabel("separation (arcsec)")
     ax.set_ylabel("contrast")
-    legend = ax.legend(frameon=False, loc="upper right", fontsize="small")
-    for text in legend.get_texts():
-        text.set_color("white")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, 1.13), ncols=3, frameon=False,
+              fontsize="small")  # fmt: skip
+
+
+def _edges(middles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Edges of cells about values that rise, halfway between them; a single one has two, too."""
+    if len(middles) == 1:
+        return np.array([middles[0] - 0.05, middles[0] + 0.05])
+    between = (middles[1:] + middles[:-1]) / 2
+    first, last = 1.5 * middles[[0, -1]] - 0.5 * middles[[1, -2]]
+    return np.array([first, *between, last])
 
 
 def injected_planets(ax: Axes, planets: QTable) -> None:

@@ -17,10 +17,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["axes_for", "new_figure", "panel", "save", "to_png"]
+__all__ = ["axes_for", "new_figure", "panel", "save", "to_png", "wide_panel"]
 
 _PANEL = (4.6, 3.7)
 """Size of a panel, inches: its letters are as large as a page's where it is as wide as a phone."""
+
+_WIDE = (6.8, 5.2)
+"""Size of a wide panel, inches."""
 
 _BOX = (0.17, 0.13, 0.6, 0.77)
 """Axes in a panel, the same for all, so that panels side by side are aligned."""
@@ -66,10 +69,27 @@ def panel() -> tuple[Figure, Axes]:
     return figure, figure.add_axes(_BOX)
 
 
+def wide_panel() -> tuple[Figure, Axes]:
+    """Make a figure with one axes for a curve, which has a page to itself, and its legend."""
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    figure = Figure(figsize=_WIDE, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12))
+    return figure, figure.subplots()
+
+
 def save(figure: Figure, path: str | Path, dpi: int = 150) -> None:
-    """Write a figure in one step."""
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=dpi, facecolor="white")
+    """Write a figure in one step, in the format that the ending of the path names."""
+    from matplotlib import rc_context
+
+    form = Path(path).suffix.removeprefix(".").lower()
+    # The same figure makes the same file; journals ask for fonts that are no outlines.
+    undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(form)
+    style = rc_context(
+        {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "pyklip_diffrender"}
+    )
+    with replacing(path) as temporary, style:
+        figure.savefig(temporary, dpi=dpi, facecolor="white", format=form, metadata=undated)
 
 
 def to_png(figure: Figure, dpi: int = 150) -> bytes:

@@ -22,6 +22,7 @@ __all__ = [
     "SNR_LINEAR",
     "light_norm",
     "pupil_image",
+    "show_pixels",
     "signed_image",
     "snr_map",
     "star_image",
@@ -130,7 +131,7 @@ def light_norm(image: Image, noise: Image | None = None) -> Any:
     low, high = float(np.nanmin(image)), float(np.nanmax(image))
     if noise is None:
         return LogNorm(high * 10.0**-_DECADES, high, clip=True)
-    width = 3 * float(np.median(noise))
+    width = 3 * float(np.nanmedian(noise))
     return AsinhNorm(width, vmin=max(low, -width), vmax=max(high, low + width))
 
 
@@ -145,7 +146,7 @@ def _ticks(linear: float, limit: float) -> list[float]:
 
 
 def _on_sky(ax: Axes, image: Image, grid: Image, north: float | None, **style: Any) -> None:
-    _show(ax, image, grid[0, :, 0], grid[:, 0, 1], **style)
+    show_pixels(ax, image, grid[0, :, 0], grid[:, 0, 1], **style)
     label_sky(ax)
     if north is not None:
         compass(ax, north)
@@ -153,12 +154,12 @@ def _on_sky(ax: Axes, image: Image, grid: Image, north: float | None, **style: A
 
 def _on_pupil(ax: Axes, image: Image, width: float, **style: Any) -> None:
     middles = ((np.arange(len(image)) + 0.5) / len(image) - 0.5) * width
-    _show(ax, image, middles, middles, **style)
+    show_pixels(ax, image, middles, middles, **style)
     ax.set_xlabel("x in the pupil (m)")
     ax.set_ylabel("y in the pupil (m)")
 
 
-def _show(
+def show_pixels(
     ax: Axes, image: Image, x: Image, y: Image, *, bar: str, title: str,
     ticks: Sequence[float] | None = None, **style: Any,
 ) -> None:  # fmt: skip

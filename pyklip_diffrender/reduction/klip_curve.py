@@ -21,6 +21,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
 from pyklip_diffrender.detection import Detection
+from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.field import pixels_of
 from pyklip_diffrender.detection.templates import Templates
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -71,8 +72,9 @@ def klip_curve(
     reference stars. The residuals are turned to the orientation of the first roll, averaged and
     smoothed with the image of a planet. The noise is the standard deviation in a ring of width
     lambda/D where the detection has limits, the throughput that of injected planets, and the number
-    of modes at every separation that with the best limit. Companions that are part of the fit are
-    subtracted first.
+    of modes at every separation that with the best limit. The light of all candidates is subtracted
+    first, whether the fit has them as companions or only the search found them: they are noise of
+    neither method.
 
     Parameters
     ----------
@@ -99,7 +101,7 @@ def klip_curve(
     """
     templates = Templates(detection.fits[0], detection.fits[0].frames[0])
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
-    klip = KlipSubtraction(templates, references, resolution)
+    klip = KlipSubtraction(templates, references, resolution, candidates=detection.sources)
     # The corners' smaller coordinates.
     edge = np.abs(klip.grid[[0, -1], [0, -1]]).min() - resolution / 2
     if separations is None:
@@ -203,7 +205,7 @@ def klip_image(
     """
     templates = Templates(detection.fits[0], detection.fits[0].frames[0])
     resolution = detection.contrast_curve.meta["resolution_arcsec"]
-    klip = KlipSubtraction(templates, references, resolution, science, keep_companions=True)
+    klip = KlipSubtraction(templates, references, resolution, science)
     used = min(modes, len(klip.modes))
     image = klip.residuals(klip.science, north)[used - 1]
     shown = np.where(klip._zone, image, np.nan)
@@ -252,8 +254,8 @@ class KlipSubtraction:
         lambda/D, arcsec.
     science : sequence of Observation, optional
         In place of the frames of the fit, from which a disk may have been subtracted.
-    keep_companions : bool
-        Leave the light of companions that are part of the fit in the frames.
+    candidates : Candidates, optional
+        Point sources whose light is subtracted from the frames of the target.
 
     Attributes
     ----------
@@ -283,7 +285,7 @@ class KlipSubtraction:
         resolution: float,
         science: Sequence[Observation] | None = None,
         *,
-        keep_companions: bool = False,
+        candidates: Candidates | None = None,
     ) -> None:
         frames = templates.frames
         self.rolls = list(templates.rolls.values())
@@ -299,10 +301,11 @@ class KlipSubtraction:
         self.shifts = self.center - places
         if science is None:
             science = [frame.observation for frame in frames.values()]
-        kept = 0.0 if keep_companions else 1.0
-        companions = [kept * frame.companion_image for frame in frames.values()]
-        images = [_filled(a) - b for a, b in zip(science, companions, strict=True)]
-        self.science = shift_frames(np.array(images), self.shifts)
+        images = np.array([_filled(each) for each in science])
+        if candidates is not None and len(candidates):
+            light = candidates.light(templates)
+            images -= np.array([light[k][0].numpy() for k in frames])
+        self.science = shift_frames(images, self.shifts)
         self.references = [
             shift_frames(_filled(each)[None], (self.center - place)[None])[0]
             for each, place in zip(references, others, strict=True)

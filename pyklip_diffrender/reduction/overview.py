@@ -89,36 +89,68 @@ class Overview:
         self._labels = [f"S/N {each:.1f}" for each in table["snr"]]
 
     @property
-    def panels(self) -> int:
-        """Number of panels."""
-        return 2 if self.klip is None else 3
+    def panels(self) -> tuple[str, ...]:
+        """Names of the panels: the image, KLIP's, the most probable image, and the S/N."""
+        return (
+            "without_star",
+            *(() if self.klip is None else ("klip",)),
+            # With a disk in the model that image would lack its light.
+            *(() if self.images.has_disk else ("most_probable",)),
+            "snr",
+        )
 
-    def draw(self, axes: Sequence[Any]) -> None:
-        """Draw the combined image, KLIP's at the same scale if there is one, and the S/N map.
+    def draw(self, ax: Any, panel: str) -> None:
+        """Draw one of `panels`; all images of light have the same scale.
 
         Parameters
         ----------
-        axes : sequence of `panels` Axes
+        ax : Axes
+        panel : str
         """
+        grid, north = self.images.grid, 0.0 if self.images.oriented else None
+        if panel == "snr":
+            snr = self.images.turned(self._detection.snr)
+            drawing.snr_map(ax, snr, grid, self._places, north, title="S/N", labels=self._labels)
+            return
         mean, error = self.images.combined
-        image, grid = self.images.image, self.images.grid
-        north = 0.0 if self.images.oriented else None
-        style: dict[str, Any] = {
-            "bar": self._unit, "linear": _LINEAR * float(np.nanmedian(error)), "north": north,
-            "limit": float(np.nanmax(np.abs(mean))), "places": self._places,
-        }  # fmt: skip
-        drawing.signed_image(axes[0], image, grid, title="Without the star", **style)
-        if self.klip is not None:
-            title = self.klip.label
-            drawing.signed_image(axes[1], self.klip.image, self.klip.grid, title=title, **style)
-            axes[1].set_xlim(axes[0].get_xlim())
-            axes[1].set_ylim(axes[0].get_ylim())
-        snr = self.images.turned(self._detection.snr)
-        drawing.snr_map(axes[-1], snr, grid, self._places, north, title="S/N", labels=self._labels)
+        image, title = mean, "Without the star"
+        if panel == "most_probable":
+            image, title = self.images.posterior_mean[0], "Most probable image"
+        if panel == "klip" and self.klip is not None:
+            image, grid, title = self.klip.image, self.klip.grid, self.klip.label
+        drawing.signed_image(
+            ax, image, grid, float(np.nanmax(np.abs(mean))), bar=self._unit, title=title,
+            places=self._places, linear=_LINEAR * float(np.nanmedian(error)), north=north,
+        )  # fmt: skip
+        pixel = self.images.grid[0, 1, 0] - self.images.grid[0, 0, 0]
+        half = np.abs(self.images.grid).max() + pixel / 2
+        ax.set_xlim(-half, half)
+        ax.set_ylim(-half, half)
+
+    def kept(self, separations: Sequence[float]) -> tuple[Image, Image | None]:
+        """Fractions of a faint source's light that the image and KLIP leave at separations.
+
+        Medians of rings a resolution element wide; KLIP's are those of its best numbers of modes.
+        """
+        resolution = self._detection.contrast_curve.meta["resolution_arcsec"]
+        distance = np.hypot(*np.moveaxis(self.images.grid, -1, 0))
+        kept = self.images.throughput
+        ours = [
+            np.nanmedian(kept[np.abs(distance - each) < resolution / 2]) for each in separations
+        ]
+        if self.klip is None:
+            return np.array(ours), None
+        curve = self.klip.curve
+        theirs = np.interp(
+            separations, curve["separation"].value, curve["throughput"], np.nan, np.nan
+        )
+        return np.array(ours), np.asarray(theirs)
 
     def figure(self) -> Any:
-        """One figure of all panels and the contrast curve."""
-        figure, axes = drawing.new_figure(1, self.panels + 1)
-        self.draw(list(axes[0, :-1]))
+        """One figure of the panels but the most probable image, and the contrast curve."""
+        panels = [each for each in self.panels if each != "most_probable"]
+        figure, axes = drawing.new_figure(1, len(panels) + 1)
+        for ax, panel in zip(axes[0], panels, strict=False):
+            self.draw(ax, panel)
         draw_curve(axes[0, -1], self._detection, self.klip and self.klip.curve)
         return figure

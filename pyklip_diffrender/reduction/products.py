@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any, Literal
 
 from pyklip_diffrender import drawing
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import replacing, write_table
 from pyklip_diffrender.reduction.overview import Klip, Overview
-from pyklip_diffrender.reduction.page import page
-from pyklip_diffrender.reduction.pictures import (
-    MOST_FRAMES,
-    curve_pictures,
-    disk_pictures,
-    overview_pictures,
-    star_pictures,
-    wavefront_pictures,
-    wide_pictures,
-)
-from pyklip_diffrender.reduction.recovery_sections import completeness_section, injections_section
+from pyklip_diffrender.reduction.pages import FIGURE_FORMATS, write_figures
+from pyklip_diffrender.reduction.pictures import ReportPictures
 from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.report import page
 from pyklip_diffrender.reduction.sky_images import SkyImages
 from pyklip_diffrender.reduction.summary import summarise
 
@@ -47,13 +42,35 @@ PRODUCTS = {
 """Every file that a reduction may write, with its content."""
 
 
+_FIGURES = "figures"
+"""Folder of the figures, in that of the products."""
+
+_FIGURE = re.compile(
+    r"(without_star|klip|most_probable|snr|contrast_curve|candidate_\d+_(frame_\d+|corner)"
+    r"|whole_frames_(snr|contrast_curve)|extended_light(_model)?|injected_planets|completeness"
+    r"|frame_\d+_(data|model|residual)|wavefront_(before|after|change))"
+    rf"\.({'|'.join(FIGURE_FORMATS)})"
+)
+"""Names of the files of figures."""
+
+
 def existing_products(folder: Path) -> list[Path]:
     """Files in a folder that are called like products of a reduction."""
-    return [folder / name for name in PRODUCTS if (folder / name).exists()]
+    figures = folder / _FIGURES
+    drawn = figures.iterdir() if figures.is_dir() else ()
+    return [
+        *(folder / name for name in PRODUCTS if (folder / name).exists()),
+        *sorted(path for path in drawn if _FIGURE.fullmatch(path.name)),
+    ]
 
 
 def write_products(
-    reduction: Reduction, folder: Path, *, fit: bool = True, derivatives: bool = False
+    reduction: Reduction,
+    folder: Path,
+    *,
+    fit: bool = True,
+    derivatives: bool = False,
+    figures: Literal["pdf", "png", "svg"] | None = None,
 ) -> list[Path]:
     """Write the products of a reduction; see `Reduction.write`.
 
@@ -66,11 +83,23 @@ def write_products(
         Write ``fit.fits``.
     derivatives : bool
         Write the derivatives of the fit with it.
+    figures : {"pdf", "png", "svg"}, optional
+        Write every figure of the report to a file of this format, too.
 
     Returns
     -------
     list of Path
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For another format.
     """
+    if figures is not None and figures not in FIGURE_FORMATS:
+        raise IncompatibleSetupError(
+            f"figures: got {figures!r}, expected one of {', '.join(FIGURE_FORMATS)}, or None for a "
+            "report without files of its figures"
+        )
     written = reduction.detection.write(folder, overwrite=True)
     if fit:
         path = folder / "fit.fits"
@@ -90,7 +119,10 @@ def write_products(
     written.append(overview.images.write(folder / "images.fits"))
     written.append(folder / "detection.png")
     drawing.save(overview.figure(), written[-1])
-    written += _write_report(reduction, overview, folder, written)
+    summary, pictures = _shown(reduction, overview)
+    if figures is not None:
+        written += write_figures(pictures, folder / _FIGURES, figures)
+    written += _write_page(summary, pictures, folder, written)
     for path in set(existing_products(folder)) - set(written):
         path.unlink()
     return written
@@ -112,32 +144,25 @@ def write_report(reduction: Reduction, folder: Path, files: Iterable[Path] = ())
     list of Path
     """
     overview = Overview(SkyImages(reduction), Klip.of(reduction))
-    return _write_report(reduction, overview, folder, files)
+    return _write_page(*_shown(reduction, overview), folder, files)
 
 
-def _write_report(
-    reduction: Reduction, overview: Overview, folder: Path, files: Iterable[Path]
+def _shown(reduction: Reduction, overview: Overview) -> tuple[dict[str, Any], ReportPictures]:
+    """Numbers and pictures of the report."""
+    summary = summarise(reduction, overview.klip and overview.klip.curve)
+    return summary, ReportPictures.of(reduction, overview, summary)
+
+
+def _write_page(
+    summary: dict[str, Any], pictures: ReportPictures, folder: Path, files: Iterable[Path]
 ) -> list[Path]:
     html, data = (folder / name for name in ("report.html", "summary.json"))
-    klip = overview.klip and overview.klip.curve
-    summary = summarise(reduction, klip)
-    injections, fractions = reduction.injections, reduction.completeness
-    curve = reduction.detection.contrast_curve
-    frames = range(min(len(reduction.fit.frames), MOST_FRAMES))
-    text = page(
-        summary,
-        overview_pictures(overview, summary),
-        curve_pictures(reduction, summary, klip),
-        [star_pictures(reduction, frame) for frame in frames],
-        wavefront_pictures(reduction, summary),
-        [] if reduction.wide is None else wide_pictures(reduction.wide),
-        [] if reduction.disk is None else disk_pictures(reduction.disk),
-        {path.name: PRODUCTS.get(path.name, "") for path in (*files, html, data)},
-        [
-            *([] if injections is None else [injections_section(summary, injections)]),
-            *([] if fractions is None else [completeness_section(fractions, curve)]),
-        ],
-    )
+    listed = [*files, html, data]
+    drawn = [path for path in listed if path.parent.name == _FIGURES]
+    about = {path.name: PRODUCTS.get(path.name, "") for path in listed if path not in drawn}
+    if drawn:
+        about[f"{_FIGURES}/"] = f"the {len(drawn)} figures of this page, each in a file"
+    text = page(summary, pictures, about)
     written = {html: text, data: json.dumps(summary, indent=2, allow_nan=False) + "\n"}
     for path, content in written.items():
         with replacing(path) as temporary:

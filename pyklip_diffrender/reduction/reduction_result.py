@@ -6,6 +6,7 @@ import os
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 from astropy.table import QTable
 
@@ -143,7 +144,12 @@ class Reduction:
         return f"{head}\n{self.detection._repr_html_()}"
 
     def write(
-        self, folder: str | os.PathLike[str], *, overwrite: bool = False, derivatives: bool = False
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        overwrite: bool = False,
+        derivatives: bool = False,
+        figures: Literal["pdf", "png", "svg"] | None = None,
     ) -> list[Path]:
         """Write maps, tables, the fit, the flat-field pattern, figures and a report.
 
@@ -158,6 +164,9 @@ class Reduction:
             Keep the derivatives of the images in ``fit.fits``, which then takes ten times the
             space: they are needed to search the fit again (`detect`), and to measure at other
             places (``Detection.read(...).measure``).
+        figures : {"pdf", "png", "svg"}, optional
+            Write every figure of the report to a file of this format in the folder ``figures``,
+            too. The report itself needs none of them.
 
         Returns
         -------
@@ -168,10 +177,12 @@ class Reduction:
         ------
         ExistingFileError
             If there are products in the folder, and `overwrite` is False; it is also an `OSError`.
+        IncompatibleSetupError
+            For another format of figures.
         """
         # The one import against the order of the modules: the products know this class.
         from pyklip_diffrender.reduction.products import existing_products, write_products
 
         folder = Path(folder)
         require_new(existing_products(folder), overwrite)
-        return write_products(self, folder, derivatives=derivatives)
+        return write_products(self, folder, derivatives=derivatives, figures=figures)

@@ -10,18 +10,21 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from html import escape
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy import units as u
+from astropy.io import fits
+from astropy.wcs import WCS
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from pyklip_diffrender import drawing
 from pyklip_diffrender.io.files import replacing
-from pyklip_diffrender.reduction import html
+from pyklip_diffrender.reduction.pages import Picture, render
 from pyklip_diffrender.reduction.words import plus_minus, scientific
 
 __all__ = ["COMPARISON", "compare_reductions", "sources_of", "write_comparison"]
@@ -39,6 +42,9 @@ _AGREES = 11.8
 
 _PREFERRED = 9.0
 """Difference of chi-squared by which one explanation is preferred to the other."""
+
+_MOST_TRACKS = 6
+"""Candidates of which the way of a background source is drawn."""
 
 _FLOOR = 0.003
 """Error of positions between reductions beyond that of the fit, arcsec: orientation, distortion,
@@ -260,7 +266,26 @@ def write_comparison(
     }  # fmt: skip
     page, data = (Path(folder) / name for name in COMPARISON)
     texts = {
-        page: _page(folders, pairs, sources, motion),
+        page: render(
+            "comparison.html",
+            target=summaries[0]["target"],
+            folders=folders,
+            pairs=pairs,
+            thumbnails=_thumbnails(folders, Path(folder)),
+            tracks=_tracks(summaries, motion),
+            motion=motion,
+            filters=list(dict.fromkeys(str(e["filter"]) for s in sources for e in s["filters"])),
+            sources=[
+                {
+                    "date": source["date"],
+                    "by_filter": {
+                        str(each["filter"]): _brightness(summaries[each["reduction"]], each)
+                        for each in source["filters"]
+                    },
+                }
+                for source in sources
+            ],
+        ),
         data: json.dumps(content, indent=2, allow_nan=False) + "\n",
     }
     for path, text in texts.items():
@@ -269,108 +294,84 @@ def write_comparison(
     return list(texts)
 
 
-def _page(
-    folders: Mapping[str, Mapping[str, Any]],
-    pairs: Sequence[Mapping[str, Any]],
-    sources: Sequence[Mapping[str, Any]],
-    motion: tuple[float, float] | None,
-) -> str:
-    target = next(iter(folders.values()))["target"]
-    reductions = [
-        [
-            html.link(f"{name}/report.html", str(each["first_date"])[:10]),
-            str(each["filter"] or ""),
-            each["sentence"],
-        ]
-        for name, each in folders.items()
-    ]
-    positions = [
-        [
-            str(each["first_date"])[:10],
-            str(each["filter"] or ""),
-            str(k),
-            plus_minus(row["separation_arcsec"], row["separation_error_arcsec"]),
-            plus_minus(row["position_angle_deg"], row["position_angle_error_deg"]),
-            f"{row['snr']:.1f}",
-            scientific(row["contrast"], row["contrast_error"]),
-            plus_minus(row["ab_mag"], row["ab_mag_error"]) if "ab_mag" in row else "not known",
-        ]
-        for each in folders.values()
-        for k, row in enumerate(each["candidates"], 1)
-    ]
-    moves = [
-        [
-            " and ".join(
-                f"{d} {f or ''} ({n})"
-                for d, f, n in zip(p["dates"], p["filters"], p["candidates"], strict=True)
-            ),
-            "{:+.3f}, {:+.3f}".format(*p["moved_arcsec"]),
-            f"{p['chi2_with_star']:.1f}",
-            "not known" if p["chi2_with_sky"] is None else f"{p['chi2_with_sky']:.1f}",
-            "" if p["colour_mag"] is None else plus_minus(p["colour_mag"], p["colour_error_mag"]),
-            p["verdict"],
-        ]
-        for p in pairs
-    ]
-    known = "not known" if motion is None else "{:+.3f}, {:+.3f} arcsec per year".format(*motion)
-    sections = [
-        html.section(
-            "Reductions", html.table(["Date", "Filter", "Result"], reductions, wrap=2)
-        ),
-        html.section(
-            "Candidates",
-            html.table(
-                ["Date", "Filter", "", "Separation (arcsec)", "Position angle (deg)", "S/N",
-                 "Contrast", "AB magnitude"],
-                positions
-            )
-            if positions
-            else html.note("There are no candidates."),
-        ),
-        *([_over_filters(list(folders.values()), sources)] if sources else []),
-        html.section(
-            "Pairs of candidates",
-            html.table(
-                ["Candidates", "Moved to east, north (arcsec)", "Chi-squared with the star",
-                 "Chi-squared with the sky", "Colour (mag)", "Verdict"],
-                moves, wrap=5,
-            )
-            if moves
-            else html.note("No candidate has a counterpart in another reduction."),
-            html.note(
-                "Every epoch and filter was reduced alone. Chi-squared has two degrees of freedom, "
-                "and is that of a source that moves with the star, or stays on the sky. The colour "
-                "is the AB magnitude in the first filter minus that in the second, without errors "
-                "of the photometric calibration. Orbits, the star's parallax and errors of its "
-                f"proper motion are neglected. Proper motion to east and north: {known}."
-            ),
-        ),
-    ]  # fmt: skip
-    header = f"<header><h1>{escape(str(target))}: {len(folders)} reductions</h1></header>\n"
-    return html.document(f"{target}: comparison", header, sections)
+def _name(summary: Mapping[str, Any]) -> str:
+    """Date and filter of a reduction."""
+    return f"{str(summary['first_date'])[:10]} {summary['filter'] or ''}".rstrip()
 
 
-def _over_filters(
-    summaries: Sequence[Mapping[str, Any]], sources: Sequence[Mapping[str, Any]]
-) -> str:
-    """The table of sources over the filters of their epochs."""
-    filters = list(dict.fromkeys(str(e["filter"]) for s in sources for e in s["filters"]))
-    rows = []
-    for source in sources:
-        cells = dict.fromkeys(filters, "")
-        for each in source["filters"]:
-            summary = summaries[each["reduction"]]
-            cells[str(each["filter"])] = _brightness(summary, each)
-        rows.append([source["date"], *cells.values()])
-    return html.section(
-        "Candidates over filters",
-        html.table(["Date", *filters], rows),
-        html.note(
-            "Candidates that the filters of an epoch have at one place, with their numbers: AB "
-            "magnitude (contrast where it is not known), S/N, or the contrast that a candidate "
-            "there would have needed."
-        ),
-    )
+def _thumbnails(folders: Mapping[str, Mapping[str, Any]], above: Path) -> list[Picture]:
+    """S/N maps with north up, for the folders that have products."""
+    pictures = []
+    for name, summary in folders.items():
+        path = above / name / "images.fits"
+        if not path.exists():
+            continue
+        with fits.open(path) as hdus:
+            snr, header = np.array(hdus["SNR"].data, dtype=float), hdus["SNR"].header
+        scale = WCS(header).proj_plane_pixel_scales()[0].to_value(u.arcsec)
+        y, x = np.indices(snr.shape) + 1.0
+        grid = scale * np.stack([x - header["CRPIX1"], y - header["CRPIX2"]], axis=-1)
+        # East is to the left.
+        places = np.array([_offset(each) for each in summary["candidates"]]).reshape(-1, 2)
+        figure, ax = drawing.panel()
+        drawing.snr_map(
+            ax, snr, grid, places * (-1, 1), 0.0 if summary["oriented"] else None,
+            title=_name(summary), labels=[str(k + 1) for k in range(len(places))],
+        )  # fmt: skip
+        count = len(places)
+        some = f"{count or 'no'} candidate{'' if count == 1 else 's'}"
+        pictures.append(
+            Picture(
+                name,
+                figure,
+                f"Map of the signal-to-noise ratio of a point source, {_name(summary)}, {some}.",
+                f"{_name(summary)}: S/N of a point source, {some}, numbered as in the table.",
+            )
+        )
+    return pictures
+
+
+def _tracks(
+    summaries: Sequence[Mapping[str, Any]], motion: tuple[float, float] | None
+) -> list[Picture]:
+    """Where the candidates of the first epoch would be later as sources in the background."""
+    oriented = [each for each in summaries if each["oriented"]]
+    start = next((each for each in oriented if each["candidates"]), None)
+    if motion is None or start is None:
+        return []
+    dated = [each for each in oriented if each["epoch_mjd"] >= start["epoch_mjd"]]
+    if all(_together(start, each) for each in dated):
+        return []
+    pictures = []
+    for k, candidate in enumerate(start["candidates"][:_MOST_TRACKS], 1):
+        place, epochs = _offset(candidate), []
+        for each in dated:
+            offsets = [_offset(row) for row in each["candidates"]]
+            errors = [np.sqrt(np.diagonal(_covariance(row))) for row in each["candidates"]]
+            years = (each["epoch_mjd"] - start["epoch_mjd"]) / _YEAR
+            epochs.append(
+                drawing.Epoch(
+                    _name(each),
+                    np.array(offsets).reshape(-1, 2),
+                    np.array(errors).reshape(-1, 2),
+                    None if _together(start, each) else place - np.array(motion) * years,
+                )
+            )
+        figure, ax = drawing.panel()
+        drawing.sky_track(ax, epochs, place, f"Candidate {k} of {_name(start)}")
+        pictures.append(
+            Picture(
+                f"track_{k}",
+                figure,
+                f"Offsets of candidate {k} of {_name(start)} and of later candidates from the "
+                "star, and the way of a source in the background.",
+                f"Candidates near candidate {k} of {_name(start)}, filled, and where a source in "
+                "the background would be at every later date, open and connected by the dashed "
+                "line: it moves opposite to the star's proper motion. A companion stays, apart "
+                "from its orbit.",
+            )
+        )
+    return pictures
 
 
 def _brightness(summary: Mapping[str, Any], in_filter: Mapping[str, Any]) -> str:

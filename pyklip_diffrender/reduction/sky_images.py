@@ -90,16 +90,9 @@ class SkyImages:
         return self.turned((detection.photon_error / error) ** 2)
 
     @property
-    def image(self) -> Image:
-        """The image to show: the posterior mean, or with a disk in the model the mean of frames."""
-        return (self.combined if self._disk is not None else self.posterior_mean)[0]
-
-    @property
-    def words(self) -> str:
-        """Description of `image`."""
-        if self._disk is None:
-            return "Most probable image of the sky without star and detector, from all frames"
-        return "Mean of all frames without the star"
+    def has_disk(self) -> bool:
+        """Whether extended light was fitted, which the combined image has and the others lack."""
+        return self._disk is not None
 
     def turned(self, on_frame: Image) -> Image:
         """Interpolate an image on the pixels of the first frame."""

@@ -149,8 +149,17 @@ def _systematics(reduction: Reduction) -> dict[str, Any] | None:
     if used is None:
         return None
     provenance = {key: used.provenance.get(key, []) for key in ("stars", "frames")}
+    fitted = {each.observation.target for fit in reduction.references for each in fit.frames}
     size, error = pattern_size(reduction.fit) or (None, None)
-    return {"name": used.name, **provenance, "size": size, "size_error": error}
+    return {
+        "name": used.name,
+        **provenance,
+        # Reference frames of this sequence need not be where the pattern comes from.
+        "own_stars": [star for star in provenance["stars"] if star in fitted],
+        "other_stars": [star for star in provenance["stars"] if star not in fitted],
+        "size": size,
+        "size_error": error,
+    }
 
 
 def _star(detection: Detection) -> dict[str, Any] | None:
@@ -219,13 +228,22 @@ def _injected(planets: QTable) -> dict[str, Any]:
         "mean_ratio_error": ratio.std(ddof=1) / math.sqrt(len(ratio)) if several else None,
         "pull_deviation": pull.std(ddof=1) if several else None,
         "within_one_error": np.mean(np.abs(pull) < 1),
+        "strength": planets.meta["strength"],
         "planets": _rows(planets),
     }
 
 
 def _completeness(reduction: Reduction) -> dict[str, Any] | None:
     """Contrasts at which 50 and 95 % of planets are found, None where there are none."""
-    return None if reduction.completeness is None else dict(reduction.completeness.meta)
+    fractions, curve = reduction.completeness, reduction.detection.contrast_curve
+    if fractions is None:
+        return None
+    places, limits = curve["separation"].value, np.log(curve["contrast"])
+    return {
+        **fractions.meta,
+        "planets": fractions["planets"].max(),
+        "limit": np.exp(np.interp(fractions.meta["separation_arcsec"], places, limits)),
+    }
 
 
 def _curve(curve: QTable) -> dict[str, Any]:

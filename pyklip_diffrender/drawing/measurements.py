@@ -1,0 +1,204 @@
+"""A measured source: its pixels, its flux and position, and its way over the sky."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyklip_diffrender.drawing.images import show_pixels
+from pyklip_diffrender.drawing.marks import ACCENT, INK, compass, halo
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["Epoch", "Stamp", "corner", "sky_track", "stamp_panels"]
+
+Array = NDArray[np.float64]
+
+_STAMPS, _CORNER = (4.8, 3.9), (4.8, 4.4)
+"""Sizes of figures of several small axes, inches."""
+
+_SIGMAS = (1.0, 2.0)
+"""Ellipses of a corner figure, standard deviations."""
+
+_ON_CURVE = 181
+"""Points of a curve."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stamp:
+    """The pixels about a source in one frame; NaN where they are masked or outside of it.
+
+    Attributes
+    ----------
+    x, y : ndarray, (n,)
+        Coordinates of the pixels from the star, arcsec.
+    data, subtracted, model : ndarray, (n, n)
+        The frame, the frame without the star and everything else that is not the source, and the
+        source, in the frame's unit.
+    noise : ndarray, (n, n)
+        Standard deviations of the pixels, in the same unit.
+    north : float or None
+        Position angle of +y, degrees east of north.
+    """
+
+    x: Array
+    y: Array
+    data: Array
+    subtracted: Array
+    model: Array
+    noise: Array
+    north: float | None
+
+
+def stamp_panels(stamp: Stamp, unit: str) -> Figure:
+    """Draw data, star-subtracted data, model and residual of a source in one frame."""
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    figure = Figure(figsize=_STAMPS, layout=ConstrainedLayoutEngine(compress=True, w_pad=0.08))
+    limit = max(float(np.nanmax(np.abs(stamp.model))), 3 * float(np.nanmedian(stamp.noise)))
+    signed: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "bar": unit}
+    light = {"cmap": "magma", "bar": unit}
+    residual = (stamp.subtracted - stamp.model) / stamp.noise
+    sigmas = {"cmap": "RdBu_r", "vmin": -5.0, "vmax": 5.0, "bar": "standard deviations"}
+    axes: NDArray[Any] = figure.subplots(2, 2)
+    for ax, title, image, style in (
+        (axes[0, 0], "Data", stamp.data, light),
+        (axes[0, 1], "Without the star", stamp.subtracted, signed),
+        (axes[1, 0], "Model", stamp.model, signed),
+        (axes[1, 1], "Residual", residual, sigmas),
+    ):
+        show_pixels(ax, image, stamp.x, stamp.y, title=title, **style)
+        ax.locator_params(nbins=3)
+        for each in (ax, *ax.child_axes):
+            each.tick_params(labelsize="small")
+        ax.plot(stamp.x.mean(), stamp.y.mean(), "+", color=INK, ms=8, path_effects=halo())
+    for ax in axes[1]:
+        ax.set_xlabel("x (arcsec)", fontsize="small")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("y (arcsec)", fontsize="small")
+    if stamp.north is not None:
+        compass(axes[1, 1], stamp.north)
+    return figure
+
+
+def corner(names: Sequence[str], values: Array, covariance: Array, labels: Sequence[str]) -> Figure:
+    """Draw the Gaussian of a few measured values: marginal distributions, and ellipses of pairs.
+
+    Parameters
+    ----------
+    names : sequence of str, (n,)
+        Of the axes, with units.
+    values : ndarray, (n,)
+    covariance : ndarray, (n, n)
+    labels : sequence of str, (n,)
+        Values with their errors, as titles.
+
+    Returns
+    -------
+    Figure
+        Ellipses have one and two standard deviations: 39 and 86 % of the probability.
+    """
+    from matplotlib.figure import Figure
+
+    count = len(names)
+    figure = Figure(figsize=_CORNER, layout="constrained")
+    axes: NDArray[Any] = figure.subplots(count, count, sharex="col", squeeze=False)
+    errors = np.sqrt(np.diagonal(covariance))
+    turn = np.linspace(0, 2 * np.pi, _ON_CURVE)
+    for row, column in np.ndindex(count, count):
+        ax: Axes = axes.item(row, column)
+        if column > row:
+            ax.set_axis_off()
+            continue
+        if column == row:
+            steps = np.linspace(-3.5, 3.5, _ON_CURVE)
+            bell = np.exp(-(steps**2) / 2)
+            ax.fill_between(values[row] + errors[row] * steps, bell, color=ACCENT, alpha=0.15, lw=0)
+            ax.plot(values[row] + errors[row] * steps, bell, color=ACCENT)
+            ax.set_title(labels[row], fontsize="small")
+            ax.set_yticks([])
+            ax.set_ylim(0, 1.1)
+        else:
+            pair = [column, row]
+            root = np.linalg.cholesky(covariance[np.ix_(pair, pair)])
+            circle = root @ np.stack([np.cos(turn), np.sin(turn)])
+            for sigmas in _SIGMAS:
+                x, y = values[pair][:, None] + sigmas * circle
+                ax.plot(x, y, color=ACCENT)
+                ax.fill(x, y, color=ACCENT, alpha=0.12, lw=0)
+            ax.plot(*values[pair], "+", color=INK)
+            ax.set_ylim(*(values[row] + np.array([-3.5, 3.5]) * errors[row]))
+        ax.set_xlim(*(values[column] + np.array([-3.5, 3.5]) * errors[column]))
+        ax.tick_params(labelsize="small")
+        ax.tick_params(axis="x", rotation=45)
+        ax.locator_params(axis="x", nbins=4)
+        if 0 < column < row:
+            ax.set_yticks([])
+        elif column < row:
+            ax.locator_params(axis="y", nbins=4)
+        if row == count - 1:
+            ax.set_xlabel(names[column], fontsize="small")
+        if column == 0 and row:
+            ax.set_ylabel(names[row], fontsize="small")
+    return figure
+
+
+@dataclass(frozen=True, eq=False)
+class Epoch:
+    """Sources that were measured at one date.
+
+    Attributes
+    ----------
+    label : str
+    places, errors : ndarray, (k, 2)
+        Offsets from the star to the east and north and their standard deviations, arcsec.
+    background : ndarray, (2,) or None
+        Where a source in the background would be that was at the place of the first epoch.
+    """
+
+    label: str
+    places: Array
+    errors: Array
+    background: Array | None
+
+
+def sky_track(ax: Axes, epochs: Sequence[Epoch], start: Array, title: str) -> None:
+    """Draw where sources were measured, and the way of one in the background; east is left.
+
+    Parameters
+    ----------
+    ax : Axes
+    epochs : sequence of Epoch
+        In order of time.
+    start : ndarray, (2,)
+        Offset of the source at the first epoch, to which the view belongs, arcsec.
+    title : str
+    """
+    markers = "osD^vP*X"
+    way = np.array([start, *(each.background for each in epochs if each.background is not None)])
+    ax.plot(*way.T, "--", color=INK, lw=1, label="source in the background")
+    near = max(0.15, 1.6 * float(np.abs(way - start).max()))
+    for k, each in enumerate(epochs):
+        marker = markers[k % len(markers)]
+        inside = (np.abs(each.places - start) < near).all(axis=1)
+        (x, y), (x_error, y_error) = each.places[inside].T, each.errors[inside].T
+        ax.errorbar(
+            x, y, y_error, x_error, fmt=marker, color=ACCENT, ms=6, capsize=2, label=each.label
+        )
+        if each.background is not None:
+            ax.plot(*each.background, marker, mfc="white", mec=INK, ms=7, zorder=1)
+    ax.set_xlim(start[0] + near, start[0] - near)
+    ax.set_ylim(start[1] - near, start[1] + near)
+    ax.set_box_aspect(1.0)
+    ax.locator_params(nbins=5)
+    ax.set_xlabel("offset to the east (arcsec)")
+    ax.set_ylabel("offset to the north (arcsec)")
+    ax.set_title(title, color=INK, loc="left")
+    ax.legend(frameon=False, fontsize="small")
