@@ -127,8 +127,18 @@ class Reduction:
         search = self.detection if self.wide is None else self.wide
         return (
             f"{self.sequence!r}\n{self.fit.status.message}\n"
-            f"flat-field pattern: {known}\n{search}\n{self.remark}"
+            f"flat-field pattern: {known}\n{self._references}{search}\n{self.remark}"
         ).rstrip()
+
+    @property
+    def _references(self) -> str:
+        """What the frames of reference stars are for, in a line; empty without any."""
+        every = self.visit.contributions
+        used = sum(each.use == "joint" for each in every)
+        if not every:
+            return ""
+        deeper = f"; limits {self.visit.gain:.2f} times deeper" if used else ""
+        return f"reference frames in the likelihood: {used} of {len(every)}{deeper}\n"
 
     def _repr_html_(self) -> str:
         facts = {

@@ -88,8 +88,11 @@ def _setup(summary: Mapping[str, Any]) -> str:
     dates = [str(summary[key] or "")[:10] for key in ("first_date", "last_date")]
     targets = [each for each in summary["frames"] if each["use"] == "target"]
     references = len(summary["frames"]) - len(targets)
+    joint = sum(each["use"] == "joint" for each in summary["visit"]["contributions"])
     used = summary["systematics"]
     purpose = "KLIP alone" if used is None or not used["own_stars"] else "the pattern and KLIP"
+    if joint:
+        purpose = f"KLIP, {joint} of them in the likelihood"
     parts = [
         summary["instrument"],
         summary["filter"],

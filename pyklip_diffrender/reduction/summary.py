@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -94,10 +94,15 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
         "frames": [
             *(
                 _frame(each, "target") | {"bad_pixels": _bad_pixels(each, fitted)}
-                for each, fitted in zip(sequence.science, fit.frames, strict=True)
+                # Frames of reference stars follow those of the target.
+                for each, fitted in zip(sequence.science, fit.frames, strict=False)
             ),
             *(_frame(each, "reference") for each in sequence.references),
         ],
+        "visit": {
+            "gain": reduction.visit.gain,
+            "contributions": [asdict(each) for each in reduction.visit.contributions],
+        },
         "admission": _rows(sequence.table),
         "left_out": [
             *({"name": name, "reason": reason} for name, reason in sequence.excluded),

@@ -32,11 +32,14 @@ def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str,
         fit = Refinement.read(folder.parent / job.base / "fit.fits")
         first = fit.frames[0].observation
         planet = _planet(job.injection, first.position_angle)
-        frames: abc.Sequence[FrameFit] = fit.frames
+        frames: abc.Sequence[FrameFit] = [
+            each for each in fit.frames if not each.observation.reference
+        ]
+        references = tuple(each.observation for each in fit.frames if each.observation.reference)
         if job.options.disk:
             frames = _with_disk(frames, _sequence(job).cutout(job.options.size).science)
         science = with_planets(frames, [planet])
-        sequence = Sequence(first.target, science)
+        sequence = Sequence(first.target, science, references)
         changes |= {"systematics": fit.systematics or "off", "wide": False}
     else:
         sequence = _sequence(job)
