@@ -43,6 +43,7 @@ import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
 from pyklip_diffrender.instrument import detector_place, filter_shift
 from pyklip_diffrender.optics import resample
+from pyklip_diffrender.reduction.klip_curve import klip_curve
 from pyklip_diffrender.scene import Planet, Sequence
 
 ROLLS = (70.0, 80.0)
@@ -67,6 +68,7 @@ MATCHED = 0.08
 """arcsec from a planet within which a candidate is that planet."""
 
 INNER = 0.5
+KLIP_INNER = 0.3
 
 
 @dataclass(frozen=True)
@@ -271,13 +273,38 @@ def reduced(case: Case, folder: Path, references: int = 0, repeat: int = 0) -> d
     began = time.process_time()
     reduction = dr.reduce(sequence, before, size=case.size)
     seconds = time.process_time() - began
-    result = compare(case, reduction) | {
-        "cpu_stpsf": made,
-        "cpu": seconds,
-        "memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
-    }
+    result = (
+        compare(case, reduction)
+        | klip_ratios(reduction)
+        | {
+            "references": [each.use for each in reduction.visit.contributions],
+            "gain": reduction.visit.gain,
+            "cpu_stpsf": made,
+            "cpu": seconds,
+            "memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        }
+    )
     done.write_text(json.dumps(result, indent=2), encoding="utf-8")
     return result
+
+
+def klip_ratios(reduction: dr.Reduction) -> dict[str, Any]:
+    """Limits of KLIP with the same references over ours, raw and with small-sample corrections."""
+    ours = reduction.detection.contrast_curve
+    inside = ours["separation"].to_value("arcsec") >= KLIP_INNER
+    separations = ours["separation"][inside]
+    klip = klip_curve(reduction.detection, reduction.sequence.references, separations)
+    ours = ours[inside][: len(klip)]
+    return {
+        "klip_separations": [float(each.to_value("arcsec")) for each in klip["separation"]],
+        "klip_over_ours_raw": (
+            np.asarray(klip["contrast"]) / np.asarray(ours["contrast"])
+        ).tolist(),
+        "klip_over_ours_corrected": (
+            np.asarray(klip["small_sample"]) / np.asarray(ours["small_sample"])
+        ).tolist(),
+        "klip_modes": np.asarray(klip["modes"]).tolist(),
+    }
 
 
 def compare(case: Case, reduction: dr.Reduction) -> dict[str, Any]:

@@ -34,6 +34,7 @@ _WIDE = 10.0
 _COMPLETENESS = 90.0
 _WRITE = 7.0
 _FRAMES = 0.88
+_JOINT = 0.9
 _PIXELS = 0.17
 _MEMORY = 1.4e9
 _MEMORY_PER_FRAME = 0.4e9
@@ -69,10 +70,13 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
             for each in sequence.science
             if each.first_pixel is None
         ]
-    elif searched or systematics == "references":
+    elif systematics == "references" or (searched and options.references == "pattern"):
         steps += [(f"reference star {star}", fit * n**_FRAMES) for star, n in stars.items()]
     joint = fit * count**_FRAMES * (1 + _TIED * (options.star_flux is not None))
     steps.append(("wavefront", joint))
+    others = len(sequence.references) * (options.references == "joint" and not options.disk)
+    if others:
+        steps.append(("reference stars and target together", fit * _JOINT * (count + others)))
     refit = _DISK * joint * options.disk
     if options.disk:
         steps.append(("extended light, and wavefront without it", refit))
@@ -99,7 +103,9 @@ def describe_plan(sequence: Sequence, options: ReduceOptions) -> str:
     steps = steps_of(sequence, options)
     lines = [f"{k}. {name}: about {duration(s)}" for k, (name, s) in enumerate(steps, 1)]
     total = sum(seconds for _, seconds in steps)
-    memory = _MEMORY + _MEMORY_PER_FRAME * len(sequence.science) * (options.size / 80) ** 2
+    joins = options.references == "joint" and not options.disk
+    frames = len(sequence.science) + joins * len(sequence.references)
+    memory = _MEMORY + _MEMORY_PER_FRAME * frames * (options.size / 80) ** 2
     free = free_memory()
     of = "" if free is None else f" ({free / 1e9:.1f} GB are free)"
     lines.append(

@@ -265,6 +265,10 @@ search = _all(
            help="Flat-field pattern: auto (the package's library, else the reference "
            "stars), references (both), off, a folder or file of patterns to search besides the "
            "package's (command learn), or a systematics.fits of an earlier reduction."),
+    option("--references", type=click.Choice(("joint", "pattern", "off")), default="joint",
+           show_default=True, section="Fit and search",
+           help="What the frames of reference stars are for: one likelihood with the target's, the "
+           "flat-field pattern, or nothing."),
     option("--memory", metavar="SIZE", section="Fit and search",
            help='Memory that the process may take, such as "2 GB"; default: as much as it needs.'),
     option("--dry-run", is_flag=True, section="Output",

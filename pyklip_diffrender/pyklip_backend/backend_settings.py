@@ -94,6 +94,9 @@ class DiffrenderSettings:
         them in any case and uses both; a library, its file, or a folder of such files is searched
         besides the package's; see `reduce`. Reference frames are those of a psf_library that
         `JWSTData` has read, if the mode contains RDI, and any in the dataset.
+    references : {"joint", "pattern", "off"}, optional
+        What the reference frames are for: with "joint", the default, they are fitted together with
+        the target's where that makes limits deeper; see `reduce`.
     keep_detected : bool, optional
         Subtract none of the light of detected companions with the star; True by default for real
         NIRCam frames, else False. Bright ones are part of the fit in any case, as in `reduce`.
@@ -155,6 +158,7 @@ class DiffrenderSettings:
     fit: GaussNewton | None = None
     start: Mapping[str, Any] | None = None
     systematics: Systematics | PatternLibrary | str | os.PathLike[str] | None = None
+    references: str | None = None
     keep_detected: bool | None = None
     threshold: float | None = None
     disk: bool | None = None

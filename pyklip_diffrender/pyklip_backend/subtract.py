@@ -240,6 +240,7 @@ def _options(
     given: dict[str, Any] = {
         "settings": settings.fit,
         "start": settings.start,
+        "references": settings.references,
         "threshold": settings.threshold,
         "disk": settings.disk,
         "star_flux": settings.star_flux,

@@ -54,6 +54,8 @@ class Options:
     systematics : str
         "auto", "references", "off", or the path of a file of `Systematics.write`, of a library of
         patterns, or of a folder with such libraries.
+    references : str
+        "joint", "pattern" or "off", see `ReduceOptions`.
     wide, disk, completeness : bool
         Search the whole frames as well, fit extended light together with the star, and compute the
         fraction of planets that the search finds.
@@ -68,6 +70,7 @@ class Options:
     size: int = 80
     threshold: float = 5.0
     systematics: str = "auto"
+    references: str = "joint"
     wide: bool = False
     disk: bool = False
     completeness: bool = False
@@ -261,6 +264,10 @@ def _options(table: CheckedTable, default: Options) -> Options:
         "systematics", default.systematics,
         "'auto', 'references', 'off', or an existing file or folder with patterns", systematics,
     )  # fmt: skip
+    references = table.take(
+        "references", default.references, "'joint', 'pattern' or 'off'",
+        only(as_text, lambda use: use in ("joint", "pattern", "off")),
+    )  # fmt: skip
     wide, disk, completeness = (
         table.take(key, getattr(default, key), "true or false", as_flag)
         for key in ("wide", "disk", "completeness")
@@ -284,7 +291,9 @@ def _options(table: CheckedTable, default: Options) -> Options:
     where = f"{table.place}: settings"
     table.problems += [f"{where}: {each}" for each in wrong]
     allowed = default.settings if wrong else settings
-    return Options(size, threshold, pattern, wide, disk, completeness, star, star_error, allowed)
+    return Options(
+        size, threshold, pattern, references, wide, disk, completeness, star, star_error, allowed
+    )
 
 
 def _wrong_settings(settings: Mapping[str, Any]) -> list[str]:
