@@ -154,7 +154,7 @@ def fit_gradient(device: Any, **changes: object) -> list[Array]:
     """Through the model itself, by everything that a fit may vary."""
     problem = Problem(model_on(device, **changes), frame(), dr.random_opd(1, npix=NPIX))
     solver = Solver([problem], settings(), BASIS, progress=False)
-    unknowns = solver.first_unknowns()
+    unknowns = solver.first_unknowns(solver.priors_of(solver.settings))
     (point,) = solver.objective.at(unknowns, unknowns.initial()).points
     pixels = solver.objective.residual(0, point)
     slopes = solver.objective.forwards[0].slopes(point, pixels, torch.zeros(0, 3))

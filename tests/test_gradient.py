@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 import pyklip_diffrender as dr
+from pyklip_diffrender.linear.model import LinearModel
 from pyklip_diffrender.refinement import GaussNewton
 from pyklip_diffrender.refinement.accurate_step import (
     ModelDerivatives,
@@ -22,7 +23,7 @@ from pyklip_diffrender.refinement.accurate_step import (
 from pyklip_diffrender.refinement.normal_equations import linearise
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.problem import Problem
-from pyklip_diffrender.refinement.solver import Solver
+from pyklip_diffrender.refinement.solver import Solver, StepState
 from pyklip_diffrender.scene import Systematics
 from pyklip_diffrender.wavefront import WavefrontPrior, default_basis
 
@@ -60,9 +61,10 @@ def solver_of(frames: int, **changes: object) -> tuple[Solver, State]:
         **changes,
     )
     solver = Solver(problems, settings, BASIS, progress=False)
-    unknowns = solver.first_unknowns()
+    priors = solver.priors_of(settings)
+    unknowns = solver.first_unknowns(priors)
     vector = unknowns.initial()
-    deviation = solver.prior_deviation(unknowns)
+    deviation = solver.prior_deviation(unknowns, priors)
     moved = torch.from_numpy(rng.normal(size=len(vector)))
     moves = torch.where(torch.isfinite(deviation), deviation, 0.0).clamp(max=5.0)
     return solver, solver.objective.at(unknowns, vector + 0.1 * moves * moved)
@@ -75,6 +77,14 @@ def gradient(solver: Solver, state: State, *, exact: bool) -> Tensor:
         return ModelDerivatives(solver.objective, state, weights).gradient()
     equations = linearise(solver.objective, state, 0.01, len(BASIS), 4.0)
     return equations.gradient - equations.curvature @ equations.current
+
+
+def linear_model(
+    solver: Solver, state: State, kappa: float, robust: float = math.inf, *, final: bool = True
+) -> LinearModel:
+    """Of all modes, with the priors of the solver's settings."""
+    priors = solver.priors_of(solver.settings)
+    return solver.linear_model(state, priors, kappa, len(BASIS), robust, final=final)
 
 
 def slope_along(solver: Solver, state: State, direction: Tensor, step: float = 1e-4) -> float:
@@ -91,7 +101,7 @@ def slope_along(solver: Solver, state: State, direction: Tensor, step: float = 1
 
 def units(solver: Solver, state: State) -> Tensor:
     """Prior deviations of the unknowns, and values of those without one."""
-    unit = solver.prior_deviation(state.unknowns)
+    unit = solver.prior_deviation(state.unknowns, solver.priors_of(solver.settings))
     return torch.where(torch.isfinite(unit), unit, state.vector.abs()).clamp(max=1e6)
 
 
@@ -178,7 +188,7 @@ def test_where_the_copy_is_the_model_both_gradients_are_the_same() -> None:
     solver, state = solver_of(1)
     same = of_the_model_itself(solver)
     exact, copied = (gradient(same, state, exact=value) for value in (True, False))
-    scale = same.prior_deviation(state.unknowns).clamp(max=1e6)
+    scale = same.prior_deviation(state.unknowns, same.priors_of(same.settings)).clamp(max=1e6)
     error = ((exact - copied) * scale).norm() / (exact * scale).norm()
     assert error < 1e-4
 
@@ -247,12 +257,12 @@ def test_a_companion_that_the_model_error_outweighs_counts_in_the_last_derivativ
     state = solver.objective.at(*state.unknowns.with_companions([companion], state.vector))
     modes, kappas = state.unknowns.where("modes"), (0.1, 0.0)
     early, late, same = (
-        solver.linear_model(state, kappa, len(BASIS), math.inf, final=False).frames[0].jacobian
+        linear_model(solver, state, kappa, final=False).frames[0].jacobian
         for kappa in (*kappas, 0.001)
     )
     assert (early[modes] - late[modes]).norm() > 0.01 * late[modes].norm()
     assert same is late
-    assert solver.linear_model(state, 0.1, len(BASIS), math.inf).frames[0].jacobian is late
+    assert linear_model(solver, state, 0.1).frames[0].jacobian is late
 
 
 @pytest.mark.slow
@@ -261,7 +271,8 @@ def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
     solver, state = solver_of(1)
     same = of_the_model_itself(solver)
     weights = solver.objective.errors(state, 0.01, 4.0)
-    deviation = solver.prior_deviation(state.unknowns)
+    priors = solver.priors_of(solver.settings)
+    deviation = solver.prior_deviation(state.unknowns, priors)
     coarse, fine = (
         linearise(each.objective, state, 0.01, len(BASIS), 4.0) for each in (solver, same)
     )
@@ -283,7 +294,7 @@ def test_an_accurate_step_ends_where_that_of_the_model_does() -> None:
         )
         assert not settled  # Every iteration lowers it, if only by a little.
         steps.append(step)
-    too_coarse = solver._solve(state.unknowns, coarse).step - coarse.current
+    too_coarse = solver._solve(state.unknowns, coarse, priors).step - coarse.current
     errors = same._solve(state.unknowns, fine, errors=True).variance.sqrt()
     assert (direct / errors).norm() > 10
     for step in steps:
@@ -348,18 +359,19 @@ def test_accurate_steps_keep_their_equations() -> None:
     # Of the model itself: one iteration is enough with equations of nearly the same state.
     solver = of_the_model_itself(solver)
     weights = solver.objective.errors(state, 0.01, 4.0)
-    before = solver._cost(state, weights)
+    carried = StepState(solver.priors_of(solver.settings))
+    before = solver._cost(state, weights, carried.priors)
 
     def replaces(state: State, kappa: float) -> bool:
         """Whether a step from a state makes new equations."""
-        equations = solver._equations
-        solver._accurate_step(state, kappa, len(BASIS))
-        return solver._equations is not equations
+        equations = solver.equations.last
+        solver._accurate_step(state, carried, kappa, len(BASIS))
+        return solver.equations.last is not equations
 
-    after, _ = solver._accurate_step(state, 0.01, len(BASIS))
-    assert solver._cost(after, weights) < 0.9 * before
+    after = solver._accurate_step(state, carried, 0.01, len(BASIS)).state
+    assert solver._cost(after, weights, carried.priors) < 0.9 * before
     assert not replaces(after, 0.01)
-    solver._has_poor_equations = True
+    solver.equations.judge(preconditions=False)
     assert replaces(after, 0.01)
     # Weights of a smaller model error are others, those of a little smaller one are not.
     assert not replaces(after, 0.008)
@@ -373,17 +385,39 @@ def test_accurate_steps_keep_their_equations() -> None:
 def test_equations_that_lead_nowhere_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     solver, state = solver_of(1, relinearise=0.1, accurate_steps=True, robust=4.0)
     solver = of_the_model_itself(solver)
-    after, _ = solver._accurate_step(state, 0.01, len(BASIS))
-    earlier, right = solver._equations, accurate_step
+    carried = StepState(solver.priors_of(solver.settings))
+    after = solver._accurate_step(state, carried, 0.01, len(BASIS)).state
+    earlier, right = solver.equations.last, accurate_step
 
     def wrong(*arguments: Any, **options: Any) -> tuple[Tensor, bool]:
         step, settled = right(*arguments, **options)
-        return (-step if solver._equations is earlier else step), settled
+        return (-step if solver.equations.last is earlier else step), settled
 
     monkeypatch.setattr("pyklip_diffrender.refinement.solver.accurate_step", wrong)
-    last, gain = solver._accurate_step(after, 0.01, len(BASIS))
-    assert gain > 0
-    assert last is not after
+    last = solver._accurate_step(after, carried, 0.01, len(BASIS))
+    assert last.gain > 0
+    assert last.state is not after
+
+
+@pytest.mark.parametrize("accurate", [False, True])
+def test_a_step_depends_on_its_arguments_alone(accurate: bool) -> None:
+    """Not on the steps before it: what these hand on is an argument."""
+    solver, state = solver_of(1, relinearise=1e-9, accurate_steps=accurate)
+    first = StepState(solver.priors_of(solver.settings), damping=0.3, kappa=0.1)
+    once = solver.step(state, first, 0.02, len(BASIS))
+    assert once.gain > 0
+    # A step along which the damping, the weights and the accuracy change.
+    solver.step(once.state, replace(first, needs_accurate=True), 0.1, 0)
+    again = solver.step(state, first, 0.02, len(BASIS))
+    assert torch.equal(again.state.vector, once.state.vector)
+    assert (again.gain, again.carried.damping) == (once.gain, once.carried.damping)
+    assert again.carried.needs_accurate == once.carried.needs_accurate
+    assert first == StepState(first.priors, damping=0.3, kappa=0.1)
+    # What is handed on counts.
+    assert not torch.equal(
+        solver.step(state, replace(first, damping=30.0), 0.02, len(BASIS)).state.vector,
+        once.state.vector,
+    )
 
 
 def test_other_weights_need_no_new_jacobian() -> None:
@@ -393,13 +427,13 @@ def test_other_weights_need_no_new_jacobian() -> None:
         solver, state = solver_of(2, relinearise=0.1, accurate_steps=True)
         if goes_on:  # The second solver begins where the first one ends.
             models = [
-                solver.linear_model(state, kappa, len(BASIS), robust, final=False)
+                linear_model(solver, state, kappa, robust, final=False)
                 for kappa, robust in ((0.01, 4.0), (0.0, math.inf))
             ]
         mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
         mask[7, 9] = True
         solver.leave_out([mask, ~mask & mask])
-        models.append(solver.linear_model(state, 0.0, len(BASIS), math.inf, final=False))
+        models.append(linear_model(solver, state, 0.0, final=False))
     *same, new = ([frame.jacobian for frame in model.frames] for model in models)
     assert all(each[k] is same[0][k] for each in same for k in range(2))
     assert new[0] is not same[0][0]
@@ -410,7 +444,7 @@ def test_other_weights_need_no_new_jacobian() -> None:
 def test_derivatives_by_a_frame_become_those_by_all_unknowns() -> None:
     """The adjoint of `of_unknowns`, with modes that drift between the frames."""
     solver, state = solver_of(2, drift=WavefrontPrior(SCALES, fit_scales=False))
-    assert solver.priors.drift > 0
+    assert solver.priors_of(solver.settings).drift > 0
     rng = np.random.default_rng(10)
     joint = torch.from_numpy(rng.normal(size=state.unknowns.size))
     for k in range(2):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from astropy.table import QTable
 from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from pyklip_diffrender.detection.candidate_tables import measured_table
 from pyklip_diffrender.detection.candidates import Candidates, refine_candidates
@@ -146,7 +147,8 @@ def detect(
 
     def look(fits: Sequence[Refinement], known: Candidates) -> _Outcome:
         maps = Maps(groups_of(fits), progress)
-        return _Outcome(fits, maps, *_search(maps, fits, known, threshold, inner, scatter))
+        search = _PeakSearch(maps, fits, threshold, inner, scatter)
+        return _Outcome(fits, maps, *search.run(known))
 
     def look_and_refine(fits: Sequence[Refinement], known: Candidates) -> _Outcome:
         """Search, and search again with the candidates as companions if some are bright."""
@@ -388,58 +390,143 @@ def _checked(fits: Fits) -> list[Refinement]:
     return refinements
 
 
-def _search(
-    maps: Maps,
-    fits: Sequence[Refinement],
-    start: Candidates,
-    threshold: float,
-    inner: float,
-    scatter: float | None,
-) -> tuple[Candidates, ErrorFactor, Significance]:
-    """Candidates in the order in which they were found, and the factor for the errors."""
-    groups, grid, pixel = maps.groups, maps.grid, pixel_width(maps.grid)
-    # A fit may have taken a residual for a companion while its wavefront was still wrong.
-    candidates = refine_candidates(groups, start, pixel / 2, _STEPS)
-    unscaled = ErrorFactor.constant(1.0)
-    while len(candidates) and candidates.snr(unscaled).min() < threshold:
-        weakest = int(candidates.snr(unscaled).argmin())
-        candidates = refine_candidates(groups, candidates.without(weakest), pixel / 2, _STEPS)
-    # A peak that is no candidate once its position is fitted would be the highest one for ever.
-    dismissed = torch.zeros(0, 2, dtype=torch.float64)
-    # Pixels whose sources are nearer to the star than the search goes.
-    within = np.zeros(grid.shape[:2], dtype=bool)
-    hidden = False
-    while True:
-        snr = maps.snr(maps.without(candidates))
-        significance = significance_of(fits, maps, candidates.offsets, inner, scatter)
-        allowed = far_from(grid, dismissed, 2 * pixel) & ~within
-        peak = significance.next_peak(snr, candidates.offsets, threshold, allowed)
-        if peak is not None and max(len(candidates), len(dismissed)) < _MAX_CANDIDATES:
-            contrast = float(snr[peak] / np.sqrt(maps.information[peak]))
-            candidates = candidates.with_one_more(grid[peak], contrast)
-            candidates = refine_candidates(groups, candidates, pixel / 2, _STEPS)
-            if separation_of(candidates.offsets.numpy())[-1] < inner:
-                within[peak] = True
-                candidates = candidates.without(len(candidates) - 1)
-                candidates = refine_candidates(groups, candidates, pixel / 2, _STEPS)
-            _log.info("candidates at %s arcsec", candidates.offsets.tolist())
-            continue
-        factor = significance.factor(snr, candidates.offsets)
-        margin = candidates.snr(factor) - factor.threshold(threshold, candidates.offsets)
+@dataclass(frozen=True)
+class _Peaks:
+    """How far a search for peaks has come.
+
+    Attributes
+    ----------
+    candidates : Candidates
+        In the order in which they were found.
+    dismissed : Tensor, (k, 2)
+        Positions of peaks that were no candidates after all. They would be the highest for ever.
+    within : ndarray of bool, (ny, nx)
+        Pixels whose sources are nearer to the star than the search goes.
+    hides : bool
+        Whether light from there has explained peaks elsewhere.
+    """
+
+    candidates: Candidates
+    dismissed: Tensor
+    within: NDArray[np.bool_]
+    hides: bool = False
+
+
+@dataclass(frozen=True)
+class _PeakSearch:
+    """A search of maps for peaks, one after the other, until none is left.
+
+    Let p be the image of a planet of contrast 1 at a pixel, r the residual of the fit, and Sigma
+    the covariance of noise and starlight with the wavefront marginalised. The maps have
+
+        numerator N = p . Sigma^-1 r,    information I = p . Sigma^-1 p
+
+    for every pixel, so that the contrast is N / I and its S/N is N / sqrt(I) with the errors that
+    the noise explains. Errors are multiplied by a factor f, which grows with the scatter of the
+    S/N. Candidates at offsets o with contrasts c take N = sum c p(o) . Sigma^-1 p from the maps,
+    and with it their side lobes and their share of the scatter. So f falls when a planet becomes a
+    candidate and grows when a candidate is dropped, and a search repeats three steps:
+
+    1. `_added`: the highest peak that is left and significant becomes a candidate, and all of them
+       are fitted together, with their positions.
+    2. `_dropped`: where no peak is left, the weakest candidate that is not significant with the
+       present factor is dropped.
+    3. `_settled`: where none is dropped either, positions are fitted until they move no more.
+    """
+
+    maps: Maps
+    fits: Sequence[Refinement]
+    threshold: float
+    inner: float
+    scatter: float | None
+
+    def run(self, start: Candidates) -> tuple[Candidates, ErrorFactor, Significance]:
+        """Candidates in the order in which they were found, and the factor for the errors."""
+        maps, peaks = self.maps, self._begun(start)
+        # With m for `_MAX_CANDIDATES`: none is added after m were dropped, and no more than m are
+        # left to be dropped then. So at most 2 m are dropped and 2 m added, but for peaks of
+        # sources within `inner`, each of which takes a pixel from the search.
+        for _ in range(4 * _MAX_CANDIDATES + peaks.within.size + 1):
+            snr, offsets = maps.snr(maps.without(peaks.candidates)), peaks.candidates.offsets
+            significance = significance_of(self.fits, maps, offsets, self.inner, self.scatter)
+            found = self._added(peaks, snr, significance)
+            if found is None:
+                factor = significance.factor(snr, offsets)
+                found = self._dropped(peaks, snr, factor)
+            if found is None:
+                return self._settled(peaks.candidates), factor, significance
+            peaks = found
+        raise RuntimeError("the search for peaks did not end")
+
+    def _begun(self, start: Candidates) -> _Peaks:
+        """Begin with the companions of the fit that are significant.
+
+        It may have taken a residual for a companion while its wavefront was still wrong.
+        """
+        candidates, unscaled = self._fitted(start), ErrorFactor.constant(1.0)
+        while len(candidates) and candidates.snr(unscaled).min() < self.threshold:
+            weakest = int(candidates.snr(unscaled).argmin())
+            candidates = self._fitted(candidates.without(weakest))
+        return _Peaks(
+            candidates,
+            torch.zeros(0, 2, dtype=torch.float64),
+            np.zeros(self.maps.grid.shape[:2], dtype=bool),
+        )
+
+    def _added(self, peaks: _Peaks, snr: Image, significance: Significance) -> _Peaks | None:
+        """Make the highest peak that is left a candidate; None if none is significant."""
+        grid, candidates = self.maps.grid, peaks.candidates
+        allowed = far_from(grid, peaks.dismissed, 2 * pixel_width(grid)) & ~peaks.within
+        peak = significance.next_peak(snr, candidates.offsets, self.threshold, allowed)
+        if peak is None or max(len(candidates), len(peaks.dismissed)) >= _MAX_CANDIDATES:
+            return None
+        contrast = float(snr[peak] / np.sqrt(self.maps.information[peak]))
+        more = self._fitted(candidates.with_one_more(grid[peak], contrast))
+        within = peaks.within
+        if separation_of(more.offsets.numpy())[-1] < self.inner:
+            within = within.copy()
+            within[peak] = True
+            more = self._fitted(more.without(len(more) - 1))
+        _log.info("candidates at %s arcsec", more.offsets.tolist())
+        return replace(peaks, candidates=more, within=within)
+
+    def _dropped(self, peaks: _Peaks, snr: Image, factor: ErrorFactor) -> _Peaks | None:
+        """Drop the weakest candidate that is none with the present factor; None if all are.
+
+        The factor may have grown since a candidate was accepted. Side lobes of a source within
+        `inner` are no candidates, however significant they are.
+        """
+        candidates = peaks.candidates
+        margin = candidates.snr(factor) - factor.threshold(self.threshold, candidates.offsets)
         if not len(candidates) or margin.min() >= 0:
-            lobes = side_lobes(maps, snr, candidates, factor, threshold, inner)
+            lobes = side_lobes(self.maps, snr, candidates, factor, self.threshold, self.inner)
             if not lobes.any():
-                if not candidates.converged:
-                    candidates = refine_candidates(groups, candidates, reach=pixel / 2)
-                return candidates, factor, significance
+                return None
             margin = np.where(lobes, margin, np.inf)
-            if not hidden:
+            if not peaks.hides:
                 _log.warning(
                     "light within %.2f arcsec is not the star's; peaks that it explains elsewhere "
-                    "are no candidates", inner
+                    "are no candidates", self.inner
                 )  # fmt: skip
-            hidden = True
-        # The factor may have grown since a candidate was accepted.
+            peaks = replace(peaks, hides=True)
         weakest = int(margin.argmin())
-        dismissed = torch.cat([dismissed, candidates.offsets[weakest, None]])
-        candidates = refine_candidates(groups, candidates.without(weakest), pixel / 2, _STEPS)
+        return replace(
+            peaks,
+            candidates=self._fitted(candidates.without(weakest)),
+            dismissed=torch.cat([peaks.dismissed, candidates.offsets[weakest, None]]),
+        )
+
+    def _settled(self, candidates: Candidates) -> Candidates:
+        """Fit positions until they move no more, if the last fit ended before."""
+        if candidates.converged:
+            return candidates
+        return refine_candidates(self.maps.groups, candidates, reach=self._reach)
+
+    def _fitted(self, candidates: Candidates) -> Candidates:
+        """All candidates fitted together, with their positions, by a few steps."""
+        return refine_candidates(self.maps.groups, candidates, self._reach, _STEPS)
+
+    @property
+    def _reach(self) -> float:
+        """Largest move of a candidate in one step, arcsec."""
+        return pixel_width(self.maps.grid) / 2

@@ -17,7 +17,7 @@ from pyklip_diffrender.linear.response import WavefrontResponse, coarse_copy, do
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.wavefront.bases import Basis
 
-__all__ = ["ResponseCache"]
+__all__ = ["Reading", "ResponseCache"]
 
 _Derivatives = TypeVar("_Derivatives")
 
@@ -58,8 +58,50 @@ class _About:
     now: dict[str, Tensor]
 
 
+class Reading:
+    """Takes derivatives from a cache, and knows the largest error of those that it has taken.
+
+    Parameters
+    ----------
+    cache : ResponseCache
+    allowed : float
+        Relative change of the field above which derivatives are computed again.
+    keep : int
+        Number of responses that the cache stores.
+
+    Attributes
+    ----------
+    farthest : float
+        Largest change of the field since the derivatives that were taken were computed.
+    """
+
+    def __init__(self, cache: ResponseCache, allowed: float, keep: int) -> None:
+        self._cache, self._allowed, self._keep = cache, allowed, keep
+        self.farthest = 0.0
+
+    def near(self, opd: Tensor, values: dict[str, Tensor]) -> WavefrontResponse:
+        """Take the response for nearly the same field, see `ResponseCache.near`."""
+        response, error = self._cache.response_within(opd, values, self._allowed, self._keep)
+        self.farthest = max(self.farthest, error)
+        return response
+
+    def parameters(
+        self,
+        opd: Tensor,
+        values: dict[str, Tensor],
+        names: tuple[str, ...],
+        fields: Sequence[Tensor],
+    ) -> Tensor:
+        """Take the derivatives by parameters, (components, ny, nx), see `ResponseCache`."""
+        slopes, error = self._cache.slopes_within(opd, values, names, self._allowed, self._keep)
+        self.farthest = max(self.farthest, error)
+        return self._cache.image_slopes(fields, values, names, slopes)
+
+
 class ResponseCache:
     """Cache of wavefront responses, and of derivatives with respect to other parameters.
+
+    Whoever needs to know how far its derivatives are from exact ones takes them by a `Reading`.
 
     Parameters
     ----------
@@ -71,9 +113,10 @@ class ResponseCache:
         Largest number of wavelengths at which derivatives are computed.
     relinearise : float
         Relative change of the field (radians for a phase), rms over the pupil, above which
-        derivatives are computed again. With parameter derivatives computed at a distance of 0.2
-        (15 mas in the star's position), the stated error of the star's position is half the correct
-        one, and the position is off by four times that error.
+        derivatives are computed again, unless a `Reading` allows another one. With parameter
+        derivatives computed at a distance of 0.2 (15 mas in the star's position), the stated error
+        of the star's position is half the correct one, and the position is off by four times that
+        error.
     keep : int
         Number of responses to store: one for each frame, because star positions differ.
     memory : float
@@ -81,11 +124,6 @@ class ResponseCache:
         they are needed, the oldest first, about the same wavefront.
     progress : bool
         Show progress bars.
-
-    Attributes
-    ----------
-    farthest : float
-        Largest change of the field at which derivatives were used; set it to 0 to begin anew.
     """
 
     def __init__(
@@ -100,15 +138,22 @@ class ResponseCache:
         memory: float = math.inf,
         progress: bool = False,
     ) -> None:
-        self.keep = keep
         self.model, self.basis, self.npix, self.wavelengths = model, basis, npix, wavelengths
-        self.relinearise, self.memory, self.progress = relinearise, memory, progress
+        self._relinearise, self._keep = relinearise, keep
+        self.memory, self.progress = memory, progress
         self._kept: list[tuple[_About, WavefrontResponse]] = []
         self._slopes: list[tuple[_About, dict[str, list[Tensor]]]] = []
         self._kept_wavelengths, bandpass = model.bandpass.thinned(wavelengths)
         self._coarse = coarse_copy(model, npix).at_wavelengths(bandpass)
         self._last_pupil = LastPupil(self._coarse)
-        self.farthest = 0.0
+
+    def reading(self, allowed: float | None = None, keep: int | None = None) -> Reading:
+        """Begin to take derivatives with another allowed error, or another number of responses."""
+        return Reading(
+            self,
+            self._relinearise if allowed is None else allowed,
+            self._keep if keep is None else keep,
+        )
 
     def parameters(
         self,
@@ -129,44 +174,65 @@ class ResponseCache:
         fields : sequence of Tensor
             The star's field at each wavelength.
         """
-        slopes = self._slopes_near(opd, values, names)
+        return self.reading().parameters(opd, values, names, fields)
+
+    def image_slopes(
+        self,
+        fields: Sequence[Tensor],
+        values: dict[str, Tensor],
+        names: tuple[str, ...],
+        slopes: dict[str, list[Tensor]],
+    ) -> Tensor:
+        """Derivatives of the image, (components, ny, nx), from those of the field."""
         own = [fields[k] for k in self._kept_wavelengths]
         return image_derivatives(self._coarse, own, values, names, slopes)
 
-    def _slopes_near(
-        self, opd: Tensor, values: dict[str, Tensor], names: tuple[str, ...]
-    ) -> dict[str, list[Tensor]]:
+    def slopes_within(
+        self,
+        opd: Tensor,
+        values: dict[str, Tensor],
+        names: tuple[str, ...],
+        allowed: float,
+        keep: int,
+    ) -> tuple[dict[str, list[Tensor]], float]:
+        """Derivatives of the field by parameters, and their error; see `Reading`."""
         inside = opd[self.model.entrance.lit]
-        near = self._nearest(self._slopes, inside, values, _TILT_OF_SLOPES)
+        near = self._nearest(self._slopes, inside, values, _TILT_OF_SLOPES, allowed)
         if near is not None:
-            about, slopes = near
+            about, slopes, error = near
             if self._last_pupil.change(about.now, values) > _UNSEEN:
                 for fields in slopes.values():
                     self._last_pupil.multiply(fields, about.now, values)
                 about.now = dict(values)
-            return slopes
-        del self._slopes[: max(0, len(self._slopes) + 1 - self.keep)]
+            return slopes, error
+        del self._slopes[: max(0, len(self._slopes) + 1 - keep)]
         slopes = field_derivatives(self._coarse, downsample(opd, self._coarse.npix), values, names)
         self._slopes.append((_About(inside, dict(values), dict(values)), slopes))
-        return slopes
+        return slopes, 0.0
 
     def near(self, opd: Tensor, values: dict[str, Tensor]) -> WavefrontResponse:
         """Return the stored response for nearly the same field, or compute it.
 
         It follows changes in the last pupil, so that it is right until the next call.
         """
+        return self.reading().near(opd, values)
+
+    def response_within(
+        self, opd: Tensor, values: dict[str, Tensor], allowed: float, keep: int
+    ) -> tuple[WavefrontResponse, float]:
+        """The response for nearly the same field, and its error; see `Reading`."""
         inside = opd[self.model.entrance.lit]
-        near = self._nearest(self._kept, inside, values, _TILT)
+        near = self._nearest(self._kept, inside, values, _TILT, allowed)
         if near is not None:
-            about, response = near
+            about, response, error = near
             if self._last_pupil.change(about.now, values) > _UNSEEN:
                 response.follow(self._last_pupil, values)
                 about.now = dict(values)
-            return response
+            return response, error
         # Unknowns whose effects nearly cancel need derivatives of the same field.
         self._slopes.clear()
         # Memory is freed first, because the new response is as large as the old one.
-        del self._kept[: max(0, len(self._kept) + 1 - self.keep)]
+        del self._kept[: max(0, len(self._kept) + 1 - keep)]
         response = WavefrontResponse(
             self.model,
             self.basis,
@@ -181,7 +247,7 @@ class ResponseCache:
             self._make_room(response.size)
             response.store()
         self._kept.append((_About(inside, dict(values), dict(values)), response))
-        return response
+        return response, 0.0
 
     def _nearest(
         self,
@@ -189,13 +255,13 @@ class ResponseCache:
         opd: Tensor,
         values: dict[str, Tensor],
         tilt: float,
-    ) -> tuple[_About, _Derivatives] | None:
-        """The derivatives with the smallest error, see `_error`, if it is allowed."""
+        allowed: float,
+    ) -> tuple[_About, _Derivatives, float] | None:
+        """The derivatives with the smallest error, and it, see `_error`, if it is allowed."""
         errors = [self._error(about, opd, values, tilt) for about, _ in kept]
-        if not errors or min(errors) > self.relinearise:
+        if not errors or min(errors) > allowed:
             return None
-        self.farthest = max(self.farthest, min(errors))
-        return kept[errors.index(min(errors))]
+        return *kept[errors.index(min(errors))], min(errors)
 
     def _make_room(self, size: int) -> None:
         """Free the oldest responses until as many bytes can be stored."""

@@ -20,6 +20,7 @@ import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pyklip_diffrender.io.progress import ProgressBar
@@ -28,15 +29,16 @@ from pyklip_diffrender.refinement.companions import bright_companions, with_domi
 from pyklip_diffrender.refinement.conclusion import conclude
 from pyklip_diffrender.refinement.course import NOTHING, Course
 from pyklip_diffrender.refinement.fit_result import Refinement
-from pyklip_diffrender.refinement.mode_priors import ModePriors, count_modes_below
+from pyklip_diffrender.refinement.mode_priors import count_modes_below
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.outliers import isolated_outliers
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.settings import GaussNewton
-from pyklip_diffrender.refinement.solver import Solver
+from pyklip_diffrender.refinement.solver import Solver, StepState
 from pyklip_diffrender.refinement.status import Status
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.wavefront.bases import Basis
+from pyklip_diffrender.wavefront.priors import EvidenceUpdate
 
 __all__ = ["Annealing"]
 
@@ -110,6 +112,34 @@ _SAME_DRIFT = 0.25
 change of it that takes none."""
 
 
+@dataclass(frozen=True)
+class _Fitted:
+    """Where a fit has ended: its state, what its last step carries, and the settings it ended with.
+
+    The settings have other priors than those of the fit where the data have changed these.
+    """
+
+    state: State
+    carried: StepState
+    settings: GaussNewton
+
+
+# How the model error decreases. With the data d, the star s, and the noise sigma of a pixel, the
+# error of the star model is the fraction e of the star for which chi-squared per pixel is 1,
+#
+#     mean of (d - s)^2 / (sigma^2 + (e s)^2) = 1,
+#
+# and 0 if the noise alone explains the residual. A fit with the errors sqrt(sigma^2 + (kappa s)^2)
+# takes steps that are right where the linear model is: with kappa = e, all pixels have residuals
+# about as large as their errors, so that no bright pixel alone decides. After each step kappa is
+#
+#     kappa' = min(0.6 kappa, e / 2),
+#
+# half the error that is left, so that the next step aims at explaining more than the last one did,
+# and at most `_ANNEALING` times the last kappa, so that it ends even where e no longer decreases.
+# A kappa below `_NEGLIGIBLE` is 0 (or `min_model_error`): the noise is then the photons' own.
+
+
 class Annealing:
     """One fit with a given basis.
 
@@ -134,17 +164,16 @@ class Annealing:
         progress: bool,
     ) -> None:
         self.settings, self.basis, self.progress = settings, basis, progress
-        self._stated = settings
         self.problems = list(problems)
         self.solver = Solver(problems, settings, basis, progress)
         self.objective = self.solver.objective
         self._few_modes = count_modes_below(basis, _FEW_CYCLES)
-        unknowns = self.solver.first_unknowns()
+        self._first = StepState(self.solver.priors_of(settings))
+        unknowns = self.solver.first_unknowns(self._first.priors)
         self._begin = self.objective.at(
             unknowns, unknowns.initial() if warm is None else unknowns.warm(warm)
         )
         self._is_warm = warm is not None
-        self._first_scales = self.solver.priors.scales
         self.history: list[dict[str, Any]] = []
 
     def run(self) -> Refinement:
@@ -156,39 +185,50 @@ class Annealing:
                 gain = self._step(course)
                 bar.update(chi2=course.chi2)
                 if self._is_warm and len(self.history) == _EARLY:
-                    self._measure_drift(course.state)
+                    end, _ = self._with_drift_of(self._end_of(course))
+                    course.carried, course.settings = end.carried, end.settings
                 converged = (self._anneal if course.modes else self._align)(course, gain)
-        state, status = self._finish(course.best, converged)
+        end, status = self._finish(replace(self._end_of(course), state=course.best), converged)
         return conclude(
             self.solver,
-            self.settings,
-            state,
-            self._unexplained(state),
+            end.settings,
+            end.carried.priors,
+            end.state,
+            self._unexplained(end.state),
             status,
             history=self.history,
             seconds=time.perf_counter() - began,
         )
 
+    @staticmethod
+    def _end_of(course: Course) -> _Fitted:
+        """The present end of a fit, if it were to end."""
+        return _Fitted(course.state, course.carried, course.settings)
+
     def _beginning(self) -> Course:
         """Where the schedule begins: a fit that continues another one has all its unknowns."""
-        settings, state = self.settings, self._with_dominant(self._begin)
+        settings = self.settings
+        state, carried = self._with_dominant(self._begin, self._first)
         kappa = max(self.objective.model_error(state), settings.min_model_error)
         if self._is_warm and settings.min_model_error:
             # A larger one would lead away from the solution, and back.
             kappa = settings.min_model_error
         skips_alignment = settings.wavefront and (not settings.free or self._is_warm)
         modes = self._modes_for(kappa) if skips_alignment else 0
-        return Course(state, state, state, kappa, modes, settings.max_iterations)
+        return Course(state, state, state, carried, settings, kappa, modes, settings.max_iterations)
 
     def _step(self, course: Course) -> float:
         """Take a step; return the decrease of the penalised chi-squared per pixel."""
         course.remaining -= 1
-        course.state, gain = self.solver.step(course.state, course.kappa, course.modes)
+        course.state, gain, course.carried = self.solver.step(
+            course.state, course.carried, course.kappa, course.modes
+        )
         course.error = self.objective.model_error(course.state)
         course.chi2 = self.objective.chi2_per_pixel(course.state)
         if (course.error, course.chi2) < course.least:
             course.best, course.least = course.state, (course.error, course.chi2)
-        self._record(course.kappa, course.modes, course.chi2, course.error, gain)
+        damping = course.carried.damping
+        self._record(course.kappa, course.modes, course.chi2, course.error, gain, damping)
         return gain
 
     def _align(self, course: Course, gain: float) -> bool:
@@ -202,7 +242,7 @@ class Annealing:
         if gain < _ALIGNED and self.settings.wavefront:
             course.aligned, course.modes = course.state, self._modes_for(course.kappa)
             # The damping of the alignment does not apply to the wavefront.
-            self.solver.damping = 0.0
+            course.carried = course.carried.without_damping()
             return False
         return gain < self.settings.tolerance
 
@@ -234,13 +274,16 @@ class Annealing:
         is_close = course.error < _NEAR
         course.state = self._with_companions(course.state if is_close else course.aligned, added)
         course.least, course.remaining = NOTHING, self.settings.max_iterations
-        course.may_drop, self.solver.damping = False, 0.0
+        course.may_drop, course.carried = False, course.carried.without_damping()
         if is_close:
             # Images are less linear in positions than in the wavefront, and steps of these few
             # unknowns are cheap.
-            course.state = self._settled(course.state, _COMPANION_STEPS, modes=0)
+            course.state, course.carried = self._settled(
+                course.state, course.carried, _COMPANION_STEPS, modes=0
+            )
         else:
-            self.solver.priors.scales = self._first_scales
+            priors = replace(course.carried.priors, scales=self._first.priors.scales)
+            course.carried = replace(course.carried, priors=priors)
             course.modes = 0
             floor = self.settings.min_model_error
             course.kappa = max(self.objective.model_error(course.state), floor)
@@ -254,7 +297,7 @@ class Annealing:
         is_close = course.error <= max(_NEAR, self.settings.min_model_error)
         if not (course.may_drop and is_close):
             return False
-        snr = self.solver.companion_snr(course.state)
+        snr = self.solver.companion_snr(course.state, course.carried.priors)
         faint = snr < _FAINT
         faint[: len(self._begin.unknowns.frames[0].companions)] = False
         if not bool(faint.any()):
@@ -265,86 +308,101 @@ class Annealing:
         course.least = NOTHING
         return True
 
-    def _finish(self, best: State, converged: bool) -> tuple[State, Status]:
+    def _finish(self, best: _Fitted, converged: bool) -> tuple[_Fitted, Status]:
         """Correct what the residual of the best iterate shows to be wrong."""
         best = self._without_outliers(best)
-        if converged:
-            best = self._with_measured_drift(best)
         if converged and self.settings.widen_prior:
             best = self._with_wider_prior(best)
-        if best.flux <= 0:
+        if converged:
+            best = self._with_measured_drift(best)
+        if best.state.flux <= 0:
             return best, Status.DIVERGED
         if not converged:
             return best, Status.ITERATION_LIMIT
-        explained = self.objective.chi2_per_pixel(best) < _EXPLAINED
+        explained = self.objective.chi2_per_pixel(best.state) < _EXPLAINED
         return best, Status.CONVERGED if explained else Status.MODEL_MISMATCH
 
-    def _without_outliers(self, state: State) -> State:
+    def _without_outliers(self, end: _Fitted) -> _Fitted:
         """Leave out bad pixels that stand alone, and go on without them."""
         for _ in range(_ROUNDS):
-            if not self._leave_out_outliers(state):
+            if not self._leave_out_outliers(end):
                 break
-            state = self._settled(state, _STEPS)
-        return state
+            end = self._gone_on(end, _STEPS)
+        return end
 
-    def _with_measured_drift(self, state: State) -> State:
-        """Give the drift between frames the size that maximises the evidence, and go on with it."""
-        if not self._unexplained(state) and self._measure_drift(state):
-            state = self._settled(state, _DRIFT_STEPS)
-        return state
-
-    def _measure_drift(self, state: State) -> bool:
-        """Set the size of the drift to that of the highest evidence; False if it hardly changes."""
-        if not self.solver.priors.drift:
-            return False
-        self.solver.linear_model(state, 0.0, self._all_modes, math.inf, final=False)
-        ratios = self.solver.priors.ratios(self.solver.posterior(state))
-        changed = self.settings.with_drift_scales(ratios, self._stated)
-        if changed == self.settings:
-            return False
-        _log.info("the drift between frames is %s times the stated one", ratios)
-        before = self.solver.priors.scales
-        self.settings = changed
-        self.solver.priors = ModePriors.of(
-            changed, self.basis, [each.observation for each in self.problems]
-        )
-        change = (self.solver.priors.scales / before).log().abs().max()
-        return float(change) > _SAME_DRIFT
-
-    def _with_wider_prior(self, state: State) -> State:
+    def _with_wider_prior(self, end: _Fitted) -> _Fitted:
         """Raise the scales of a prior that is too narrow, and go on with them."""
         for _ in range(_WIDENINGS):
-            if self.objective.chi2_per_pixel(state) >= _EXPLAINED:
+            if self.objective.chi2_per_pixel(end.state) >= _EXPLAINED:
                 break
-            self.solver.linear_model(state, 0.0, self._all_modes, math.inf, final=False)
-            ratios = self.solver.priors.ratios_if_fixed(self.solver.posterior(state), self.settings)
-            if not self.solver.priors.are_improbable(ratios):
+            priors = end.carried.priors
+            ratios = priors.ratios_if_fixed(self._posterior(end), end.settings)
+            if not priors.are_improbable(ratios):
                 break
             _log.info("the wavefront is improbable under its prior, by factors %s", ratios)
-            self.settings = self.settings.with_wider_priors(ratios)
-            self.solver.priors = ModePriors.of(
-                self.settings, self.basis, [each.observation for each in self.problems]
-            )
-            state = self._without_outliers(self._settled(state, self.settings.max_iterations))
-        return state
+            end = self._with_settings(end, end.settings.with_wider_priors(ratios))
+            end = self._without_outliers(self._gone_on(end, self.settings.max_iterations))
+        return end
 
-    def _settled(self, state: State, steps: int, modes: int | None = None) -> State:
+    def _with_measured_drift(self, end: _Fitted) -> _Fitted:
+        """Give the drift between frames the size that maximises the evidence, and go on with it."""
+        if self._unexplained(end.state):
+            return end
+        end, is_other = self._with_drift_of(end)
+        return self._gone_on(end, _DRIFT_STEPS) if is_other else end
+
+    def _with_drift_of(self, end: _Fitted) -> tuple[_Fitted, bool]:
+        """Set the size of the drift to that of the highest evidence; False if it hardly changes."""
+        before = end.carried.priors
+        if not before.drift:
+            return end, False
+        ratios = before.ratios(self._posterior(end))
+        changed = end.settings.with_drift_scales(ratios, self.settings)
+        if changed == end.settings:
+            return end, False
+        _log.info("the drift between frames is %s times the stated one", ratios)
+        end = self._with_settings(end, changed)
+        change = (end.carried.priors.scales / before.scales).log().abs().max()
+        return end, float(change) > _SAME_DRIFT
+
+    def _posterior(self, end: _Fitted) -> EvidenceUpdate:
+        """Errors of all unknowns, with the weights of all pixels and no model error."""
+        priors = end.carried.priors
+        self.solver.linear_model(end.state, priors, 0.0, self._all_modes, math.inf, final=False)
+        return self.solver.posterior(end.state, priors)
+
+    def _with_settings(self, end: _Fitted, settings: GaussNewton) -> _Fitted:
+        """The same state with other settings, and the priors that these state."""
+        carried = replace(end.carried, priors=self.solver.priors_of(settings))
+        return replace(end, carried=carried, settings=settings)
+
+    def _gone_on(self, end: _Fitted, steps: int) -> _Fitted:
+        """Take more steps of all unknowns, see `_settled`."""
+        state, carried = self._settled(end.state, end.carried, steps)
+        return replace(end, state=state, carried=carried)
+
+    def _settled(
+        self, state: State, carried: StepState, steps: int, modes: int | None = None
+    ) -> tuple[State, StepState]:
         """Take steps, by default of all modes, until they gain little."""
         modes = self._all_modes if modes is None else modes
         kappa = max(self._unexplained(state), self.settings.min_model_error)
         for _ in range(steps):
-            state, gain = self.solver.step(state, kappa, modes)
+            state, gain, carried = self.solver.step(state, carried, kappa, modes)
             error, chi2 = self.objective.model_error(state), self.objective.chi2_per_pixel(state)
-            self._record(kappa, modes, chi2, error, gain)
+            self._record(kappa, modes, chi2, error, gain, carried.damping)
             if gain < self.settings.tolerance:
                 break
-        return state
+        return state, carried
 
-    def _leave_out_outliers(self, state: State) -> bool:
+    def _leave_out_outliers(self, end: _Fitted) -> bool:
         """Leave out bad pixels that stand alone; False if there are none."""
+        state, priors = end.state, end.carried.priors
         for k in range(_SEARCHES):
             kappa = self._unexplained(state)
-            linear = self.solver.linear_model(state, kappa, self._all_modes, math.inf, final=False)
+            linear = self.solver.linear_model(
+                state, priors, kappa, self._all_modes, math.inf, final=False
+            )
             outliers = isolated_outliers(self.objective, state, linear)
             del linear  # The next one is as large.
             if not any(bool(each.any()) for each in outliers):
@@ -361,7 +419,9 @@ class Annealing:
         explained = self.objective.chi2_per_pixel(state) < _EXPLAINED
         return 0.0 if explained else self.objective.model_error(state)
 
-    def _record(self, kappa: float, modes: int, chi2: float, error: float, gain: float) -> None:
+    def _record(
+        self, kappa: float, modes: int, chi2: float, error: float, gain: float, damping: float
+    ) -> None:
         record = {
             "iteration": len(self.history),
             "wavefront": modes > 0,
@@ -369,19 +429,19 @@ class Annealing:
             "chi2_per_pixel": chi2,
             "model_error": error,
             "gain": gain,
-            "damping": self.solver.damping,
+            "damping": damping,
         }
         self.history.append(record)
         _log.debug(
             "step %d: chi2 %.4g per pixel, model error %.2g %% of the star, gain %.2g"
             ", damping %.2g",
-            record["iteration"], chi2, 100 * error, gain, self.solver.damping,
+            record["iteration"], chi2, 100 * error, gain, damping,
         )  # fmt: skip
 
     def _modes_for(self, kappa: float) -> int:
         """Number of leading modes to fit while the model error is kappa."""
         joint_fit = len(self.problems) > 1
-        amplitude = len(self.solver.priors.amplitude) > 0
+        amplitude = len(self._first.priors.amplitude) > 0
         coarse = self.settings.coarse_first and not joint_fit and not amplitude
         fine = kappa <= max(_COARSE, self.settings.min_model_error)
         return self._few_modes if coarse and not fine else len(self.basis)
@@ -400,7 +460,7 @@ class Annealing:
             self.objective, course.state, course.kappa, most=most, threshold=threshold
         )
 
-    def _with_dominant(self, state: State) -> State:
+    def _with_dominant(self, state: State, carried: StepState) -> tuple[State, StepState]:
         """Add a companion that outshines what the mask leaves of the star, if there is one.
 
         Without it the star's flux would follow the companion's light.
@@ -408,15 +468,15 @@ class Annealing:
         error = self.objective.model_error(state)
         is_fixed = self._is_warm or not self.settings.companions_if_stalled
         if error < _OUTSHONE or is_fixed:
-            return state
+            return state, carried
         trial = with_dominant(self.objective, state, error)
         if trial is not state:
-            trial = self._settled(trial, _COMPANION_STEPS, modes=0)
-            self.solver.damping = 0.0
+            trial, carried = self._settled(trial, carried, _COMPANION_STEPS, modes=0)
+            carried = carried.without_damping()
         if self.objective.model_error(trial) > error / 2:
-            return state
+            return state, carried
         _log.info("a source outshines the star, and is fitted with it")
-        return trial
+        return trial, carried
 
     def _stalling(self, course: Course) -> list[Planet]:
         """A companion in the residual of a fit of the wavefront that stalled.

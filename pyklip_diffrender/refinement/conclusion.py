@@ -7,6 +7,7 @@ from typing import Any
 
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.frame_fit import FrameFit
+from pyklip_diffrender.refinement.mode_priors import ModePriors
 from pyklip_diffrender.refinement.objective import State
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.solver import Solver
@@ -18,6 +19,7 @@ __all__ = ["conclude"]
 def conclude(
     solver: Solver,
     settings: GaussNewton,
+    priors: ModePriors,
     state: State,
     kappa: float,
     status: Status,
@@ -30,6 +32,8 @@ def conclude(
     solver : Solver
     settings : GaussNewton
         With the prior of the final state.
+    priors : ModePriors
+        With the scales of the final state.
     state : State
     kappa : float
         Error of the star model that errors include, as a fraction of the star.
@@ -42,11 +46,11 @@ def conclude(
     # Robust weights take a source that is not in the model for an outlier, and a tenth of the light
     # of one of S/N 7 with it.
     robust = solver.objective.robust if kappa else math.inf
-    linear = solver.linear_model(state, kappa, modes, robust)
-    update = solver.posterior(state)
+    linear = solver.linear_model(state, priors, kappa, modes, robust)
+    update = solver.posterior(state, priors)
     assert update.variance is not None
     deviation = update.variance.sqrt()
-    priors, ratios = solver.priors, solver.priors.ratios_if_fixed(update, settings)
+    ratios = priors.ratios_if_fixed(update, settings)
     if status is Status.CONVERGED and priors.are_improbable(ratios):
         status = Status.PRIOR_MISMATCH
     frames = []

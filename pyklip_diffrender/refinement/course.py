@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 
 from pyklip_diffrender.refinement.objective import State
+from pyklip_diffrender.refinement.settings import GaussNewton
+from pyklip_diffrender.refinement.solver import StepState
 
 __all__ = ["NOTHING", "Course"]
 
@@ -21,6 +23,10 @@ class Course:
     ----------
     state, best, aligned : State
         The present one, the one of the least model error, and the one that ended the alignment.
+    carried : StepState
+        What the last step hands on to the next one.
+    settings : GaussNewton
+        Those of the fit, with the size of the drift between frames once it is measured.
     kappa : float
         Assumed error of the star model, as a fraction of the star.
     modes : int
@@ -39,6 +45,8 @@ class Course:
     state: State
     best: State
     aligned: State
+    carried: StepState
+    settings: GaussNewton
     kappa: float
     modes: int
     remaining: int

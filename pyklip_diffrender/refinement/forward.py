@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pyklip_diffrender.linear.mode_fields import NANOMETRE
 from pyklip_diffrender.linear.response import coarse_copy, downsample
-from pyklip_diffrender.linear.response_cache import ResponseCache
+from pyklip_diffrender.linear.response_cache import Reading, ResponseCache
 from pyklip_diffrender.optics.grid import PupilGrid
 from pyklip_diffrender.refinement.problem import Problem
 from pyklip_diffrender.refinement.unknowns import FrameUnknowns
@@ -147,13 +147,16 @@ class Forward:
         star = values.get("star_offset", torch.zeros(2, dtype=torch.float64))
         return {**values, "star_offset": star + offset.to(star.device)}
 
-    def jacobian(self, point: Point, modes: int, kappa: float = 0.0) -> Tensor:
+    def jacobian(
+        self, point: Point, modes: int, kappa: float = 0.0, reading: Reading | None = None
+    ) -> Tensor:
         """Derivative of `total`, (unknowns, ny, nx), float32, on the CPU.
 
         Up to the first `modes` modes; with 0 only what comes before amplitude and wavefront. The
         light of companions that are faint, or that an error `kappa` of the star model outweighs,
-        counts as independent of optics and wavefront.
+        counts as independent of optics and wavefront. `reading` takes the derivatives of the field.
         """
+        reading = self.responses.reading() if reading is None else reading
         unknowns, bright = point.unknowns, point.unknowns.bright_sources(point.vector, kappa)
         levels = self.levels(point, bright)
         count = unknowns.where("companions").stop
@@ -165,7 +168,7 @@ class Forward:
         rows[first : first + len(levels)] = levels
         rows[:first], rows[unknowns.where("companions").stop :] = 0.0, 0.0
         for light in self._lights(point, bright):
-            self._add_slopes(rows, point, *light, modes)
+            self._add_slopes(rows, point, *light, modes, reading)
         return rows
 
     def _lights(
@@ -189,12 +192,13 @@ class Forward:
         values: dict[str, Tensor],
         level: Tensor,
         modes: int,
+        reading: Reading,
     ) -> None:
         """Add the derivatives of one source by optical parameters, amplitude and wavefront."""
         unknowns = point.unknowns
-        response = self.responses.near(point.opd, values) if modes else None
+        response = reading.near(point.opd, values) if modes else None
         if unknowns.optical:
-            slopes = self.responses.parameters(point.opd, values, unknowns.optical, fields)
+            slopes = reading.parameters(point.opd, values, unknowns.optical, fields)
             rows[: len(slopes)] += (level * slopes).cpu()
         if response is not None:
             amplitude = unknowns.where("amplitude")

@@ -65,7 +65,7 @@ def count_modes_below(basis: Basis, cycles: float) -> int:
     return int(beyond[0]) if len(beyond) else len(basis)
 
 
-@dataclass
+@dataclass(frozen=True)
 class ModePriors:
     """Gaussian priors about zero.
 
@@ -85,7 +85,7 @@ class ModePriors:
     names : tuple of str
         Names of the groups.
     scales : Tensor, (groups,)
-        nm. Every step of a fit updates them unless they are fixed.
+        nm. A step of a fit returns others unless they are fixed.
     """
 
     amplitude: Tensor

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pyklip_diffrender.linear.frames import LinearFrame, pixel_pieces
 from pyklip_diffrender.linear.noise import summed_rows
+from pyklip_diffrender.linear.response_cache import Reading
 from pyklip_diffrender.refinement.objective import Objective, State
 
 __all__ = ["NormalEquations", "linearise"]
@@ -37,6 +38,11 @@ class NormalEquations:
     frames : tuple of LinearFrame
     bright_companions : int
         Number of companions, over all frames, that count in the Jacobians.
+    error : float
+        Largest error of the derivatives, as that of a `Reading`.
+    has_weights : bool
+        Whether curvature and gradient have the present weights of the pixels. If not, only the
+        Jacobians can be used again, and the curvature to precondition.
     """
 
     state: State
@@ -47,6 +53,8 @@ class NormalEquations:
     current: Tensor
     frames: tuple[LinearFrame, ...]
     bright_companions: int
+    error: float = 0.0
+    has_weights: bool = True
 
 
 def _accumulate(jacobian: Tensor, weight: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -78,6 +86,7 @@ def linearise(
     robust: float,
     jacobians: Sequence[Tensor] = (),
     outweighing: float = 0.0,
+    reading: Reading | None = None,
 ) -> NormalEquations:
     """Linearise all frames about a state.
 
@@ -97,6 +106,8 @@ def linearise(
     outweighing : float
         Error of the star model, as a fraction of the star, that decides which companions count in
         the Jacobians, see `brightest`.
+    reading : Reading, optional
+        Takes the derivatives of the field, where the Jacobians are not known.
     """
     size = state.unknowns.with_modes(modes)
     current = (state.vector - state.unknowns.initial())[:size]
@@ -110,7 +121,9 @@ def linearise(
         residual, weight, common = (
             each.cpu() for each in (residuals[k], noise.weight[k], noise.common[k])
         )
-        rendered = jacobians[k] if jacobians else forward.jacobian(point, modes, outweighing)
+        rendered = (
+            jacobians[k] if jacobians else forward.jacobian(point, modes, outweighing, reading)
+        )
         part = state.unknowns.rows[k]
         rows, first = part.rows[: len(rendered)], part.first_mode
         drift = part.drift if modes else part.drift[:, :0]
@@ -134,5 +147,5 @@ def linearise(
     gradient = gradient + curvature @ current
     return NormalEquations(
         state, kappa, robust, curvature, gradient, current, tuple(frames),
-        state.bright_companions(outweighing),
+        state.bright_companions(outweighing), 0.0 if reading is None else reading.farthest,
     )  # fmt: skip
