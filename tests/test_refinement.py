@@ -120,7 +120,6 @@ def quick(
     case: Case,
     observation: Observation | None = None,
     start: Mapping[str, object] | None = None,
-    seed: int = 0,
     **changes: object,
 ) -> Refinement:
     return refine(
@@ -129,7 +128,6 @@ def quick(
         case.opd,
         settings=few(**changes),
         start=start,
-        seed=seed,
     )
 
 
