@@ -357,7 +357,7 @@ def test_a_dry_run_lists_frames_map_and_steps_and_writes_nothing(
     sensed = "opd_2022-07-31.fits, sensed 2022-07-31T00:00, 0.9 days after the frames"
     assert f"wavefront map: {sensed}" in lines
     steps = [line for line in lines if line[:3] in ("1. ", "2. ", "3. ", "4. ")]
-    assert ["star" in steps[0], "wavefront" in steps[1], "search" in steps[2]] == [True] * 3
+    assert ["wavefront" in steps[0], "star" in steps[1], "search" in steps[2]] == [True] * 3
     assert "GB of memory" in lines[-1]
     assert not products.exists()
     # Which is which follows from the option, too.
@@ -432,18 +432,20 @@ def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
 
     sequence = Sequence.from_files(frames).cutout(8)
     names = list(steps(sequence))
-    assert names == ["reference star HIP-2", "wavefront", "search", "products"]
+    assert names == ["wavefront", "reference stars and target together", "search", "products"]
+    for_pattern = steps(sequence, references="pattern")
+    assert list(for_pattern) == ["reference star HIP-2", "wavefront", "search", "products"]
     alone = steps(replace(sequence, references=()))
     assert len(alone) == len(names) - 1
     twice = replace(sequence, science=sequence.science * 2)
-    both = steps(twice, systematics="off")
+    both = steps(twice, systematics="off", references="off")
     assert both["search"] == 2 * alone["search"]
     one, two = alone["wavefront"], both["wavefront"]
     assert one < two < 2 * one
-    more = steps(twice, systematics="off", disk=True)
+    more = steps(twice, systematics="off", disk=True, references="off")
     assert more.items() > both.items()
     assert more["extended light, and wavefront without it"] > one
-    eight = steps(twice, systematics="off", injections=8)
+    eight = steps(twice, systematics="off", injections=8, references="off")
     assert eight["8 injected planets"] == 2 * sum(list(both.values())[:2])
     both_kinds = steps(twice, systematics="off", injections=8, disk=True)
     longer = both_kinds["8 injected planets"] - eight["8 injected planets"]

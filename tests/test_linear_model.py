@@ -29,7 +29,7 @@ def frame(k: int, rows: list[int], drift: list[int], first_mode: int) -> LinearF
         weight=weight,
         jacobian=random(len(rows), NY, NX, seed=30 + k).float(),
         rows=torch.tensor(rows),
-        drift=torch.tensor(drift, dtype=torch.int64),
+        drift=torch.tensor([drift], dtype=torch.int64),
         first_mode=first_mode,
         common=torch.zeros(NY, NX, dtype=torch.float64),
     )
@@ -44,7 +44,7 @@ def dense(model: LinearModel) -> tuple[Tensor, Tensor, Tensor]:
         white = (part.jacobian.double() * part.weight).flatten(1)
         for row, unknown in enumerate(part.rows.tolist()):
             jacobian[unknown] += white[row]
-        for k, unknown in enumerate(part.drift.tolist()):
+        for k, unknown in enumerate(part.drift[0].tolist()):
             jacobian[unknown] += white[part.first_mode + k]
         columns.append(jacobian)
         data.append((part.weight * part.residual).flatten())
@@ -261,7 +261,7 @@ def test_unknowns_can_be_taken_out_and_their_light_put_back(pair: LinearModel) -
     assert len(less.unknowns) == len(pair.unknowns) - 1
     first = less.frames[0]
     assert first.rows.tolist() == [0, 2, 3, 4]
-    assert first.drift.tolist() == [5, 6]
+    assert first.drift.tolist() == [[5, 6]]
     assert first.first_mode == 2
     seen = first.weight > 0
     added = (first.residual - pair.frames[0].residual)[seen]

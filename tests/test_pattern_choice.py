@@ -199,7 +199,7 @@ def test_pyklip_chooses_as_a_reduction_does(
     else:
         result = subtract_by_refinement(star, OPD, settings, tell=told.append)
     assert result.systematics == label
-    refuted = "the frames do not show the pattern of the library" in told
+    refuted = any("without the library's flat-field pattern" in each for each in told)
     assert refuted == (bool(cards) and shown == 0)
 
 

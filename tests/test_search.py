@@ -64,9 +64,8 @@ def test_a_dismissed_peak_is_not_taken_again(monkeypatch: pytest.MonkeyPatch) ->
         frames=(SimpleNamespace(observation=observation),),
         model=SimpleNamespace(resolution=0.14),
     )
-    candidates, factor, _ = search._search(
-        maps, [fit], Candidates.at(np.zeros((0, 2)), []), 5.0, 0.2, 1.0
-    )
+    peaks = search._PeakSearch(maps, [fit], 5.0, 0.2, 1.0)
+    candidates, factor, _ = peaks.run(Candidates.at(np.zeros((0, 2)), []))
     assert factor.typical == 1.0
     assert sorted(candidates.contrasts.tolist()) == [6.0, 8.0]
     # Three peaks are fitted and one is dismissed; each needs one fit.
