@@ -24,17 +24,19 @@ Rows = Sequence[tuple[Job, Record | None]]
 
 _GIB = 2.0**30
 
+_NAMES = 3
+"""Most sequences that the title names."""
 
-def page(rows: Rows, name: str) -> str:
+
+def page(rows: Rows) -> str:
     """The page, with every value escaped: headers of files may hold anything.
 
     Parameters
     ----------
     rows : sequence of (Job, dict or None)
         Jobs with their records; None for one that waits.
-    name : str
-        Of the survey.
     """
+    name = _title(rows)
     sections = [
         html.section("Contrast", _limits(rows)),
         html.section("Candidates", _candidates(rows)),
@@ -71,7 +73,15 @@ def page(rows: Rows, name: str) -> str:
         f'<div class="status {tone}"><strong>{escape(", ".join(parts))}.</strong>'
         f"<p>{advice}</p></div>\n{html.facts(facts)}\n</header>\n"
     )
-    return html.document(f"{name}: survey", header, sections)
+    return html.document(name, header, sections)
+
+
+def _title(rows: Rows) -> str:
+    """What the survey is of: its sequences, or the first of them and their number."""
+    names = list(dict.fromkeys(job.name for job, _ in rows))
+    if len(names) > _NAMES:
+        return f"Survey of {names[0]} and {len(names) - 1} more sequences"
+    return f"Survey of {', '.join(names)}"
 
 
 def _finished(rows: Rows, *, injected: bool = False) -> list[tuple[Job, Record]]:
@@ -208,7 +218,7 @@ def _jobs(rows: Rows) -> str:
                 _report(job, _label(job)) if _status(record) == "finished" else _label(job),
                 result.get("filter") or job.filter or "",
                 _status(record),
-                (result.get("fit_status") or "").lower().replace("_", " "),
+                result.get("fit_status") or "",
                 number(result["reduced_chi2"]) if "reduced_chi2" in result else "",
                 "" if candidates is None else str(len(candidates)),
                 _time(known["seconds"]) if "seconds" in known else "",
@@ -242,7 +252,7 @@ def _label(job: Job) -> str:
 
 
 def _report(job: Job, label: str | None = None) -> html.Markup:
-    return html.link(f"jobs/{job.key}/report.html", label or job.name)
+    return html.link(f"jobs/{job.folder}/report.html", label or job.name)
 
 
 def _time(seconds: float) -> str:
