@@ -144,7 +144,9 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
     ]
     with breakdown_explained(problems[0].observation.name):
         again = fit_in_stages(problems, settings, warm, seed=fit.seed, progress=progress)
-    return replace(again, catalogue_error=fit.catalogue_error)
+    return replace(
+        again, catalogue_error=fit.catalogue_error, catalogue_flux=fit.catalogue_flux
+    )
 
 
 def join_frames(
