@@ -79,7 +79,7 @@ class Subtraction:
     fits : tuple of Fit
         At least one; together they cover all frames.
     systematics : str
-        Origin of the flat-field pattern that was used, see `PatternChoice.label`.
+        Name of the flat-field pattern that was used.
     references : int
         Number of frames of reference stars that were used.
     pointings : tuple of FittedPointing
@@ -99,6 +99,13 @@ class Subtraction:
     pointings: tuple[FittedPointing, ...] = ()
     error_factor: ErrorFactor | None = None
     disk: Disk | None = None
+
+    def __repr__(self) -> str:
+        fits = "; ".join(f"{fit.status}, chi2/pixel {fit.chi2:.3g}" for fit in self.fits)
+        return (
+            f"<Subtraction: {_counted(len(self.star), 'frame')}, {self.method}, {fits}, flat-field "
+            f"pattern {self.systematics}>"
+        )
 
     @property
     def worst(self) -> Fit:
@@ -219,13 +226,13 @@ def subtract_by_refinement(
         fitted.append(FittedPointing(result, k, group, window, away))
         star[group.frames] = fitted[-1].star()
     frames = np.sort(np.concatenate([group.frames for group in groups]))
-    status = result.status.name.lower()
+    status = result.status.name
     return Subtraction(
         star,
         result.method,
         _seed_of(settings),
         (Fit(tuple(map(int, frames)), status, float(result.chi2_per_pixel), result),),
-        choice.label,
+        "none" if choice.systematics is None else choice.systematics.name,
         choice.reference_frames,
         tuple(fitted),
         error_factor,
@@ -295,7 +302,7 @@ def _seed_of(settings: DiffrenderSettings) -> int:
 
 def _described(result: Refinement) -> str:
     """How a fit ended, in a few words."""
-    return f"{result.status.name.lower()}, chi2 per pixel {result.chi2_per_pixel:.3g}"
+    return f"{result.status.name}, chi2 per pixel {result.chi2_per_pixel:.3g}"
 
 
 def _counted(number: int, noun: str) -> str:

@@ -26,7 +26,7 @@ _HEADER = Template("""\
 $pictures
 <p class="result">$sentence</p>
 <div class="status $tone">
-<strong>$status</strong>
+<strong>$name</strong>: $status
 <p>$advice</p>
 </div>
 $facts
@@ -67,7 +67,6 @@ def page(
         Every value in it is escaped: headers of files may hold anything.
     """
     status = summary["status"]
-    message = status["message"]
     tone = "good" if status["name"] == "CONVERGED" else "warn" if status["usable"] else "bad"
     sections = [
         html.section("Candidates", _candidates(summary)),
@@ -94,7 +93,8 @@ def page(
         # Numbers are not broken over lines.
         "sentence": re.sub(" ([±×]) ", "\u00a0\\1\u00a0", summary["sentence"]),
         "tone": tone,
-        "status": message[:1].upper() + message[1:] + ("" if message.endswith(".") else "."),
+        "name": status["name"],
+        "status": f"{status['message']}.",
         "advice": status["advice"],
     }
     header = _HEADER.substitute(
@@ -146,7 +146,7 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     flux = []
     if star is not None:
         value = plus_minus(star["flux_density_Jy"], star["flux_density_error_Jy"])
-        source = "as assumed" if star["source"] == "star_flux" else "from its diffracted light"
+        source = "as stated" if star["source"] == "star_flux" else "from its diffracted light"
         flux = [("Flux density of the star", f"{value} Jy, {source}")]
     return [
         ("Reduced chi-squared without model error", number(fit["reduced_chi2"])),
