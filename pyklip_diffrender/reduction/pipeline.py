@@ -145,8 +145,9 @@ def prepare(sequence: Sequence, opd: Any, options: ReduceOptions) -> Preparation
         )
     if options.wide:
         require_outer_pixels(sequence.science[0], options.size)
+    cut = sequence.cutout(options.size)
     model = model_for(sequence.science[0], options.size, device=options.device)
-    return Preparation(sequence, sequence.cutout(options.size), model, wavefront, options)
+    return Preparation(sequence, cut, model, wavefront, options)
 
 
 @dataclass(frozen=True, eq=False)

@@ -214,7 +214,9 @@ def join_frames(
         problems.append(Problem(fit.model, aligned.observation, fit.initial, start, systematics))
     with breakdown_explained(problems[0].observation.name):
         joined = fit_in_stages(problems, settings, warm, seed=fit.seed, progress=progress)
-    return replace(joined, catalogue_error=fit.catalogue_error)
+    return replace(
+        joined, catalogue_error=fit.catalogue_error, catalogue_flux=fit.catalogue_flux
+    )
 
 
 def _aligned(

@@ -6,8 +6,10 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from astropy import units as u
 
 from pyklip_diffrender.errors import DiffrenderError, NoValidPixelsError
 from pyklip_diffrender.io.files import open_fits
@@ -19,6 +21,11 @@ from pyklip_diffrender.scene.observation import Observation
 __all__ = ["FrameFile", "admissible", "exclude_unusable", "exposures_in", "require_some"]
 
 _SUFFIXES = (".fits", ".fits.gz")
+
+_SENSED = "RESULT_PHASE"
+"""Extension of wavefront-sensing files of MAST."""
+
+_MAP = "it is a wavefront map, no frame of a star; wavefront maps are chosen with opd (--opd)"
 
 _USABLE = ("calints", "crfints", "cal", "crf", "rateints", "rate")
 """Levels of frames that are still those of the detector, the best first."""
@@ -125,12 +132,22 @@ def _frame_file(path: Path) -> FrameFile:
     try:
         with open_fits(path) as hdus:
             header, shape = hdus[0].header, ()
+            if "SCI" not in hdus and any(_is_map(hdu) for hdu in hdus):
+                return FrameFile(path, Exposure(path.name), reason=_MAP)
             if "SCI" in hdus:
                 header = merged_header(header, hdus["SCI"].header, path.name)
                 shape = np.shape(hdus["SCI"].data)
             return FrameFile(path, Exposure.of(header, path.name, shape))
     except DiffrenderError as error:
         return FrameFile(path, Exposure(path.name), reason=_without_name(error, path.name))
+
+
+def _is_map(hdu: Any) -> bool:
+    """Whether an HDU has a map of path differences, as wavefront sensing writes them."""
+    if hdu.name == _SENSED:
+        return True
+    unit = u.Unit(str(hdu.header.get("BUNIT", "")), parse_strict="silent")
+    return bool(hdu.is_image and unit.is_equivalent(u.m))
 
 
 def admissible(files: Iterable[FrameFile]) -> list[FrameFile]:
