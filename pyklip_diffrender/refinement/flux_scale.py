@@ -42,6 +42,9 @@ error of a good catalogue."""
 _ROUNDS = 3
 """Most fits with the flux held, of which each starts from the one before."""
 
+_TIGHTER = 10.0
+"""Factor by which the next of these fits holds the flux more tightly."""
+
 _BRIGHTNESS = u.MJy / u.sr
 
 
@@ -135,7 +138,7 @@ def with_star_flux(
     error : float
         Its relative standard deviation, which errors of contrasts then include.
     held : float
-        Relative deviation from it that the fit allows.
+        Relative deviation from it that the first fit allows.
     progress : bool
         Show progress bars.
 
@@ -146,21 +149,20 @@ def with_star_flux(
     """
     for frame in fit.frames:
         require_calibrated(frame.observation)
-    aims = [star_flux / _scale(frame) for frame in fit.frames]
-    deviations = {**fit.settings.deviations, "flux": held}
     for _ in range(_ROUNDS):
         frames = [
-            replace(frame, start={**frame.start, "flux": aim})
-            for frame, aim in zip(fit.frames, aims, strict=True)
+            replace(frame, start={**frame.start, "flux": star_flux / _scale(frame)})
+            for frame in fit.frames
         ]
         known = replace(fit, frames=tuple(frames), catalogue_error=error, catalogue_flux=star_flux)
+        deviations = {**fit.settings.deviations, "flux": held}
         fit = refine_again(known, progress=progress, deviations=deviations)
-        # The light that passes the stop changes with the wavefront and the pupil's amplitude, and
-        # the frames may pull at the flux that is held.
-        ratios = [star_flux / (_scale(frame) * frame.flux) for frame in fit.frames]
-        if max(abs(ratio - 1) for ratio in ratios) < _AGREES:
+        shares = [_scale(frame) * frame.flux / star_flux for frame in fit.frames]
+        if max(abs(share - 1) for share in shares) < _AGREES:
             break
-        aims = [aim * ratio for aim, ratio in zip(aims, ratios, strict=True)]
+        # The light that passes the stop has changed with the wavefront and the pupil's amplitude,
+        # or the frames pull at the flux more than it is held.
+        held /= _TIGHTER
     return fit
 
 
