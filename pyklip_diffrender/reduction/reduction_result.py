@@ -126,7 +126,7 @@ class Reduction:
         known = "none" if self.systematics is None else f"from {self.systematics.name}"
         search = self.detection if self.wide is None else self.wide
         return (
-            f"{self.sequence!r}\n{self.fit.status.message}\n"
+            f"{self.sequence!r}\n{self.fit.status}\n"
             f"flat-field pattern: {known}\n{self._references}{search}\n{self.remark}"
         ).rstrip()
 
@@ -142,7 +142,7 @@ class Reduction:
 
     def _repr_html_(self) -> str:
         facts = {
-            "Status": self.fit.status.message,
+            "Status": str(self.fit.status),
             "Frames": f"{len(self.sequence.science)} of the target, "
             f"{len(self.sequence.references)} of reference stars",
             "Filter": self.sequence.filter,
