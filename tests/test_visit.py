@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -19,7 +20,7 @@ from pyklip_diffrender.linear.frames import FrameRows
 from pyklip_diffrender.pattern import PatternChoice, choose_systematics, pattern_for_visit
 from pyklip_diffrender.reduction import ReduceOptions, Visit
 from pyklip_diffrender.reduction.visit import rough_settings, with_references
-from pyklip_diffrender.refinement import GaussNewton, Refinement, join_frames, refine
+from pyklip_diffrender.refinement import GaussNewton, Refinement, align_frame, join_frames, refine
 from pyklip_diffrender.refinement.mode_priors import ModePriors, exposure_sequences
 from pyklip_diffrender.scene import Observation, Planet
 from pyklip_diffrender.wavefront.bases import default_basis
@@ -104,6 +105,15 @@ def joined(*references: Observation, **keywords: Any) -> tuple[Refinement, Visit
     return with_references(fit, choice, references, **keywords)[:2]
 
 
+def together(
+    fit: Refinement, references: Sequence[Observation], settings: GaussNewton
+) -> Refinement:
+    """All frames in one likelihood, with the unknown pattern of the rolls."""
+    pattern = alone()[0].systematics
+    aligned = [align_frame(fit, each, settings, systematics=pattern) for each in references]
+    return join_frames(fit, aligned, settings, systematics=pattern)
+
+
 def limit(fit: Refinement) -> float:
     curve = dr.contrast_curve(fit, [0.5, 0.7], scatter=1.0)
     return float(np.mean(curve["contrast"]))
@@ -144,7 +154,18 @@ def test_a_companion_of_a_reference_is_masked_and_named() -> None:
     assert np.nanmin(detection.residual_snr) > -5
 
 
-def test_a_reference_that_contradicts_the_target_is_left_out_by_name() -> None:
+def test_a_reference_with_another_wavefront_does_not_take_part() -> None:
+    far = reference(1, drift=4e-8)
+    fit, visit = joined(reference(0), far)
+    assert [each.use for each in visit.contributions] == ["joint", "left out"]
+    assert "is not explained" in visit.contributions[1].reason
+    assert len(fit.frames) == 3
+
+
+def test_a_reference_that_contradicts_the_target_is_left_out_by_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("pyklip_diffrender.reduction.visit._UNLIKE", np.inf)
     turned = reference(1)
     turned = replace(turned, data=turned.data[:, ::-1].copy(), name="mirrored")
     fit, visit = joined(reference(0), turned)
@@ -195,27 +216,23 @@ def test_frames_that_do_not_fit_into_the_memory_are_left_out(
 
 
 def test_bad_pixels_of_the_target_are_bad_in_the_references() -> None:
-    choice, fit = alone()
+    _, fit = alone()
     frames = list(fit.frames)
     for k, part in enumerate(frames):
         valid = part.observation.valid.copy()
         valid[:, 20, 9] = False
         frames[k] = replace(part, observation=replace(part.observation, valid=valid))
     fit = replace(fit, frames=tuple(frames))
-    joint = join_frames(
-        fit, [reference(0)], rough_settings(SETTINGS), systematics=choice.systematics
-    )
+    joint = together(fit, [reference(0)], rough_settings(SETTINGS))
     assert not joint.frames[2].observation.valid[0, 20, 9]
     assert joint.frames[2].observation.valid[0, 20, 10]
 
 
 def test_a_known_flux_of_the_target_is_not_that_of_a_reference() -> None:
-    choice, fit = alone()
+    _, fit = alone()
     frames = tuple(replace(each, start={**each.start, "flux": each.flux}) for each in fit.frames)
     settings = replace(SETTINGS, deviations={"flux": 1e-3})
-    joint = join_frames(
-        replace(fit, frames=frames), [reference(0)], settings, systematics=choice.systematics
-    )
+    joint = together(replace(fit, frames=frames), [reference(0)], settings)
     assert joint.frames[0].flux == pytest.approx(fit.frames[0].flux, rel=5e-3)
     assert joint.frames[2].flux == pytest.approx(2 * FLUX, rel=0.05)
 
@@ -223,10 +240,8 @@ def test_a_known_flux_of_the_target_is_not_that_of_a_reference() -> None:
 @pytest.mark.parametrize("other", [False, True])
 def test_only_frames_of_the_same_pixels_share_a_pattern(other: bool) -> None:
     place = (640, 1600) if other else (600, 1600)
-    choice, fit = alone()
-    joint = join_frames(
-        fit, [reference(0, first_pixel=place)], SETTINGS, systematics=choice.systematics
-    )
+    _, fit = alone()
+    joint = together(fit, [reference(0, first_pixel=place)], SETTINGS)
     shares = [bool((part.common != 0).any()) for part in joint.linear.frames]
     assert shares == [True, True, not other]
     # Where its pixels are its own, the pattern is noise of the frame.
@@ -280,12 +295,10 @@ def test_dithers_share_a_drift_and_have_one_of_their_own() -> None:
 
 @pytest.mark.parametrize(("rms", "least", "most"), [(0.2e-9, 0.0, 0.9), (5e-9, 1.5, 5.0)])
 def test_the_size_of_the_drift_is_that_of_the_frames(rms: float, least: float, most: float) -> None:
-    choice, fit = alone()
+    _, fit = alone()
     stated = WavefrontPrior({"segment": 0.6, "texture": 0.3}, knee=1.0)
     settings = replace(SETTINGS, drift=stated, dither_drift=stated, drift_cycles=6.0)
-    joint = join_frames(
-        fit, [reference(k, drift=rms) for k in range(3)], settings, systematics=choice.systematics
-    )
+    joint = together(fit, [reference(k, drift=rms) for k in range(3)], settings)
     assert least < joint.scales["texture dither"] / 0.3 < most
     assert joint.scales["texture dither"] <= 4.0001 * 0.3
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pyklip_diffrender.refinement.continuation import join_frames, refine_again
+from pyklip_diffrender.refinement.continuation import align_frame, join_frames, refine_again
 from pyklip_diffrender.refinement.fit_result import Refinement
 from pyklip_diffrender.refinement.fitting import refine
 from pyklip_diffrender.refinement.flux_scale import (
@@ -21,6 +21,7 @@ __all__ = [
     "GaussNewton",
     "Refinement",
     "Status",
+    "align_frame",
     "jansky_per_unit",
     "join_frames",
     "nircam_settings",

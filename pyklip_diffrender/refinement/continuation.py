@@ -10,7 +10,6 @@ from typing import Any
 from pyklip_diffrender.linear.frames import Unknown
 from pyklip_diffrender.refinement.annealing import Annealing
 from pyklip_diffrender.refinement.fit_result import Refinement
-from pyklip_diffrender.refinement.frame_fit import FrameFit
 from pyklip_diffrender.refinement.problem import Problem, starting_values
 from pyklip_diffrender.refinement.settings import GaussNewton
 from pyklip_diffrender.refinement.status import breakdown_explained
@@ -20,7 +19,7 @@ from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.wavefront.bases import default_basis
 from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
-__all__ = ["continue_from", "fit_in_stages", "join_frames", "refine_again"]
+__all__ = ["align_frame", "continue_from", "fit_in_stages", "join_frames", "refine_again"]
 
 _log = logging.getLogger(__name__)
 
@@ -144,84 +143,42 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
     return replace(again, catalogue_error=fit.catalogue_error, catalogue_flux=fit.catalogue_flux)
 
 
-def join_frames(
+def align_frame(
     fit: Refinement,
-    others: Sequence[Observation],
+    observation: Observation,
     settings: GaussNewton,
     *,
     systematics: Systematics | None,
-    progress: bool = False,
 ) -> Refinement:
-    """Continue a fit with more frames in its likelihood, such as those of reference stars.
+    """Fit place, flux and background of a frame with the wavefront of another fit.
 
-    The wavefront of the fit is near that of the new frames, whose stars are first aligned with it.
-    A few steps of all unknowns then take the place of a fit from the map on.
+    The Lyot stop, the blur and the internal aberrations are those of the fit, too. Pixels that are
+    bad in all its frames of the same detector pixels are left out.
 
     Parameters
     ----------
     fit : Refinement
-    others : sequence of Observation
+    observation : Observation
         Of the shape of the fitted frames.
     settings : GaussNewton
-        Those of the fit, with a prior on the drift between frames.
+        Its parameters in `own` are free.
     systematics : Systematics or None
-        Pattern of all frames.
-    progress : bool
-        Show progress bars.
+        Pattern of the frame.
 
     Raises
     ------
     IncompatibleSetupError
-        If the fit was read from a file without its linear model, and for frames that cannot share
-        a fit.
+        For a frame that cannot share a fit with those of `fit`.
     NoValidPixelsError, ShapeError
-        For new frames that do not suit the model.
+        For a frame that does not suit the model.
     """
-    require_agreement([*(frame.observation for frame in fit.frames), *others])
-    settings, reached = continue_from(replace(fit, settings=settings))
-    own = (*settings.own, "pedestal")
-    count = len(fit.frames)
-    warm = {
-        # A single frame has no unknowns of its own.
-        each._replace(frame=0) if count == 1 and each.name in own else each: value
-        for each, value in reached.items()
-    }
-    problems = [
-        Problem(frame.model, frame.observation, fit.initial, frame.start, systematics)
-        for frame in fit.frames
-    ]
-    bad = {
-        (frame.observation.first_pixel, frame.observation.shape): ~frame.observation.valid.any(
-            axis=0
-        )
-        for frame in fit.frames
-    }
-    for k, observation in enumerate(others, count):
-        # Pixels that are bad in the fitted frames are bad in all frames.
-        known = bad.get((observation.first_pixel, observation.shape))
-        if observation.first_pixel is not None and known is not None:
-            observation = replace(observation, valid=observation.valid & ~known)
-        start = starting_values(fit.model, observation, {})
-        aligned = _aligned(fit, observation, start, settings, systematics)
-        for name in own:
-            values = aligned.values.get(name, ())
-            warm |= {Unknown(name, i, k): float(value) for i, value in enumerate(values)}
-        problems.append(Problem(fit.model, aligned.observation, fit.initial, start, systematics))
-    with breakdown_explained(problems[0].observation.name):
-        joined = fit_in_stages(problems, settings, warm, progress=progress)
-    return replace(joined, catalogue_error=fit.catalogue_error, catalogue_flux=fit.catalogue_flux)
-
-
-def _aligned(
-    fit: Refinement,
-    observation: Observation,
-    start: Mapping[str, Any],
-    settings: GaussNewton,
-    systematics: Systematics | None,
-) -> FrameFit:
-    """A frame fitted with the wavefront and the shared parameters of another fit."""
     first = fit.frames[0]
-    shared = {n: v for n, v in first.values.items() if n in fit.model.parameters}
+    require_agreement([*(frame.observation for frame in fit.frames), observation])
+    for frame in fit.frames:
+        other = frame.observation
+        if None is not other.first_pixel == observation.first_pixel:
+            known = other.valid.any(axis=0)
+            observation = replace(observation, valid=observation.valid & known)
     own = tuple(name for name in settings.free if name in settings.own)
     alone = replace(
         settings,
@@ -234,9 +191,67 @@ def _aligned(
         max_companions=0,
         deviations={n: d for n, d in settings.deviations.items() if n in own},
     )
-    kept = {n: v for n, v in shared.items() if n not in own}
-    problem = Problem(
-        fit.model, observation, replace(fit.initial, data=fit.wavefront), {**kept, **start},
-        systematics,
-    )  # fmt: skip
-    return fit_in_stages([problem], alone, progress=False).frames[0]
+    shared = {
+        name: value
+        for name, value in first.values.items()
+        if name in fit.model.parameters and name not in own
+    }
+    start = starting_values(fit.model, observation, {})
+    initial = replace(fit.initial, data=fit.wavefront)
+    problem = Problem(fit.model, observation, initial, {**shared, **start}, systematics)
+    with breakdown_explained(observation.name):
+        return fit_in_stages([problem], alone, progress=False)
+
+
+def join_frames(
+    fit: Refinement,
+    others: Sequence[Refinement],
+    settings: GaussNewton,
+    *,
+    systematics: Systematics | None,
+    progress: bool = False,
+) -> Refinement:
+    """Continue a fit with more frames in its likelihood, such as those of reference stars.
+
+    The wavefront of the fit is near that of the new frames. A few steps of all unknowns then take
+    the place of a fit from the map on.
+
+    Parameters
+    ----------
+    fit : Refinement
+    others : sequence of Refinement
+        New frames, aligned with the fit, see `align_frame`.
+    settings : GaussNewton
+        Those of the fit, with a prior on the drift between frames.
+    systematics : Systematics or None
+        Pattern of all frames.
+    progress : bool
+        Show progress bars.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        If the fit was read from a file without its linear model.
+    """
+    settings, reached = continue_from(replace(fit, settings=settings))
+    own = (*settings.own, "pedestal")
+    count = len(fit.frames)
+    warm = {
+        # A single frame has no unknowns of its own.
+        each._replace(frame=0) if count == 1 and each.name in own else each: value
+        for each, value in reached.items()
+    }
+    for k, other in enumerate(others, count):
+        for name in own:
+            values = other.frames[0].values.get(name, ())
+            warm |= {Unknown(name, i, k): float(value) for i, value in enumerate(values)}
+    problems = [
+        Problem(frame.model, frame.observation, fit.initial, frame.start, systematics)
+        for frame in fit.frames
+    ]
+    for (frame,) in (other.frames for other in others):
+        start = starting_values(fit.model, frame.observation, {})
+        problems.append(Problem(fit.model, frame.observation, fit.initial, start, systematics))
+    with breakdown_explained(problems[0].observation.name):
+        joined = fit_in_stages(problems, settings, warm, progress=progress)
+    return replace(joined, catalogue_error=fit.catalogue_error, catalogue_flux=fit.catalogue_flux)
