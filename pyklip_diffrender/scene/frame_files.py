@@ -10,15 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from pyklip_diffrender.errors import DiffrenderError, NoValidPixelsError
-from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.io.files import fits_files, open_fits, unpacked_name
 from pyklip_diffrender.io.headers import merged_header
 from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["FrameFile", "admissible", "exclude_unusable", "exposures_in", "require_some"]
-
-_SUFFIXES = (".fits", ".fits.gz")
 
 _USABLE = ("calints", "crfints", "cal", "crf", "rateints", "rate")
 """Levels of frames that are still those of the detector, the best first."""
@@ -102,7 +100,7 @@ def exposures_in(
     paths: list[Path] = []
     for each in map(Path, entries):
         if each.is_dir():
-            inside = sorted(p for p in each.iterdir() if p.name.lower().endswith(_SUFFIXES))
+            inside = fits_files(each)
             if not inside:
                 raise NoValidPixelsError(f"{each}: the folder has no FITS files")
             paths += inside
@@ -145,7 +143,7 @@ def exclude_unusable(files: Sequence[FrameFile]) -> None:
     _exclude_duplicates(admissible(files), lambda each: str(each.path.resolve()), _same_file)
     # The same file, packed and unpacked.
     _exclude_duplicates(
-        admissible(files), lambda each: str(each.path.resolve()).removesuffix(".gz"), _same_file
+        admissible(files), lambda each: unpacked_name(str(each.path.resolve())), _same_file
     )
     _exclude_duplicates(admissible(files), _moment, _same_exposure)
 

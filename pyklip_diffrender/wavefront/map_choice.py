@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +20,7 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     MissingOPDError,
 )
+from pyklip_diffrender.io.files import BROKEN, fits_files
 from pyklip_diffrender.io.headers import header_text, merged_header, sensing_date
 from pyklip_diffrender.io.opd_map import FLAT, OPDMap
 from pyklip_diffrender.optics.grid import resample
@@ -34,14 +34,6 @@ _log = logging.getLogger(__name__)
 Rule = Literal["nearest", "before", "after", "interpolate"]
 
 RULES: tuple[Rule, ...] = ("nearest", "before", "after", "interpolate")
-
-_SUFFIXES = (".fits", ".fits.gz", ".fit")
-
-_BROKEN = (
-    OSError, EOFError, ValueError, TypeError, KeyError, zlib.error, fits.VerifyError,
-    AstropyUserWarning,
-)  # fmt: skip
-"""Exceptions, and the warning, that astropy raises for files that are cut or damaged."""
 
 _OUTDATED = 200.0
 """Days between a map and the frames above which a warning is given: the telescope is realigned
@@ -146,7 +138,7 @@ def dated_maps(folder: Path) -> list[tuple[Time, Path]]:
     """Date and path of every wavefront map in a folder."""
     if not folder.is_dir():
         raise MissingOPDError(f"{folder}: no such folder, expected a folder of wavefront maps")
-    files = sorted(p for p in folder.iterdir() if p.name.endswith(_SUFFIXES) and p.is_file())
+    files = fits_files(folder)
     maps = []
     for path in files:
         try:
@@ -179,7 +171,7 @@ def _date_of_map(path: Path) -> Time:
                 if hdu.header.get("NAXIS") == 2 and hdu.header["NAXIS1"] == hdu.header["NAXIS2"]
             ]
             primary = hdus[0].header
-    except _BROKEN as error:
+    except BROKEN as error:
         raise CorruptFileError(f"not a complete FITS file ({error})") from error
     if not squares:
         raise LookupError("it has no square image")
