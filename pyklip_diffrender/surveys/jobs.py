@@ -12,7 +12,7 @@ from typing import Any
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
-from pyklip_diffrender.io.files import sha256
+from pyklip_diffrender.io.files import fits_files, sha256
 from pyklip_diffrender.io.opd_map import FLAT
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
@@ -22,8 +22,6 @@ __all__ = ["Injection", "Job", "jobs_of"]
 
 _SWITCHES = ("wide", "disk", "completeness")
 """Options that are named in the key of a job where they are on."""
-
-_SUFFIXES = (".fits", ".fits.gz")
 
 
 @dataclass(frozen=True)
@@ -211,7 +209,7 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
     """Files of a folder, or the files themselves."""
     if len(paths) > 1 or not paths[0].is_dir():
         return list(paths)
-    inside = sorted(each for each in paths[0].iterdir() if each.name.endswith(_SUFFIXES))
+    inside = fits_files(paths[0])
     if not inside:
         raise CorruptFileError(f"{paths[0]}: the folder has no FITS files")
     return inside
