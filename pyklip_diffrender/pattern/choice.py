@@ -119,7 +119,7 @@ class PatternChoice:
         """Number of frames of reference stars that the pattern was learned from."""
         if self.systematics is None:
             return 0
-        return sum(len(frame.observation) for fit in self.references for frame in fit.frames)
+        return sum(frame.observation.count for fit in self.references for frame in fit.frames)
 
     def is_refuted_by(self, fit: Refinement) -> bool:
         """Return True if a fit shows less than half of the library's pattern.

@@ -68,7 +68,7 @@ class FrameFile:
     def read(self) -> Observation | None:
         """Read the frames; if they cannot be read, None, with the reason."""
         try:
-            return Observation.from_fits(self.path)
+            return Observation.means_from_fits(self.path)
         except DiffrenderError as error:
             self.reason = _without_name(error, self.name)
             return None
@@ -121,11 +121,11 @@ def exposures_in(
 
 def _frame_file(path: Path) -> FrameFile:
     try:
-        with open_fits(path) as hdus:
+        with open_fits(path, images=False) as hdus:
             header, shape = hdus[0].header, ()
             if "SCI" in hdus:
                 header = merged_header(header, hdus["SCI"].header, path.name)
-                shape = np.shape(hdus["SCI"].data)
+                shape = tuple(hdus["SCI"].shape) if hdus["SCI"].is_image else ()
             return FrameFile(path, Exposure.of(header, path.name, shape))
     except DiffrenderError as error:
         return FrameFile(path, Exposure(path.name), reason=_without_name(error, path.name))

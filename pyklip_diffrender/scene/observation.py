@@ -19,7 +19,7 @@ from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.catalogue_star import star_of
 from pyklip_diffrender.scene.checked_frames import checked_frames, selected
 from pyklip_diffrender.scene.exposure import instrument_of
-from pyklip_diffrender.scene.file_frames import frames_of_file
+from pyklip_diffrender.scene.file_frames import frames_of_file, means_of_file
 from pyklip_diffrender.scene.integrations import pointings
 from pyklip_diffrender.scene.measured_noise import weighted_mean
 from pyklip_diffrender.scene.window import Window
@@ -67,6 +67,9 @@ class Observation:
     noise_ratios : tuple of float
         Scatter of the file's pixels far from the star over their stated errors, for every frame,
         before the errors were corrected; NaN where it could not be measured.
+    integrations : tuple of int
+        Number of integrations of the detector that each frame is the mean of; empty where each
+        frame is one.
 
     Examples
     --------
@@ -98,6 +101,7 @@ class Observation:
     header: fits.Header = field(default_factory=fits.Header)
     remarks: tuple[str, ...] = ()
     noise_ratios: tuple[float, ...] = ()
+    integrations: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.position_angles is not None:
@@ -183,6 +187,31 @@ class Observation:
         """
         return cls(**frames_of_file(path, every_integration=every_integration))
 
+    @classmethod
+    def means_from_fits(cls, path: str | os.PathLike[str]) -> Observation:
+        """Read a file as `from_fits` does, and average the integrations of each of its pointings.
+
+        A fit takes such means in any case. A file of thousands of integrations is never in memory
+        as a whole: it takes at most as much memory as the file has bytes, and usually less.
+
+        Parameters
+        ----------
+        path : path
+
+        Returns
+        -------
+        Observation
+            One frame for each pointing, see `pointings`; `integrations` says of how many it is the
+            mean, and `noise_ratios` has the ratio of the integration in which it is farthest from
+            one.
+
+        Raises
+        ------
+        CorruptFileError, UnitError, ShapeError, NoValidPixelsError
+            As `from_fits`.
+        """
+        return cls(**means_of_file(path))
+
     def part(self, which: NDArray[np.intp]) -> Observation:
         """Select frames by their indices."""
         return replace(self, **selected(vars(self), which))
@@ -226,6 +255,11 @@ class Observation:
                 "Position angle of +y": None if self.north is None else f"{self.north:.2f} deg",
             },
         )
+
+    @property
+    def count(self) -> int:
+        """Number of integrations, also of those that frames are means of."""
+        return sum(self.integrations) if self.integrations else len(self)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -393,6 +427,7 @@ class Observation:
             data=data[None],
             error=error[None],
             valid=valid[None],
+            integrations=(self.count,) if self.integrations else (),
             center=self.center.mean(axis=0, keepdims=True),
             position_angles=None if self.position_angles is None else self.position_angles[:1],
         )
