@@ -16,10 +16,10 @@ from pyklip_diffrender.errors import (
     UnitError,
 )
 from pyklip_diffrender.io.units import (
-    native_float64,
     require_finite,
     require_shape,
     to_arcsec,
+    to_mask,
     to_pair,
     to_unit,
 )
@@ -46,7 +46,7 @@ def checked_frames(
     frames = checked_stacks(
         to_unit(data, unit, f"{name}: data"),
         to_unit(error, unit, f"{name}: error"),
-        valid=None if valid is None else np.array(valid, dtype=bool),
+        valid=None if valid is None else to_mask(valid, f"{name}: valid"),
         unit=unit,
         pixelscale=pixelscale,
         center=center,
@@ -121,7 +121,8 @@ def checked_stacks(
         angles = to_unit(details["position_angles"], u.deg, "position_angles")
         details["position_angles"] = _spread(angles, (len(values),), f"{name}: position_angles")
     frames, ny, nx = values.shape
-    position = native_float64([(nx - 1) / 2, (ny - 1) / 2] if center is None else center)
+    middle = [(nx - 1) / 2, (ny - 1) / 2]
+    position = to_unit(middle if center is None else center, u.pix, f"{name}: center")
     require_finite(position, f"{name}: center")
     scale = _spread(to_arcsec(pixelscale, "pixelscale"), (2,), f"{name}: pixelscale")
     if not (np.isfinite(scale) & (scale > 0)).all():
