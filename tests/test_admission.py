@@ -761,9 +761,9 @@ def test_a_copy_of_an_exposure_that_can_be_used_stands_in_for_it(folder: Path) -
 def test_segments_of_an_exposure_are_one_roll(folder: Path) -> None:
     calints(folder / "seg2.fits", cards={"EXSEGNUM": 2}, date="2022-10-03T06:20:00", integrations=2)
     first, second = dr.Sequence.from_files(folder).science
-    assert (len(first), len(second)) == (3, 1)
+    assert (first.count, second.count) == (3, 1)
     assert first.name == f"{FIRST} and 1 more"
-    assert len(first.noise_ratios) == 3
+    assert len(first.noise_ratios) == len(first) == 2
     assert dict(zip(*(dr.Sequence.from_files(folder).table[k] for k in ("file", "use")),
                     strict=True))["seg2.fits"] == "target"  # fmt: skip
 

@@ -292,14 +292,14 @@ def test_files_are_opened_twice_at_most_and_judged_once(
 ) -> None:
     files = written(tmp_path, light, aligned=True)
     opened: Counter[str] = Counter()
-    read_bytes, open_fits, judge = Path.read_bytes, fits.open, sequence.judge_frames
+    open_path, open_fits, judge = Path.open, fits.open, sequence.judge_frames
 
-    def count_read(path: Path) -> bytes:
+    def count_path(path: Path, *args: Any, **options: Any) -> Any:
         opened[path.name] += 1
-        return read_bytes(path)
+        return open_path(path, *args, **options)
 
     def count_open(name: Any, *args: Any, **options: Any) -> Any:
-        # Others are files that this package has read already.
+        # Others are files that this package has opened already.
         if isinstance(name, str | Path):
             opened[Path(name).name] += 1
         return open_fits(name, *args, **options)
@@ -308,7 +308,7 @@ def test_files_are_opened_twice_at_most_and_judged_once(
         opened["judged"] += 1
         judge(*args)
 
-    monkeypatch.setattr(Path, "read_bytes", count_read)
+    monkeypatch.setattr(Path, "open", count_path)
     monkeypatch.setattr(fits, "open", count_open)
     monkeypatch.setattr(sequence, "judge_frames", count_judged)
     with contextlib.suppress(Stopped, ExceptionGroup):

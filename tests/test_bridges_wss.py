@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.io import fits
+from astropy.table import Table
 from astropy.time import Time
 from stpsf_data import pupil, wss_file
 
@@ -131,26 +134,80 @@ def test_interpolation_in_time_warns(wss: Path, tmp_path: Path) -> None:
         interpolate_wss(*maps, "2022-08-15")
 
 
+FIRST, SECOND = (f"R2022081102-NRCA3_FP1-{k}.fits" for k in (1, 2))
+
+ROWS = [
+    # Moment, file, correction and exposure, as MAST lists them: the later analysis first.
+    ("2022-08-11T02:00", SECOND, "R2022081102", "V01163040001002002102101"),
+    ("2022-08-11T02:00", FIRST, "R2022081102", "V01163040001002002102101"),
+    ("2022-08-11T07:00", "R2022083106-NRCA3_FP1-1.fits", "R2022083106", "V01163041001002002102101"),
+    ("2022-08-11T09:00", "R2022081103-NRCA3_FP1-1.fits", "R2022081103", "V0116304200100200210210E"),
+    ("2022-08-14T02:00", "R2022081402-NRCA3_FP1-1.fits", "R2022081402", "V01163043001002002102101"),
+]
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize(
+    ("date", "choice", "names"),
+    [
+        ("2022-08-11T08:00", "before", [SECOND]),
+        ("2022-08-11T08:00", "nearest", [SECOND]),
+        ("2022-08-11T08:00", "closest", [SECOND]),
+        ("2022-08-10T08:00", "after", [SECOND]),
+        ("2022-08-11T02:00", "after", [SECOND]),
+        ("2022-08-11T08:00", "after", ["R2022081402-NRCA3_FP1-1.fits"]),
+        ("2022-08-13T08:00", "nearest", ["R2022081402-NRCA3_FP1-1.fits"]),
+        ("2022-08-13T08:00", "interpolate", [SECOND, "R2022081402-NRCA3_FP1-1.fits"]),
+    ],
+)
 def test_by_date_through_stpsf(
-    stpsf_path: Path, wss: Path, monkeypatch: pytest.MonkeyPatch
+    wss: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    date: str,
+    choice: str,
+    names: list[str],
+    backwards: bool,
 ) -> None:
+    """What stpsf leaves out of its tables is not used, and of one sensing the last analysis."""
     from stpsf import mast_wss
 
-    asked = []
+    def listed(when: Time, days: u.Quantity) -> Table:
+        rows = [
+            (Time(moment).mjd, *facts)
+            for moment, *facts in ROWS
+            if abs((Time(moment) - when).to(u.day)) <= days
+        ]
+        names = ("date_obs_mjd", "fileName", "corr_id", "obs_id")
+        return Table(rows=rows[:: -1 if backwards else 1] or None, names=names)
 
-    def found(date: Time, choice: str, output_path: str | None) -> str:
-        asked.append((date.isot, choice, output_path))
-        return str(wss)
+    fetched = []
 
-    monkeypatch.setattr(mast_wss, "get_opd_at_time", found)
-    loaded = load_wss_opd_by_date("2022-08-11T08:00:00", "before", npix=NPIX)
-    assert asked == [("2022-08-11T08:00:00.000", "before", None)]
-    assert loaded.name == wss.name
+    def fetch(name: str, output_path: str | None) -> str:
+        assert output_path is None
+        fetched.append(name)
+        path = tmp_path / name
+        wss_file(path, date=next(f"{row[0]}:00" for row in ROWS if row[1] == name))
+        return str(path)
 
-    def unreachable(date: Time, choice: str, output_path: str | None) -> str:
+    monkeypatch.setattr(mast_wss, "mast_wss_date_query", listed)
+    monkeypatch.setattr(mast_wss, "mast_retrieve_opd", fetch)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the wavefront of .* is an interpolation")
+        loaded = load_wss_opd_by_date(date, choice, npix=NPIX, backout_si_wfe=False)
+    assert fetched == names
+    assert loaded.name == " + ".join(names)
+    with pytest.raises(MissingOPDError, match=r"no map before that date within 12 days"):
+        load_wss_opd_by_date("2022-08-01", "before")
+
+
+def test_an_archive_that_cannot_be_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    from stpsf import mast_wss
+
+    def unreachable(when: Time, days: u.Quantity) -> Table:
         raise ConnectionError("no route to host")
 
-    monkeypatch.setattr(mast_wss, "get_opd_at_time", unreachable)
+    monkeypatch.setattr(mast_wss, "mast_wss_date_query", unreachable)
     with pytest.raises(MissingOPDError, match=r"no route to host.*pass its path to load_wss_opd"):
         load_wss_opd_by_date("2022-08-11T08:00:00")
     with pytest.raises(IncompatibleSetupError, match="got 'latest', expected 'nearest'"):

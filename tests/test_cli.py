@@ -25,9 +25,10 @@ import torch
 from astropy.io import fits
 from astropy.time import Time
 
+from benchmarks.calints_files import calints
 from pyklip_diffrender import __version__
 from pyklip_diffrender.cli import application, main
-from pyklip_diffrender.cli.estimate import steps_of
+from pyklip_diffrender.cli.estimate import describe_plan, steps_of
 from pyklip_diffrender.cli.shared_options import read_config
 from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
@@ -917,3 +918,12 @@ def test_doctor_fails_with_a_sentence(tmp_path: Path, monkeypatch: pytest.Monkey
         assert words in failed.text
     assert doctor.memory_check(8e9).text == "8.0 GB of memory are free"
     assert doctor.memory_check(None).state == "note"
+
+
+def test_the_plan_says_what_reading_a_large_file_takes(tmp_path: Path) -> None:
+    path = calints(tmp_path / "a_calints.fits")
+    sequence = Sequence.from_files([path])
+    usual = describe_plan(sequence, ReduceOptions())
+    os.truncate(path, 10 * 10**9)  # Sparse: it takes no room.
+    assert "1.8 GB of memory" in usual
+    assert "8.7 GB of memory" in describe_plan(sequence, ReduceOptions())

@@ -135,6 +135,56 @@ def test_without_any_map_it_is_an_error(tmp_path: Path) -> None:
         choose_map(tmp_path, "2022-08-05", "closest")  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("rule", ["nearest", "before", "after", "interpolate"])
+@pytest.mark.parametrize("first", [1, 2, 10])
+def test_of_one_sensing_the_last_analysis_is_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, rule: str, first: int
+) -> None:
+    """Whatever the rule, and the order in which the files were written or are listed."""
+    for number in (first, *({1, 2, 10} - {first})):
+        name = f"R2022081102-NRCA3_FP1-{number}.fits"
+        wss_file(tmp_path / name, seed=number, date="2022-08-11T12:00:00")
+    ends = [("2022-08-01", "2022-08-01-1"), ("2022-08-21", "2022-08-21-1")]
+    for k, (day, name) in enumerate(ends):
+        write_map(tmp_path / f"opd_{name}.fits", k, DATE_OBS=day, TIME_OBS="12:00:00")
+    when = {"before": "2022-08-12", "after": "2022-08-10"}.get(rule, "2022-08-11T12:00:00")
+    opd = choose_map(tmp_path, when, rule)  # type: ignore[arg-type]
+    assert opd.name == "R2022081102-NRCA3_FP1-10.fits"
+    assert np.array_equal(opd.data, read_opd(tmp_path / opd.name).data)
+    said = "in place of R2022081102-NRCA3_FP1-1.fits, R2022081102-NRCA3_FP1-2.fits"
+    assert said in opd.history[-1]
+    assert said in caplog.text
+
+
+def test_a_later_correction_of_one_sensing_is_used(tmp_path: Path) -> None:
+    for name in ("O2022081103-NRCA3_FP1-1.fits", "R2022081102-NRCA3_FP1-2.fits"):
+        wss_file(tmp_path / name, date="2022-08-11T12:00:00")
+    assert choose_map(tmp_path, "2022-08-11").name == "O2022081103-NRCA3_FP1-1.fits"
+
+
+@pytest.mark.parametrize(
+    ("cards", "name", "reason"),
+    [
+        ({"CORR_ID": "R2022083106"}, "renamed.fits", "R2022083106 has known faults"),
+        ({}, "R2022083106-NRCA3_FP1-1.fits", "R2022083106 has known faults"),
+        ({"OBS_ID": "V0116304200100200210210E"}, "R2022083105-NRCA3_FP1-1.fits", "in F187N"),
+    ],
+)
+def test_maps_that_stpsf_leaves_out_are_skipped(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, cards: dict[str, str], name: str, reason: str
+) -> None:
+    wss_file(tmp_path / name, date="2022-08-31T12:00:00")
+    with fits.open(tmp_path / name, mode="update") as hdus:
+        hdus[0].header.update(cards)
+    wss_file(tmp_path / "R2022081102-NRCA3_FP1-1.fits", date="2022-08-11T12:00:00")
+    with caplog.at_level(logging.INFO):
+        assert choose_map(tmp_path, "2022-08-31").name == "R2022081102-NRCA3_FP1-1.fits"
+    assert reason in caplog.text
+    with fits.open(tmp_path / name, mode="update") as hdus:
+        hdus[0].header.update({"CORR_ID": "R2022083107", "OBS_ID": "V01445001001002002102106"})
+    assert choose_map(tmp_path, "2022-08-31").name == name
+
+
 def test_a_map_of_another_epoch_is_a_warning_with_the_days(folder: Path) -> None:
     with pytest.warns(DiffrenderWarning, match=r"opd_2022-08-21\.fits.* 223 days before the frame"):
         choose_map(folder, "2023-04-01")

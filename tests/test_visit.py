@@ -139,7 +139,7 @@ def test_references_make_the_limits_deeper_and_leave_the_planet_alone() -> None:
 
 
 def test_a_companion_of_a_reference_is_masked_and_named() -> None:
-    fit, visit = joined(*(reference(k, companion=6e-4) for k in range(2)))
+    fit, visit = joined(*(reference(k, companion=4e-4) for k in range(2)))
     assert [each.use for each in visit.contributions] == ["joint"] * 2
     for each in visit.contributions:
         assert "arcsec is subtracted and masked" in each.reason

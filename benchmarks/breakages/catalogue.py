@@ -201,8 +201,8 @@ def _frames_and_files() -> list[Breakage]:
         ),
         Breakage(
             "unaligned", "shifts of aligned frames are undone, not doubled",
-            'undo_shifts(data, error, pixels - net)',
-            'undo_shifts(data, error, net - pixels)',
+            'undo_shifts(data[part], error[part], (pixels - net)[part])',
+            'undo_shifts(data[part], error[part], (net - pixels)[part])',
             "detector_pixels",
         ),
         Breakage(

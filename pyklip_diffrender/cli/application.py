@@ -13,7 +13,7 @@ from pyklip_diffrender._version import __version__
 from pyklip_diffrender.cli import commands
 from pyklip_diffrender.cli.doctor import doctor
 from pyklip_diffrender.cli.learning import learn
-from pyklip_diffrender.cli.session import PROGRAM, Run
+from pyklip_diffrender.cli.session import PROGRAM, Run, open_streams
 from pyklip_diffrender.cli.shared_options import common
 from pyklip_diffrender.errors import DiffrenderError
 
@@ -61,7 +61,7 @@ def main(arguments: abc.Sequence[str] | None = None) -> int:
     # this when they are loaded, which is later.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     run = Run()
-    with run.messages():
+    with open_streams(), run.messages():
         try:
             status = application.main(arguments, prog_name=PROGRAM, standalone_mode=False, obj=run)
         except click.ClickException as error:

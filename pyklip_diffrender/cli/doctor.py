@@ -88,6 +88,8 @@ def check_data(tables: Collection[str] = _TABLES) -> Iterator[Check]:
 
 def check_stpsf() -> Iterator[Check]:
     """Look for stpsf, which is optional, and its data."""
+    from pyklip_diffrender.io.files import read_text
+
     try:
         name = f"stpsf {version('stpsf')}"
     except PackageNotFoundError:
@@ -103,7 +105,7 @@ def check_stpsf() -> Iterator[Check]:
             "files, or unset it",
         )
     else:
-        data = (Path(folder) / "version.txt").read_text(encoding="utf-8").strip()
+        data = read_text(Path(folder) / "version.txt").strip()
         yield Check("ok", f"{name}; STPSF_PATH is {folder}, version {data}")
 
 

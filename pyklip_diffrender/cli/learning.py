@@ -91,6 +91,7 @@ def learn(
     run.claim_file(output, overwrite)
     from pyklip_diffrender.archive import fetch_calints
     from pyklip_diffrender.cli.reducing import map_for
+    from pyklip_diffrender.io.files import without_fits_suffix
     from pyklip_diffrender.pattern import learn_library
 
     files = list(frames)
@@ -107,7 +108,7 @@ def learn(
         stars=stars,
         filters=filters,
         size=size,
-        folder=output.with_name(f"{output.name.removesuffix('.gz').removesuffix('.fits')}_fits"),
+        folder=output.with_name(f"{without_fits_suffix(output.name)}_fits"),
         device=run.device,
         progress=run.progress,
     )

@@ -18,6 +18,7 @@ from pyklip_diffrender.cli.session import Run, with_options
 from pyklip_diffrender.cli.shared_options import config_remark
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument.star_flux import star_flux_density
+from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.io.opd_map import OPDMap
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.reduction import (
@@ -105,7 +106,7 @@ def run_reduction(
                     written = reduction.write(
                         folder, overwrite=overwrite, derivatives=derivatives, figures=figures
                     )
-            summary = loads((folder / "summary.json").read_text(encoding="utf-8"))
+            summary = loads(read_text(folder / "summary.json"))
             summaries[folder.name] = summary
             click.echo(f"wrote {folder / 'report.html'} and {len(written) - 1} more files")
             status = summary["status"]
@@ -117,7 +118,7 @@ def run_reduction(
             first = sequences[0].science[0]
             motion = proper_motion(first.header, first.name)
             page, data = write_comparison(summaries, motion, output)
-            summary = loads(data.read_text(encoding="utf-8"))
+            summary = loads(read_text(data))
             click.echo(f"\nwrote {page}, which compares them")
     if json:
         click.echo(dumps(summary, indent=2))
@@ -149,7 +150,7 @@ def _remove_others(output: Path, folders: list[Path]) -> None:
     page, data = (output / name for name in COMPARISON)
     if data.exists():
         with suppress(ValueError, KeyError, TypeError):
-            listed = loads(data.read_text(encoding="utf-8"))["reductions"]
+            listed = loads(read_text(data))["reductions"]
             # Only names, so that a file that was changed cannot point outside the folder.
             earlier += [output / Path(each["folder"]).name for each in listed]
     for folder in set(earlier) - set(folders):

@@ -16,7 +16,7 @@ from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
 
-__all__ = ["PROGRAM", "Run", "with_options"]
+__all__ = ["PROGRAM", "Run", "open_streams", "with_options"]
 
 PROGRAM = "pyklip-diffrender"
 
@@ -80,6 +80,37 @@ class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
             return message
         warning = "warning: " if record.levelno == logging.WARNING else ""
         return f"{PROGRAM}: {warning}{message}"
+
+
+def _takes_text(stream: Any) -> bool:
+    """Whether a standard stream exists and is open: under ``pythonw`` there is none."""
+    if stream is None or stream.closed:
+        return False
+    try:
+        stream.flush()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+@contextmanager
+def open_streams() -> Iterator[None]:
+    """Put an empty file in place of standard streams that are missing or closed.
+
+    Without them, as under ``pythonw``, in a job of a scheduler or after ``2>&-``, the first message
+    or progress bar would end the program.
+    """
+    before = {name: getattr(sys, name) for name in ("stdout", "stderr")}
+    with open(os.devnull, "w", encoding="utf-8") as nowhere:
+        try:
+            for name, stream in before.items():
+                if not _takes_text(stream):
+                    setattr(sys, name, nowhere)
+            yield
+        finally:
+            for name, stream in before.items():
+                if getattr(sys, name) is nowhere:
+                    setattr(sys, name, stream)
 
 
 @dataclass
@@ -170,8 +201,11 @@ class Run:
         ------
         IncompatibleSetupError
         """
+        _require_no_broken_link(folder, "--output")
         if folder.exists() and not folder.is_dir():
             raise IncompatibleSetupError(f"--output: {folder} is a file, expected a folder")
+        for name in products:
+            _require_no_broken_link(folder / name, "--output")
         self._claim(folder, _existing(folder), [folder / name for name in products], overwrite)
 
     def claim_file(self, path: Path, overwrite: bool) -> None:
@@ -181,6 +215,7 @@ class Run:
         ------
         IncompatibleSetupError
         """
+        _require_no_broken_link(path, "OUTPUT")
         if not path.absolute().parent.is_dir():
             raise IncompatibleSetupError(
                 f"--output: there is no folder {path.parent} to write into"
@@ -223,6 +258,16 @@ class Run:
             return "nothing was written"
         names = sorted(path.name for path, _ in written)
         return f"these files in {output} are new and complete: {', '.join(names)}"
+
+
+def _require_no_broken_link(path: Path, option: str) -> None:
+    """Refuse a path of which a part is a link that leads nowhere, or in a circle."""
+    for part in (*reversed(path.absolute().parents), path.absolute()):
+        if part.is_symlink() and not os.path.exists(part):
+            raise IncompatibleSetupError(
+                f"{option}: {part} is a link to {os.readlink(part)}, which does not exist or leads "
+                "back to itself. Make what it points to, remove the link, or choose another place"
+            )
 
 
 def _existing(folder: Path) -> Path:

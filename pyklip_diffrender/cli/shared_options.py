@@ -93,8 +93,10 @@ def read_config(command: click.Command, path: Path) -> dict[str, Any]:
     click.UsageError
         If the file cannot be read, or has an unknown option.
     """
+    from pyklip_diffrender.io.files import read_text
+
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(read_text(path))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise click.UsageError(f"--config: {path}: {error}") from error
     general = {key: value for key, value in content.items() if not isinstance(value, Mapping)}

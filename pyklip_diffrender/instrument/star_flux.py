@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
 from pyklip_diffrender.instrument.dwarf_stars import dwarf_photometry, is_dwarf
 from pyklip_diffrender.instrument.spectrum import filter_throughput
-from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.io.files import is_fits_name, open_fits, read_text
 from pyklip_diffrender.io.units import native_float64
 
 __all__ = ["read_spectrum", "star_flux_density"]
@@ -173,17 +173,17 @@ def _photometry(path: Path) -> _Spectrum:
 def _table(path: Path, suffix: str) -> _Spectrum:
     """Samples of a table, m and Jy; columns without units are in micron and Jy."""
     units: list[Any] = [None, None]
-    if ".fits" in path.name.lower():
+    if is_fits_name(path):
         with open_fits(path) as hdus:
             table = next(hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU))
             place, level = (native_float64(table.data.field(k)) for k in (0, 1))
             units = [column.unit for column in table.columns[:2]]
     elif suffix == ".ecsv":
-        columns = [Table.read(path, format="ascii.ecsv").columns[k] for k in (0, 1)]
+        columns = [Table.read(read_text(path), format="ascii.ecsv").columns[k] for k in (0, 1)]
         place, level = (native_float64(np.ma.filled(each, np.nan)) for each in columns)
         units = [each.unit for each in columns]
     else:
-        place, level = np.loadtxt(path, ndmin=2, usecols=(0, 1)).T
+        place, level = np.loadtxt(read_text(path).splitlines(), ndmin=2, usecols=(0, 1)).T
     wavelength = u.Quantity(place, _unit(units[0], u.micron)).to(u.m, u.spectral())
     flux = u.Quantity(level, _unit(units[1], u.Jy)).to(u.Jy, u.spectral_density(wavelength))
     return native_float64(wavelength.value), native_float64(flux.value)

@@ -1,4 +1,4 @@
-"""Read FITS files with clear errors, and write files completely or not at all."""
+"""Find and read files with clear errors, and write files completely or not at all."""
 
 from __future__ import annotations
 
@@ -6,19 +6,22 @@ import gzip
 import hashlib
 import io
 import os
+import re
 import secrets
 import shutil
 import warnings
 import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
+import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
+from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import (
     CorruptFileError,
@@ -28,21 +31,86 @@ from pyklip_diffrender.errors import (
 )
 
 __all__ = [
+    "BROKEN",
     "embedded_table",
+    "fits_files",
+    "is_fits_name",
     "open_fits",
+    "read_image",
+    "read_text",
     "replacing",
     "require_new",
     "sha256",
+    "unpacked_name",
+    "without_fits_suffix",
     "write_fits",
     "write_table",
 ]
 
 _GZIP = b"\x1f\x8b"
 
+_IN_MEMORY = 2**25
+"""Bytes up to which a gzipped file is unpacked in memory, which is faster."""
+
+_CHUNK = 2**22
+"""Bytes that are read at once, a multiple of the words that are summed."""
+
+_PACKED = re.compile(r"\.(gz|fz)$", re.IGNORECASE)
+"""Suffixes of gzip and fpack."""
+
+_SUFFIX = re.compile(r"\.(fits?|fts)(\.gz|\.fz)?$", re.IGNORECASE)
+"""The suffixes of FITS files that `open_fits` reads."""
+
+
+def is_fits_name(path: str | os.PathLike[str]) -> bool:
+    """Whether a path has the suffix of a FITS file, packed or not, in any case.
+
+    Examples
+    --------
+    >>> [is_fits_name(name) for name in ("a.fits", "B.FIT.GZ", "c.fts", "d.fits.fz", "e.txt")]
+    [True, True, True, True, False]
+    """
+    return _SUFFIX.search(os.fspath(path)) is not None
+
+
+def without_fits_suffix(name: str) -> str:
+    """Name of a FITS file without the suffix, packed or not; other names are unchanged."""
+    return _SUFFIX.sub("", name)
+
+
+def unpacked_name(name: str) -> str:
+    """Name that a file has when it is unpacked: without the suffix of gzip or fpack."""
+    return _PACKED.sub("", name)
+
+
+def fits_files(folder: str | os.PathLike[str]) -> list[Path]:
+    """The FITS files in a folder by their suffixes, sorted by name.
+
+    Hidden files are not among them: the copies with metadata that macOS writes to other systems'
+    disks (``._a.fits``), and files that are being written.
+    """
+    return sorted(
+        path
+        for path in Path(folder).iterdir()
+        if is_fits_name(path) and not path.name.startswith(".") and not path.is_dir()
+    )
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Text of a file in UTF-8, with or without the byte-order mark that editors on Windows add."""
+    return Path(path).read_text(encoding="utf-8-sig")
+
 
 @contextmanager
-def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
-    """Open a FITS file (gzipped or not) and read all of it.
+def open_fits(path: str | os.PathLike[str], *, images: bool = True) -> Iterator[fits.HDUList]:
+    """Open a FITS file, packed by gzip or fpack or not, and read all of it.
+
+    Parameters
+    ----------
+    path : path
+    images : bool
+        Read the images, too. If not, `read_image` reads them, one plane at a time, so that a file
+        of many integrations is never in memory as a whole.
 
     Raises
     ------
@@ -61,34 +129,105 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
     path = Path(path)
     if not path.is_file():
         raise MissingFileError(f"{path}: no such file")
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(_unpacked(path))
+            with warnings.catch_warnings():
+                # Astropy only warns of truncated data.
+                warnings.filterwarnings(
+                    "error", message="(?s).*(truncated|corrupt)", category=AstropyUserWarning
+                )
+                # Checksums of packed images are those of the tables that hold them.
+                stored = fits.open(
+                    file, memmap=False, lazy_load_hdus=False, disable_image_compression=True
+                )
+                for number, hdu in enumerate(stored):
+                    _require_sound(hdu, number, path, file)
+                file.seek(0)
+                hdus = fits.open(file, memmap=False, lazy_load_hdus=False)
+                for hdu in hdus:
+                    if images or not hdu.is_image:
+                        _ = hdu.data
+        except CorruptFileError:
+            raise
+        except BROKEN as error:
+            raise _incomplete(path, error) from error
+        yield hdus
+
+
+BROKEN = (
+    OSError, EOFError, ValueError, TypeError, KeyError, zlib.error, AstropyUserWarning,
+    fits.VerifyError,
+)  # fmt: skip
+"""Exceptions, and the warning, that astropy raises for files that are cut or damaged."""
+
+
+def _incomplete(path: Path, error: BaseException) -> CorruptFileError:
+    return CorruptFileError(
+        f"{path} ({path.stat().st_size} bytes): not a complete FITS file ({error}). Fetch it again"
+    )
+
+
+@contextmanager
+def _unpacked(path: Path) -> Iterator[BinaryIO]:
+    """The file, or what a gzipped file holds."""
+    with path.open("rb") as file:
+        if file.read(2) != _GZIP:
+            file.seek(0)
+            yield file
+            return
+        # Not by astropy, which mistakes a truncated stream for the end of the file.
+        if path.stat().st_size <= _IN_MEMORY:
+            yield io.BytesIO(gzip.decompress(path.read_bytes()))
+            return
+        file.seek(0)
+        with gzip.GzipFile(fileobj=file) as stream:
+            while stream.read(_CHUNK):
+                pass
+            stream.seek(0)
+            yield stream  # type: ignore[misc]
+
+
+def _float64(image: Any) -> NDArray[np.float64]:
+    """Copy of an image of a file as contiguous float64 in the machine's byte order."""
+    return np.array(image, dtype=np.float64, order="C")
+
+
+def read_image(
+    hdu: Any, path: str | os.PathLike[str], convert: Callable[[Any], NDArray[Any]] = _float64
+) -> NDArray[Any]:
+    """Read the image of an HDU, plane by plane, into an array of its own.
+
+    Parameters
+    ----------
+    hdu : ImageHDU, PrimaryHDU or CompImageHDU
+        Of a file that `open_fits` has opened.
+    path : path
+        Of the file, for messages.
+    convert : callable
+        Makes a plane of the array from a plane of the file.
+
+    Raises
+    ------
+    CorruptFileError
+        If the image cannot be read.
+    """
+    shape = tuple(hdu.shape)
     try:
-        content = path.read_bytes()
-        if content.startswith(_GZIP):
-            # Not by astropy, which mistakes a truncated stream for the end of the file.
-            content = gzip.decompress(content)
-        with warnings.catch_warnings():
-            # Astropy only warns of truncated data.
-            warnings.filterwarnings(
-                "error", message="(?s).*(truncated|corrupt)", category=AstropyUserWarning
-            )
-            hdus = fits.open(io.BytesIO(content), lazy_load_hdus=False)
-            for number, hdu in enumerate(hdus):
-                _require_sound(hdu, number, path)
-    except CorruptFileError:
-        raise
-    except (
-        OSError, EOFError, ValueError, TypeError, KeyError, zlib.error, AstropyUserWarning,
-        fits.VerifyError,
-    ) as error:  # fmt: skip
-        raise CorruptFileError(
-            f"{path} ({path.stat().st_size} bytes): not a complete FITS file ({error}). "
-            "Fetch it again"
-        ) from error
-    yield hdus
+        if len(shape) < 3 or 0 in shape:
+            return convert(hdu.data)
+        first = convert(hdu.section[0])
+        result = np.empty((shape[0], *first.shape), first.dtype)
+        result[0] = first
+        for k in range(1, shape[0]):
+            result[k] = convert(hdu.section[k])
+        return result
+    except BROKEN as error:
+        raise _incomplete(Path(path), error) from error
 
 
-def _require_sound(hdu: Any, number: int, path: Path) -> None:
-    """Check the cards, the checksums and the data of an HDU."""
+def _require_sound(hdu: Any, number: int, path: Path, file: BinaryIO) -> None:
+    """Check the cards and the checksums of an HDU as it is stored."""
     # Damaged HDUs and those of unknown type have no data or no checksums.
     if not (hasattr(type(hdu), "data") and hasattr(hdu, "verify_datasum")):
         raise CorruptFileError(
@@ -102,20 +241,45 @@ def _require_sound(hdu: Any, number: int, path: Path) -> None:
                 f"{path}: extension {number} has a card that cannot be read: "
                 f"{card.image.strip()!r}. Correct it, or fetch the file again"
             ) from error
-    # Before the data are scaled, because the checksums are those of the bytes.
-    if hdu.verify_datasum() == 0:
+    stated = str(hdu.header.get("DATASUM", "")).strip()
+    signed = str(hdu.header.get("CHECKSUM", "")).strip()
+    if not (stated or signed):
+        return
+    place = hdu.fileinfo()
+    of_data = _ones_complement(file, place["datLoc"], place["datSpan"])
+    if stated and stated != str(of_data):
         raise CorruptFileError(
             f"{path}: the data of extension {number} do not have the checksum in its header "
             "(DATASUM). Fetch it again, or delete the card if somebody changed them on purpose"
         )
-    if hdu.verify_checksum() == 0:
+    of_header = _ones_complement(file, place["hdrLoc"], place["datLoc"] - place["hdrLoc"])
+    # With its CHECKSUM, an HDU sums to -0.
+    if signed and _folded(of_data + of_header) not in (0, 0xFFFFFFFF):
         warnings.warn(
             f"{path}: the header of extension {number} was changed after its checksum was made "
             "(CHECKSUM); the data were not",
             DiffrenderWarning,
             stacklevel=5,
         )
-    _ = hdu.data
+
+
+def _ones_complement(file: BinaryIO, begin: int, length: int) -> int:
+    """The checksum of FITS: the sum of 32-bit words, with the overflow added at the other end."""
+    file.seek(begin)
+    total = 0
+    while length > 0:
+        words = np.frombuffer(file.read(min(length, _CHUNK)), dtype=">u4")
+        if not len(words):
+            raise EOFError("the data end before they should")
+        total += int(words.sum(dtype=np.uint64))
+        length -= 4 * len(words)
+    return _folded(total)
+
+
+def _folded(total: int) -> int:
+    while total >> 32:
+        total = (total & 0xFFFFFFFF) + (total >> 32)
+    return total
 
 
 def require_new(paths: Iterable[str | os.PathLike[str]], overwrite: bool) -> None:
@@ -170,7 +334,8 @@ def write_fits(hdus: fits.HDUList, path: str | os.PathLike[str]) -> None:
 
 def sha256(path: str | os.PathLike[str]) -> str:
     """Hash of a file's bytes, for provenance."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_table(table: Table, path: Path) -> None:
@@ -182,4 +347,4 @@ def write_table(table: Table, path: Path) -> None:
 def embedded_table(name: str) -> Table:
     """Read one of the package's own ECSV tables; its provenance is in ``table.meta``."""
     source = resources.files("pyklip_diffrender") / "instrument" / "data" / f"{name}.ecsv"
-    return Table.read(source.read_text(encoding="utf-8"), format="ascii.ecsv")
+    return Table.read(source.read_text(encoding="utf-8-sig"), format="ascii.ecsv")

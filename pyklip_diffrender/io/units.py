@@ -1,7 +1,8 @@
 """Convert input to float64 arrays in SI units or arcsec, and check it.
 
 All input goes through these functions before it reaches torch, because `torch.as_tensor(1 * u.um)`
-is 1.0 and `torch.from_numpy` refuses big-endian arrays. Inputs are never modified.
+is 1.0, `torch.from_numpy` refuses big-endian arrays, and `numpy.asarray` drops the mask and the
+unit of most containers. Inputs are never modified.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ __all__ = [
     "require_shape",
     "set_numbers",
     "to_arcsec",
+    "to_mask",
     "to_metres",
     "to_number",
     "to_pair",
@@ -50,12 +52,116 @@ ARCSEC = float((1 * u.arcsec).to_value(u.rad))
 
 
 def native_float64(value: Any) -> NDArray[np.float64]:
-    """Copy of an array as contiguous, native-endian, writable float64 (masked values are NaN)."""
-    if isinstance(value, np.ma.MaskedArray):
-        value = np.ma.filled(value.astype(np.float64), np.nan)
-    elif isinstance(value, Tensor):
+    """Copy of an array as contiguous, native-endian, writable float64 (masked values are NaN).
+
+    Units are left out: `to_unit` converts them.
+    """
+    return _without_unit(value, "array")[0]
+
+
+def _without_unit(value: Any, name: str) -> tuple[NDArray[np.float64], u.UnitBase | None]:
+    """Values as float64, NaN where they are masked, and the unit, None if there is none.
+
+    Taken are numbers, sequences, tensors, numpy's and astropy's masked arrays, quantities, columns
+    of tables, `NDData` with `CCDData`, and `StdDevUncertainty`.
+    """
+    if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()
-    return np.array(value, dtype=np.float64, order="C")
+    if hasattr(value, "uncertainty_type"):
+        return _deviations(value, name)
+    if hasattr(value, "uncertainty") and hasattr(value, "mask"):  # NDData, which is no array.
+        values, unit = _without_unit(value.data, name)
+        if value.mask is not None:
+            values[np.broadcast_to(np.asarray(value.mask) != 0, values.shape)] = np.nan
+        return values, unit if value.unit is None else value.unit
+    if isinstance(value, list | tuple) and any(map(_is_container, value)):
+        members = [_without_unit(member, name) for member in value]
+        units = {None if unit is None else unit.to_string() for _, unit in members}
+        if None in units and units - {None, ""}:
+            raise UnitError(
+                f"{name}: got values with a unit and others without, expected one for each, or none"
+            )
+        unit = members[0][1]
+        try:
+            values = np.array([
+                array if unit is None or other is None else _converted(array, other, unit, name)
+                for array, other in members
+            ])  # fmt: skip
+        except ValueError as error:
+            if isinstance(error, UnitError):
+                raise
+            shapes = ", ".join(dict.fromkeys(str(array.shape) for array, _ in members))
+            raise ShapeError(f"{name}: got members of shapes {shapes}, expected one") from error
+        return values, unit
+    unit = getattr(value, "unit", None) if isinstance(value, np.ndarray) else None
+    mask = None
+    if isinstance(value, np.ma.MaskedArray):
+        mask, value = np.ma.getmaskarray(value), value.data
+    elif hasattr(value, "unmasked"):  # astropy's Masked, also of a Quantity.
+        mask, value = value.mask, value.unmasked
+    try:
+        plain = np.asarray(value)
+    except ValueError as error:  # A list of lists of different lengths.
+        raise ShapeError(f"{name}: got members of different shapes ({error})") from error
+    if plain.dtype.kind in "cmM":
+        kinds = {"c": "complex numbers", "m": "time differences", "M": "dates"}
+        raise IncompatibleSetupError(
+            f"{name}: got {kinds[plain.dtype.kind]} ({plain.dtype}), expected real numbers"
+        )
+    try:
+        values = np.array(plain, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise IncompatibleSetupError(
+            f"{name}: got {type(value).__name__} ({error}), expected real numbers"
+        ) from error
+    if mask is not None:
+        values[mask] = np.nan
+    return values, unit
+
+
+def _is_container(value: Any) -> bool:
+    """Whether `numpy.array` would lose something of a member of a sequence."""
+    if isinstance(value, list | tuple):
+        return any(map(_is_container, value))
+    return isinstance(value, np.ma.MaskedArray | Tensor) or any(
+        hasattr(value, name) for name in ("unit", "unmasked", "uncertainty_type")
+    )
+
+
+def _deviations(value: Any, name: str) -> tuple[NDArray[np.float64], u.UnitBase | None]:
+    """Standard deviations of an `NDUncertainty`."""
+    if value.uncertainty_type != "std":
+        raise IncompatibleSetupError(
+            f"{name}: got {type(value).__name__}, expected standard deviations, such as "
+            "uncertainty.represent_as(StdDevUncertainty)"
+        )
+    return _without_unit(value.array, name)[0], value.unit
+
+
+def _converted(
+    values: NDArray[np.float64], own: u.UnitBase, unit: u.UnitBase, name: str
+) -> NDArray[np.float64]:
+    try:
+        return np.asarray(own.to(unit, values))
+    except u.UnitConversionError as error:
+        raise UnitError(
+            f"{name}: got the unit '{own}', expected one that converts to '{unit}'"
+        ) from error
+
+
+def to_mask(value: Any, name: str) -> NDArray[np.bool_]:
+    """Copy of an array of logical values, which are False where they are masked.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For something else than logical values, or the numbers 0 and 1.
+    """
+    values, unit = _without_unit(value, name)
+    known = np.nan_to_num(values, nan=0.0)
+    if unit is not None or not np.isin(known, (0.0, 1.0)).all():
+        raise IncompatibleSetupError(f"{name}: got numbers, expected True or False for each pixel")
+    return known == 1.0
 
 
 def to_metres(value: Any, name: str) -> NDArray[np.float64]:
@@ -69,25 +175,19 @@ def to_arcsec(value: Any, name: str) -> NDArray[np.float64]:
 
 
 def to_unit(value: Any, unit: str | u.UnitBase, name: str) -> NDArray[np.float64]:
-    """Convert a Quantity, or a sequence of them, to a unit; bare numbers already have it.
+    """Convert anything with a unit, or a sequence of it, to a unit; bare numbers already have it.
 
-    `name` is the name of the value in messages.
+    `name` is the name of the value in messages. Values that are masked are NaN.
 
     Raises
     ------
     UnitError
-        If the unit does not convert.
+        If the unit does not convert, or only some values have one.
+    IncompatibleSetupError
+        For complex numbers, dates, and uncertainties that are no standard deviations.
     """
-    members = value if isinstance(value, list | tuple) else ()
-    if isinstance(value, u.Quantity) or any(isinstance(m, u.Quantity) for m in members):
-        value = u.Quantity(value)
-        try:
-            value = value.to_value(unit)
-        except u.UnitConversionError as error:
-            raise UnitError(
-                f"{name}: got the unit '{value.unit}', expected one that converts to '{unit}'"
-            ) from error
-    return native_float64(value)
+    values, own = _without_unit(value, name)
+    return values if own is None else _converted(values, own, u.Unit(unit), name)
 
 
 def to_number(value: Any, unit: str | u.UnitBase, name: str, bound: Bound = "any") -> float:

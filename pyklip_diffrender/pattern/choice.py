@@ -127,7 +127,7 @@ class PatternChoice:
         """Number of frames of reference stars that the pattern was learned from."""
         if self.systematics is None:
             return 0
-        return sum(len(frame.observation) for fit in self.references for frame in fit.frames)
+        return sum(frame.observation.count for fit in self.references for frame in fit.frames)
 
     @property
     def has_other_flat_field(self) -> bool:

@@ -19,7 +19,13 @@ from astropy.io import fits
 from astropy.table import QTable, vstack
 
 from pyklip_diffrender.errors import CorruptFileError
-from pyklip_diffrender.io.files import open_fits, require_new, write_fits
+from pyklip_diffrender.io.files import (
+    fits_files,
+    open_fits,
+    require_new,
+    unpacked_name,
+    write_fits,
+)
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.io.names import same_name
@@ -45,8 +51,6 @@ _COVERED = 0.5
 
 _VERSION = 2
 """Of the layout of the files, in the card PATVERS."""
-
-_SUFFIXES = (".fits", ".fits.gz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +130,7 @@ class PatternLibrary:
         if not path.is_dir():
             patterns, validation = _read(path)
             return cls(patterns, validation)
-        files = sorted(each for each in path.iterdir() if each.name.endswith(_SUFFIXES))
+        files = fits_files(path)
         if not files:
             raise CorruptFileError(
                 f"{path}: the folder has no FITS files, expected some that the command learn wrote"
@@ -249,7 +253,7 @@ def _covered(pattern: MeasuredPattern, observation: Observation) -> float:
 
 def _identity(pattern: MeasuredPattern) -> tuple[object, ...]:
     """The frame that a pattern was measured in, and the flat field it was calibrated with."""
-    name = pattern.frame.removesuffix(".gz")
+    name = unpacked_name(pattern.frame)
     return (name or id(pattern), pattern.date, pattern.filter, pattern.detector, pattern.flat)
 
 

@@ -173,12 +173,13 @@ def subtract_by_refinement(
     from pyklip_diffrender.reduction.verdict import warn_of_status
 
     groups = list(pointings_of(observation) if pointings is None else pointings)
-    science = tuple(group.observation for group in groups)
+    # Averaged before they are cut, as the means of files are, so that the weights are the same.
+    science = tuple(group.observation.combined() for group in groups)
     sequence = FrameSequence(observation.target, science, tuple(references))
     options = _options(settings, observation, references)
     preparation = prepare(sequence, opd, options, model=model)
     tell(
-        f"fitting {_counted(sum(map(len, science)), 'frame')} of "
+        f"fitting {_counted(sum(each.count for each in science), 'frame')} of "
         f"{_counted(len(science), 'pointing')}"
         f"{'' if len(science) == 1 else ' together'}, {model.detector.shape[1]} x "
         f"{model.detector.shape[0]} pixels"
@@ -193,7 +194,7 @@ def subtract_by_refinement(
     cut = preparation.sequence.science
     fitted = tuple(
         FittedPointing(
-            fit, k, group, window, fit.frames[k].observation.center[0] - cut[k].center.mean(axis=0)
+            fit, k, group, window, fit.frames[k].observation.center[0] - cut[k].center[0]
         )
         for k, (group, window) in enumerate(zip(groups, windows, strict=True))
     )

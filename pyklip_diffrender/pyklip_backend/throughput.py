@@ -110,7 +110,7 @@ def _at(
             core = _cores(fit.frames[k].model, templates.pixels_of(k, offsets))
             peak = np.einsum("kyx,kyx->k", core, image.numpy())
             share = np.einsum("kyx,kyx->k", core, fit.linear.frames[k].image(change).numpy())
-            count = len(fit.frames[k].observation)
+            count = fit.frames[k].observation.count
             # Where a frame does not show the source, nothing of it is taken.
             taken += count * np.divide(share, peak, out=np.zeros_like(share), where=peak > 0)
             total += count

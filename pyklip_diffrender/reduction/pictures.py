@@ -376,7 +376,7 @@ def _star(reduction: Reduction, frame: int) -> list[Picture]:
     """Data, model and residual of a frame."""
     detection = reduction.detection
     observation = detection.fits[0].frames[frame].observation
-    unit, count = drawing.unit_label(observation.unit), len(observation)
+    unit, count = drawing.unit_label(observation.unit), observation.count
     subtracted = (
         " The star was estimated together with the candidates (circles), whose light is kept."
         if len(detection.candidates)

@@ -88,7 +88,7 @@ class Reduction:
         """Number of frames of reference stars that the flat-field pattern was learned from."""
         if self.systematics is None:
             return 0
-        return sum(len(frame.observation) for fit in self.references for frame in fit.frames)
+        return sum(frame.observation.count for fit in self.references for frame in fit.frames)
 
     @property
     def remark(self) -> str:

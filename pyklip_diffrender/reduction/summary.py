@@ -293,7 +293,7 @@ def _frame(observation: Observation, use: str) -> dict[str, Any]:
         "star": observation.target,
         "date": None if observation.date is None else observation.date.isot,
         "position_angle_deg": observation.position_angle if oriented else None,
-        "integrations": len(observation),
+        "integrations": observation.count,
         "exposure_s": observation.header.get("EFFEXPTM"),
         "pixels_used": observation.valid.mean(),
         "file": observation.name,

@@ -350,9 +350,9 @@ def _unexplained(aligned: Refinement) -> float:
     def excess(part: float) -> float:
         return float(np.median(square / (noise + part**2 * light)) - chi2.ppf(0.5, 1))
 
-    return (
-        float(brentq(excess, 0.0, 1.0)) if excess(0.0) > 0 > excess(1.0) else float(excess(0) > 0)
-    )
+    if excess(0.0) <= 0:
+        return 0.0
+    return 1.0 if excess(1.0) >= 0 else float(brentq(excess, 0.0, 1.0))
 
 
 def _frame_chi2(fit: Refinement) -> NDArray[np.float64]:
@@ -383,8 +383,8 @@ def _contradicting(joint: Refinement, science: int) -> dict[str, str]:
         name = frame.observation.name
         if values[k] > limit:
             reasons[name] = (
-                f"the model that explains the target leaves it a chi-squared of {values[k]:.2f} per "
-                "pixel"
+                "the model that explains the target leaves it a chi-squared of "
+                f"{values[k]:.2f} per pixel"
             )
     for name, reason in reasons.items():
         _log.warning("%s is left out: %s", name, reason)

@@ -59,7 +59,7 @@ class Row:
         date, count = exposure.date, exposure.integrations
         if frames is not None:
             angle, offset = frames.north, frames.star_offset
-            date, count = frames.date, len(frames)
+            date, count = frames.date, frames.count
         elif any(exposure.offset):
             offset = exposure.offset
         place = exposure.star.coordinates

@@ -258,9 +258,9 @@ def undo_shifts(
     unknown = ~(np.isfinite(error) & (error > 0))
     pairs = [filled(frame, gap) for frame, gap in zip(data, missing, strict=True)]
     moved = shift_frames(np.stack([frame for frame, _ in pairs]), shifts)
-    doubt = np.stack([each for _, each in pairs]) ** 2
+    leaked = _spread(np.stack([each for _, each in pairs]) ** 2, shifts)
+    del pairs  # They are as large as the frames.
     gaps = _spread((missing | unknown).astype(float), shifts)
-    leaked = _spread(doubt, shifts)
     variance = shift_variances(error, ~unknown, shifts)
     valid = (leaked < _DOUBT * variance) & (gaps < _PART)
     return moved, np.sqrt(variance + leaked), valid

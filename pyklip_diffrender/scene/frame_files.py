@@ -13,7 +13,7 @@ from astropy import units as u
 from astropy.io import fits
 
 from pyklip_diffrender.errors import DiffrenderError, NoValidPixelsError
-from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.io.files import fits_files, open_fits, unpacked_name
 from pyklip_diffrender.io.headers import merged_header
 from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
@@ -27,8 +27,6 @@ __all__ = [
     "require_some",
     "with_references",
 ]
-
-_SUFFIXES = (".fits", ".fits.gz")
 
 _SENSED = "RESULT_PHASE"
 """Extension of wavefront-sensing files of MAST."""
@@ -77,7 +75,7 @@ class FrameFile:
         Its frames, one for every integration, or why they cannot be read; None for a file that is
         read when its frames are needed.
     observation : Observation or None
-        The frames of integrations that are used, once they were read.
+        The mean of the integrations of each pointing that are used, once they were read.
     """
 
     path: Path
@@ -97,13 +95,15 @@ class FrameFile:
         if product:
             return cls(path, Exposure(path.name), reason=product, is_product=True)
         try:
-            header = merged_header(hdus[0].header, hdus["SCI"].header, path.name)
-            file = cls(path, Exposure.of(header, path.name, np.shape(hdus["SCI"].data)))
+            science = hdus["SCI"]
+            header = merged_header(hdus[0].header, science.header, path.name)
+            shape = tuple(science.shape) if science.is_image else ()
+            file = cls(path, Exposure.of(header, path.name, shape))
         except DiffrenderError as error:
             file = cls(path, Exposure(path.name), reason=_without_name(error, path.name))
         if frames:
             try:
-                file.frames = Observation.from_hdus(hdus, path.name)
+                file.frames = Observation.from_hdus(hdus, path)
             except DiffrenderError as error:
                 file.frames = error
         return file
@@ -112,7 +112,7 @@ class FrameFile:
     def opened(cls, path: Path, *, frames: bool) -> FrameFile:
         """Open a file once, and read its header, and its frames if they are asked for."""
         try:
-            with open_fits(path) as hdus:
+            with open_fits(path, images=False) as hdus:
                 return cls.in_hdus(hdus, path, frames=frames)
         except DiffrenderError as error:
             return cls(path, Exposure(path.name), reason=_without_name(error, path.name))
@@ -123,22 +123,21 @@ class FrameFile:
         return self.path.name
 
     def read(self) -> Observation | None:
-        """The frames of integrations that are used, read once; None, with the reason, if none."""
+        """The means of the file, read once; None, with the reason, if it has none."""
         if self.observation is None and not self.reason:
             try:
-                self.observation = self._used()
+                self.observation = self._means()
             except DiffrenderError as error:
                 self.reason = _without_name(error, self.name)
         return self.observation
 
-    def _used(self) -> Observation:
-        """The frames of integrations that are used."""
+    def _means(self) -> Observation:
+        """The mean of the integrations of each pointing that are used."""
         if isinstance(self.frames, DiffrenderError):
             raise self.frames
         if self.frames is None:
-            return Observation.from_fits(self.path, star=self.place)
-        used = self.frames.valid.any(axis=(1, 2))
-        return self.frames if used.all() else self.frames.part(np.flatnonzero(used))
+            return Observation.means_from_fits(self.path, star=self.place)
+        return self.frames.means()
 
 
 def _without_name(error: Exception, name: str) -> str:
@@ -167,7 +166,7 @@ def exposures_in(
     paths: list[Path] = []
     for each in map(Path, entries):
         if each.is_dir():
-            inside = sorted(p for p in each.iterdir() if p.name.lower().endswith(_SUFFIXES))
+            inside = fits_files(each)
             if not inside:
                 raise NoValidPixelsError(f"{each}: the folder has no FITS files")
             paths += inside
@@ -243,7 +242,7 @@ def exclude_unusable(
     _exclude_duplicates(admissible(files), lambda each: str(each.path.resolve()), _same_file)
     # The same file, packed and unpacked.
     _exclude_duplicates(
-        admissible(files), lambda each: str(each.path.resolve()).removesuffix(".gz"), _same_file
+        admissible(files), lambda each: unpacked_name(str(each.path.resolve())), _same_file
     )
     _exclude_duplicates(admissible(files), _moment, _same_exposure, judge)
 

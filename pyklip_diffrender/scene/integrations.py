@@ -6,8 +6,9 @@ empty, or has the afterglow of an earlier exposure, would spoil the average.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,20 @@ from scipy.stats import median_abs_deviation
 
 from pyklip_diffrender.io.geometry import half_circle
 
-__all__ = ["Judgement", "empty_integrations", "judge_integrations", "judge_pointings", "pointings"]
+__all__ = [
+    "Judgement",
+    "compressed",
+    "empty_integrations",
+    "judge_integrations",
+    "judge_pointings",
+    "pointings",
+]
 
 Stack = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+_AT_ONCE = 2**18
+"""Pixels of which the median is taken at once, which bounds the memory that it takes."""
 
 _FEW = 3
 """Integrations below which none is an exception among the others."""
@@ -66,25 +77,31 @@ class Judgement:
     ----------
     kept : ndarray of bool, (frames,)
         Integrations that are used.
-    valid : ndarray of bool, (frames, ny, nx)
-        Pixels that are used.
     remarks : tuple of str
         Integrations and pixels that were left out, and why.
     """
 
     kept: NDArray[np.bool_]
-    valid: Mask
     remarks: tuple[str, ...]
 
 
-def empty_integrations(data: Stack, valid: Mask) -> Judgement:
+def compressed(stack: NDArray[Any], kept: NDArray[np.bool_]) -> NDArray[Any]:
+    """The frames of a stack, (frames, ...), that are kept, moved to its beginning in place."""
+    where = np.flatnonzero(kept)
+    for k, old in enumerate(where):
+        if k != old:
+            stack[k] = stack[old]
+    return stack[: len(where)]
+
+
+def empty_integrations(data: Stack, valid: Iterable[Mask]) -> Judgement:
     """Find integrations without usable pixels, or whose pixels all have one value.
 
     Parameters
     ----------
     data : ndarray, (frames, ny, nx)
-    valid : ndarray of bool, (frames, ny, nx)
-        Finite pixels with errors and without flags.
+    valid : iterable of ndarray of bool, (ny, nx)
+        Finite pixels of every frame with errors and without flags.
     """
     kept = np.ones(len(data), dtype=bool)
     remarks = []
@@ -98,7 +115,7 @@ def empty_integrations(data: Stack, valid: Mask) -> Judgement:
             continue
         kept[k] = False
         remarks.append(f"integration {k + 1} of {len(data)} is left out: {reason}")
-    return Judgement(kept, valid, tuple(remarks))
+    return Judgement(kept, tuple(remarks))
 
 
 def judge_integrations(
@@ -108,36 +125,43 @@ def judge_integrations(
     center: Stack,
     pixelscale: tuple[float, float],
     names: Sequence[str],
+    group: NDArray[np.intp] | None = None,
 ) -> Judgement:
     """Compare integrations of one pointing with their median.
 
     The star's light may move by a twentieth of a pixel and change by 3 % between integrations.
     Larger deviations that are significant are masked; an integration is left out if they are a
     quarter of the pixels within 3 arcsec of the star, or if its star is 15 % brighter or fainter.
+    The stacks are never copied as a whole, because they may be larger than the memory.
 
     Parameters
     ----------
     data, error : ndarray, (frames, ny, nx)
     valid : ndarray of bool, (frames, ny, nx)
+        Pixels that deviate are masked in place.
     center : ndarray, (frames, 2)
         x, y of the star.
     pixelscale : tuple of float
         x, y, arcsec per pixel.
     names : sequence of str
         Names of the integrations in remarks, such as "integration 3 of 8".
+    group : ndarray of int, optional
+        Indices of the integrations of the pointing; default all.
     """
-    count = len(data)
-    kept, left = np.ones(count, dtype=bool), valid.copy()
-    if count < _FEW:
-        return Judgement(kept, left, ())
-    median = _median(data, valid)
+    group = np.arange(len(data)) if group is None else group
+    kept = np.ones(len(data), dtype=bool)
+    if len(group) < _FEW:
+        return Judgement(kept, ())
+    median = _median(data, valid, group)
     rows, columns = np.indices(median.shape)
-    x, y = center.mean(axis=0)
+    x, y = center[group].mean(axis=0)
     near = np.hypot((columns - x) * pixelscale[0], (rows - y) * pixelscale[1]) < _NEAR
     remarks = []
     slopes = np.hypot(*np.gradient(median))
     allowed = _JITTER * slopes + _CHANGE * np.abs(median)
-    for k, (frame, sigma, usable, name) in enumerate(zip(data, error, valid, names, strict=True)):
+    for k in group:
+        frame, sigma = data[k].astype(float), error[k].astype(float)
+        usable, name = valid[k], names[k]
         scale = _brightness(frame, median, sigma, usable & near)
         if abs(scale - 1) > _FACTOR:
             kept[k] = False
@@ -155,13 +179,13 @@ def judge_integrations(
                 f"{_NEAR:g} arcsec of the star deviate from the median of all"
             )
         elif deviating.any():
-            left[k] &= ~deviating
+            usable &= ~deviating
             if deviating.sum() > _PATCH**2:
                 remarks.append(
                     f"{name}: {int(deviating.sum())} pixels that deviate "
                     "from the median of all are masked"
                 )
-    return Judgement(kept, left, tuple(remarks))
+    return Judgement(kept, tuple(remarks))
 
 
 def judge_pointings(
@@ -178,29 +202,33 @@ def judge_pointings(
     Parameters
     ----------
     data, error, valid, center, pixelscale, names
-        See `judge_integrations`.
+        See `judge_integrations`, which masks pixels in place.
     angles : ndarray, (frames,), or None
         Position angles, degrees.
     """
-    kept, left = np.ones(len(data), dtype=bool), valid.copy()
+    kept = np.ones(len(data), dtype=bool)
     remarks: tuple[str, ...] = ()
     for group in pointings(center, angles):
-        named = [names[k] for k in group]
-        part = judge_integrations(
-            data[group], error[group], valid[group], center[group], pixelscale, named
-        )
-        kept[group], left[group] = part.kept, part.valid
+        part = judge_integrations(data, error, valid, center, pixelscale, names, group)
+        kept &= part.kept
         remarks += part.remarks
-    return Judgement(kept, left, remarks)
+    return Judgement(kept, remarks)
 
 
-def _median(data: Stack, valid: Mask) -> Stack:
-    """Median of the valid pixels; 0 where there are none."""
-    ordered = np.sort(np.where(valid, data, np.inf), axis=0)
-    count = valid.sum(axis=0)
-    low, high = np.maximum(count - 1, 0) // 2, count // 2
-    pair = [np.take_along_axis(ordered, each[None], axis=0)[0] for each in (low, high)]
-    return np.where(count > 0, np.where(count > 0, pair[0] + pair[1], 0.0) / 2, 0.0)
+def _median(data: Stack, valid: Mask, group: NDArray[np.intp]) -> Stack:
+    """Median of the valid pixels of some frames, (ny, nx); 0 where there are none."""
+    median = np.zeros(data.shape[1:])
+    rows = max(1, _AT_ONCE // (len(group) * data.shape[2]))
+    for first in range(0, len(median), rows):
+        part = slice(first, first + rows)
+        usable = valid[group, part]
+        ordered = np.sort(np.where(usable, data[group, part], np.inf), axis=0)
+        count = usable.sum(axis=0)
+        low, high = np.maximum(count - 1, 0) // 2, count // 2
+        pair = [np.take_along_axis(ordered, each[None], axis=0)[0] for each in (low, high)]
+        total = pair[0].astype(float) + pair[1]
+        median[part] = np.where(count > 0, total, 0.0) / 2
+    return median
 
 
 def _brightness(frame: Stack, median: Stack, sigma: Stack, usable: Mask) -> float:

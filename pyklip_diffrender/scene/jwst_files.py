@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +18,11 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
     UnitError,
 )
+from pyklip_diffrender.io.files import read_image
 from pyklip_diffrender.io.headers import header_number, header_text, merged_header
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.scene.archive_names import detector_of
+from pyklip_diffrender.scene.checked_frames import usable_pixels
 from pyklip_diffrender.scene.detector_pixels import (
     SHIFTS,
     first_pixel,
@@ -29,7 +33,7 @@ from pyklip_diffrender.scene.detector_pixels import (
     undo_shifts,
 )
 from pyklip_diffrender.scene.exposure import beginning, middle, position_angle
-from pyklip_diffrender.scene.integrations import Judgement, empty_integrations
+from pyklip_diffrender.scene.integrations import Judgement, compressed, empty_integrations
 from pyklip_diffrender.scene.star_place import measured_offset
 
 _log = logging.getLogger(__name__)
@@ -66,15 +70,23 @@ _CROPPED = 32
 
 
 def read_calints(
-    hdus: fits.HDUList, name: str, star: tuple[float, float] | None = None
+    hdus: fits.HDUList,
+    path: str | os.PathLike[str],
+    *,
+    compact: bool = False,
+    star: tuple[float, float] | None = None,
 ) -> tuple[dict[str, Any], NDArray[Any] | None]:
     """Read an open calints file; see `Observation.from_fits`.
 
     Parameters
     ----------
     hdus : HDUList
-    name : str
+        From `open_fits`, whose images need not be read.
+    path : path
         The file's.
+    compact : bool
+        Keep pixels and errors in single precision if the file does: with the mask they then take
+        three quarters of the file's size.
     star : tuple of float, optional
         x, y of the star, in place of what the header says.
 
@@ -85,6 +97,7 @@ def read_calints(
     shifts : ndarray, (frames, 2), or None
         By how much spaceKLIP has shifted the frames, see `recorded_shifts`.
     """
+    name = Path(path).name
     if "SCI" not in hdus:
         raise CorruptFileError(
             f"{name}: no SCI extension, only {[h.name for h in hdus]}; expected a JWST calints file"
@@ -94,25 +107,23 @@ def read_calints(
     for hdu in hdus:
         if hdu.name in ("SCI", "ERR", "DQ") and not hdu.is_image:
             raise CorruptFileError(f"{name}: {hdu.name} is a table, not an image")
-        if hdu.name in ("SCI", "ERR", "DQ") and hdu.data is None:
+        if hdu.name in ("SCI", "ERR", "DQ") and not hdu.shape:
             raise CorruptFileError(f"{name}: {hdu.name} has no data, so no frames")
-    data = native_float64(science.data)
+    single = compact and science.header["BITPIX"] == -32
+    as_float = _single_precision if single else native_float64
+    data = read_image(science, path, as_float)
     if "ERR" not in hdus:
         raise CorruptFileError(f"{name}: no ERR extension; the fit needs errors")
-    error = native_float64(hdus["ERR"].data)
+    error = read_image(hdus["ERR"], path, as_float)
     if "DQ" in hdus:
-        quality = np.asarray(hdus["DQ"].data)
-        if quality.dtype.kind not in "iu":
-            raise CorruptFileError(
-                f"{name}: DQ holds {quality.dtype.name}, expected integers (flags)"
-            )
+        valid = read_image(hdus["DQ"], path, lambda flags: _unflagged(flags, name))
     else:
         warnings.warn(
             f"{name}: no DQ extension; only NaN pixels are masked",
             DiffrenderWarning,
             stacklevel=3,
         )
-        quality = np.zeros(data.shape, dtype=np.uint32)
+        valid = np.ones(data.shape, dtype=bool)
     mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
     details = _details(header, 1 if data.ndim == 2 else len(data), name)
     if star is not None:
@@ -125,7 +136,7 @@ def read_calints(
     arguments = {
         "data": data,
         "error": error,
-        "valid": (quality.astype(np.uint32) & BAD_PIXEL_BITS) == 0,
+        "valid": valid,
         **details,
     }
     if mask is not None:
@@ -147,6 +158,18 @@ def read_calints(
     return arguments, shifts
 
 
+def _single_precision(image: Any) -> NDArray[np.float32]:
+    return np.array(image, dtype=np.float32, order="C")
+
+
+def _unflagged(flags: Any, name: str) -> NDArray[np.bool_]:
+    """Pixels without a flag of `BAD_PIXEL_BITS`, (ny, nx)."""
+    flags = np.asarray(flags)
+    if flags.dtype.kind not in "iu":
+        raise CorruptFileError(f"{name}: DQ holds {flags.dtype.name}, expected integers (flags)")
+    return (flags.astype(np.uint32) & BAD_PIXEL_BITS) == 0
+
+
 def without_empty(
     arguments: dict[str, Any], shifts: NDArray[Any] | None
 ) -> tuple[dict[str, Any], NDArray[Any] | None, Judgement | None]:
@@ -158,8 +181,7 @@ def without_empty(
     data, error, valid = (each[None] if each.ndim == 2 else each for each in stacks)
     if data.ndim != 3 or not data.shape == error.shape == valid.shape:
         return arguments, shifts, None
-    usable = valid & np.isfinite(data) & np.isfinite(error) & (error > 0)
-    judgement = empty_integrations(data, usable)
+    judgement = empty_integrations(data, map(usable_pixels, data, error, valid))
     if judgement.kept.all():
         return arguments, shifts, None
     name, remarks = arguments["name"], judgement.remarks
@@ -168,7 +190,11 @@ def without_empty(
     for remark in remarks:
         _log.warning("%s: %s", name, remark)
     kept = judgement.kept
-    changed = {"data": data[kept], "error": error[kept], "valid": valid[kept]}
+    changed = {
+        "data": compressed(data, kept),
+        "error": compressed(error, kept),
+        "valid": compressed(valid, kept),
+    }
     if arguments["position_angles"] is not None:
         changed["position_angles"] = arguments["position_angles"][kept]
     return arguments | changed, None if shifts is None else shifts[kept], judgement
@@ -263,7 +289,7 @@ def on_detector_pixels(
     Parameters
     ----------
     arguments : dict
-        See `read_calints`.
+        See `read_calints`. Its arrays are overwritten.
     center : ndarray, (frames, 2)
         x, y of the star, 0-indexed.
     shifts : ndarray, (frames, 2)
@@ -294,17 +320,24 @@ def on_detector_pixels(
         mask = mask - begin
     net = net_shifts(shifts, center, mask)
     pixels = np.round(net.mean(axis=0))
-    shifted, sigma, good = undo_shifts(data, error, pixels - net)
     # The alignment leaves the flags where they were; a crop takes them along.
     cropped = np.abs(pixels).max() > _CROPPED
     right, up = (int(each) for each in (np.round(shifts.mean(axis=0)) if cropped else pixels))
-    good &= np.roll(usable, (up, right), axis=(1, 2))
+    for k in range(frames):
+        part = slice(k, k + 1)
+        # In double precision: the shift adds up many pixels.
+        shifted, sigma, good = undo_shifts(
+            data[part].astype(float), error[part].astype(float), (pixels - net)[part]
+        )
+        good &= np.roll(usable[part], (up, right), axis=(1, 2))
+        data[part], error[part] = np.where(good, shifted, 0.0), np.where(good, sigma, 1.0)
+        usable[part] = good
     column, row = (int(each) for each in begin - pixels)
     sure = mask is not None and on_detector((column, row), data.shape[1:])
     agree = mask is not None and _records_agree(arguments, center - mask - shifts)
     if sure and is_measured and not agree:
         # The whole pixels of the place are those of the star's stated position.
-        frame = shifted[0], sigma[0], good[0]
+        frame = data[0].astype(float), error[0].astype(float), usable[0]
         scale = float(np.mean(arguments["pixelscale"]))
         away = measured_offset(*frame, (center + pixels - net)[0], scale)
         if away is not None and np.abs(away).max() > _MISPLACED:
@@ -315,9 +348,9 @@ def on_detector_pixels(
             )  # fmt: skip
             sure = False
     return {
-        "data": np.where(good, shifted, 0.0),
-        "error": np.where(good, sigma, 1.0),
-        "valid": good,
+        "data": data,
+        "error": error,
+        "valid": usable,
         "center": center + pixels - net,
         "first_pixel": (column, row) if sure else None,
     }

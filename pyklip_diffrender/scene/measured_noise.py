@@ -51,6 +51,8 @@ def calibrated_errors(
     center: Image,
     pixelscale: tuple[float, float],
     name: str = "frames",
+    *,
+    out: Image | None = None,
 ) -> tuple[Image, tuple[float, ...]]:
     """Correct the part of the errors that does not depend on the light.
 
@@ -71,6 +73,8 @@ def calibrated_errors(
         x, y, arcsec per pixel.
     name : str
         For the log.
+    out : ndarray, (frames, ny, nx), optional
+        For the new errors, in place of a new array; may be `error`.
 
     Returns
     -------
@@ -95,12 +99,12 @@ def calibrated_errors(
     >>> bool(abs(error.mean() - 0.5) < 0.01), bool(abs(ratio - 0.5) < 0.01)
     (True, True)
     """
-    corrected, ratios = error.copy(), []
+    corrected, ratios = error.copy() if out is None else out, []
     for k, (ratio, floor) in enumerate(_measured(data, error, valid, center, pixelscale)):
         ratios.append(ratio)
         if not ratio > 0:
             continue
-        sigma = error[k]
+        sigma = error[k].astype(float)
         least = min(ratio, 1.0) * sigma
         variance = np.maximum(sigma**2 + (ratio**2 - 1) * floor**2, least**2)
         corrected[k] = np.where(valid[k], np.sqrt(variance), sigma)
@@ -109,12 +113,16 @@ def calibrated_errors(
 
 
 def weighted_mean(
-    data: Image, error: Image, valid: NDArray[np.bool_]
+    data: Image,
+    error: Image,
+    valid: NDArray[np.bool_],
+    which: Iterable[int] | None = None,
 ) -> tuple[Image, Image, NDArray[np.bool_]]:
     """Mean of frames, (frames, ny, nx), each weighted by its inverse median variance.
 
     The errors of single pixels are no weights: they come from the counts of the pixels, so that
-    low counts would weigh more, and the mean would be too low.
+    low counts would weigh more, and the mean would be too low. `which` are the indices of the
+    frames, by default of all.
 
     Returns
     -------
@@ -131,18 +139,19 @@ def weighted_mean(
     >>> bool(abs((mean - 5.0).mean()) < 0.3 * deviation.mean())
     True
     """
-    variance = np.where(valid, error, 1.0) ** 2
-    typical = [
-        np.median(v[use]) if use.any() else 1.0 for v, use in zip(variance, valid, strict=True)
-    ]
-    weight = valid / np.reshape(typical, (-1, 1, 1))
-    total = weight.sum(axis=0)
+    light, noise, total = np.zeros((3, *data.shape[1:]))
+    # Frame by frame, which takes no memory.
+    for k in range(len(data)) if which is None else which:
+        frame, usable = data[k], valid[k]
+        variance = error[k].astype(float) ** 2
+        weight = 1 / np.median(variance[usable]) if usable.any() else 1.0
+        # Masked pixels may have any value if the data were replaced, also NaN.
+        light += np.where(usable, weight * frame, 0.0)
+        noise += np.where(usable, weight**2 * variance, 0.0)
+        total += weight * usable
     covered = total > 0
     safe = np.where(covered, total, 1.0)
-    # Masked pixels may have any value if the data were replaced, also NaN.
-    mean = (weight * np.where(valid, data, 0.0)).sum(axis=0) / safe
-    deviation = np.sqrt((weight**2 * variance).sum(axis=0)) / safe
-    return mean, np.where(covered, deviation, 1.0), covered
+    return light / safe, np.where(covered, np.sqrt(noise) / safe, 1.0), covered
 
 
 def dark_pixels(frame: Image, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -218,6 +227,7 @@ def _measured(
     """Ratio and median of the errors far from the star, for every frame; NaN if not known."""
     y, x = np.indices(data.shape[1:])
     for k, (frame, sigma, usable) in enumerate(zip(data, error, valid, strict=True)):
+        frame, sigma = frame.astype(float), sigma.astype(float)
         away = np.hypot((x - center[k, 0]) * pixelscale[0], (y - center[k, 1]) * pixelscale[1])
         # A pixel is compared only where all of its neighbours are usable.
         complete = convolve(usable.astype(float), _NEIGHBOURS, mode="constant") > 0.99

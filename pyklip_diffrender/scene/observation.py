@@ -20,7 +20,12 @@ from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.catalogue_star import star_of
 from pyklip_diffrender.scene.checked_frames import checked_frames, selected
 from pyklip_diffrender.scene.exposure import instrument_of
-from pyklip_diffrender.scene.file_frames import frames_in, frames_of_file
+from pyklip_diffrender.scene.file_frames import (
+    frames_in,
+    frames_of_file,
+    means_of_file,
+    means_of_pointings,
+)
 from pyklip_diffrender.scene.integrations import pointings
 from pyklip_diffrender.scene.measured_noise import weighted_mean
 from pyklip_diffrender.scene.window import Window
@@ -68,6 +73,9 @@ class Observation:
     noise_ratios : tuple of float
         Scatter of the file's pixels far from the star over their stated errors, for every frame,
         before the errors were corrected; NaN where it could not be measured.
+    integrations : tuple of int
+        Number of integrations of the detector that each frame is the mean of; empty where each
+        frame is one.
 
     Examples
     --------
@@ -99,6 +107,7 @@ class Observation:
     header: fits.Header = field(default_factory=fits.Header)
     remarks: tuple[str, ...] = ()
     noise_ratios: tuple[float, ...] = ()
+    integrations: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.position_angles is not None:
@@ -191,12 +200,49 @@ class Observation:
         return cls(**frames_of_file(path, every_integration=every_integration, star=star))
 
     @classmethod
-    def from_hdus(cls, hdus: fits.HDUList, name: str) -> Observation:
-        """Read an open calints file of that name, with a frame for every integration.
+    def from_hdus(cls, hdus: fits.HDUList, path: str | os.PathLike[str]) -> Observation:
+        """Read the calints file at that path, which `open_fits` has opened, as `from_fits` does.
 
-        See `from_fits`.
+        There is a frame for every integration.
         """
-        return cls(**frames_in(hdus, name, every_integration=True))
+        return cls(**frames_in(hdus, path, every_integration=True))
+
+    @classmethod
+    def means_from_fits(
+        cls, path: str | os.PathLike[str], *, star: tuple[float, float] | None = None
+    ) -> Observation:
+        """Read a file as `from_fits` does, and average the integrations of each of its pointings.
+
+        A fit takes such means in any case. A file of thousands of integrations is never in memory
+        as a whole: it takes at most as much memory as the file has bytes, and usually less.
+
+        Parameters
+        ----------
+        path : path
+        star : tuple of float, optional
+            See `from_fits`.
+
+        Returns
+        -------
+        Observation
+            One frame for each pointing, see `pointings`; `integrations` says of how many it is the
+            mean, and `noise_ratios` has the ratio of the integration in which it is farthest from
+            one.
+
+        Raises
+        ------
+        CorruptFileError, UnitError, ShapeError, NoValidPixelsError
+            As `from_fits`.
+        """
+        return cls(**means_of_file(path, star=star))
+
+    def means(self) -> Observation:
+        """Average the frames of each pointing, without those that have no valid pixel.
+
+        See `means_from_fits`.
+        """
+        used = np.flatnonzero(self.valid.any(axis=(1, 2)))
+        return replace(self, **means_of_pointings(vars(self), used))
 
     def part(self, which: NDArray[np.intp]) -> Observation:
         """Select frames by their indices."""
@@ -224,7 +270,7 @@ class Observation:
         }
         offsets = [each.star_offset for each in every if each.star_offset is not None]
         if len(offsets) == len(every):
-            x, y = np.average(offsets, axis=0, weights=[len(each) for each in every])
+            x, y = np.average(offsets, axis=0, weights=[each.count for each in every])
             changed["star_offset"] = (float(x), float(y))
         middles = [each.mid_date for each in every if each.mid_date is not None]
         if len(middles) == len(every):
@@ -236,6 +282,9 @@ class Observation:
             name=f"{self.name} and {len(others)} more",
             remarks=tuple(remark for each in every for remark in each.remarks),
             noise_ratios=tuple(ratio for each in every for ratio in each.noise_ratios),
+            integrations=tuple(count for each in every for count in each.counts)
+            if any(each.integrations for each in every)
+            else (),
             **changed,
         )
 
@@ -278,6 +327,21 @@ class Observation:
                 "Position angle of +y": None if self.north is None else f"{self.north:.2f} deg",
             },
         )
+
+    @property
+    def count(self) -> int:
+        """Number of integrations, also of those that frames are means of."""
+        return sum(self.counts)
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Number of integrations that each frame is the mean of; 1 where it is one."""
+        return self.integrations or (1,) * len(self)
+
+    @property
+    def mean_center(self) -> NDArray[np.float64]:
+        """Mean x, y of the star in all integrations, (2,), 0-indexed pixels."""
+        return np.asarray(np.average(self.center, axis=0, weights=self.counts))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -446,6 +510,7 @@ class Observation:
             data=data[None],
             error=error[None],
             valid=valid[None],
-            center=self.center.mean(axis=0, keepdims=True),
+            integrations=(self.count,),
+            center=self.mean_center[None],
             position_angles=None if self.position_angles is None else self.position_angles[:1],
         )

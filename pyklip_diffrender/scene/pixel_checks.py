@@ -194,7 +194,7 @@ def _contrast_of_source(observation: Observation) -> float:
     data, _, valid = _mean(observation)
     image = np.where(valid, data - float(np.quantile(data[valid], 0.25)), 0.0)
     rows, columns = np.indices(image.shape)
-    x, y = observation.center.mean(axis=0)
+    x, y = observation.mean_center
     outside = np.hypot(columns - x, rows - y) * scale > _OUTSIDE
     peak = _peak(np.where(outside, gaussian_filter(image, 1.0), -np.inf))
     if _likeness(image, peak, source, _peak(source), scale) < _LIKE_A_SOURCE:
@@ -260,7 +260,7 @@ def brightness(observation: Observation) -> float:
     if stamp is None:
         return np.nan
     image = stamp[0]
-    center = observation.center.mean(axis=0)
+    center = observation.mean_center
     x, y = center - np.round(center)
     rows, columns = np.indices(image.shape) - len(image) // 2
     distance = np.hypot(columns - x, rows - y) * float(np.mean(observation.pixelscale))
@@ -439,7 +439,7 @@ def _stamp(observation: Observation) -> tuple[Image, Image, Image] | None:
     """Image about the star, distances from it (arcsec), and noise; None for small frames."""
     data, error, valid = _mean(observation)
     return stamp_about(
-        data, error, valid, observation.center.mean(axis=0), float(np.mean(observation.pixelscale))
+        data, error, valid, observation.mean_center, float(np.mean(observation.pixelscale))
     )
 
 
@@ -448,7 +448,7 @@ def _noise(observation: Observation, *, clipped: bool = True) -> tuple[Image, ND
     data, _, valid = _mean(observation)
     difference = data - convolve(data, _NEIGHBOURS, mode="nearest")
     rows, columns = np.indices(data.shape)
-    x, y = observation.center.mean(axis=0)
+    x, y = observation.mean_center
     far = np.hypot(columns - x, rows - y) * float(np.mean(observation.pixelscale)) > _FAR
     usable = valid & far
     typical = float(np.median(np.abs(difference[usable]))) if usable.any() else 0.0

@@ -344,7 +344,7 @@ class Sequence:
         science, references : tuple of Window
         """
         frames = (*self.science, *self.references)
-        windows = [Window.about(each.center.mean(axis=0), shape) for each in frames]
+        windows = [Window.about(each.mean_center, shape) for each in frames]
         places = [
             None if each.first_pixel is None else np.add(each.first_pixel, (window.x, window.y))
             for each, window in zip(frames, windows, strict=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.io.geometry import full_circle
 from pyklip_diffrender.io.opd_map import FLAT
 from pyklip_diffrender.surveys.checked_table import (
@@ -177,7 +178,7 @@ def read_config(source: str | os.PathLike[str] | Mapping[str, Any]) -> Config:
         path = Path(source)
         name, folder = path.name, path.parent
         try:
-            content = tomllib.loads(path.read_bytes().decode())
+            content = tomllib.loads(read_text(path))
         except OSError as error:
             raise CorruptFileError(f"{path}: cannot be read ({error.strerror})") from error
         # Deeply nested brackets exhaust the parser's stack.

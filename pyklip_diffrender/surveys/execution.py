@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import sys
 import time
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
@@ -123,8 +124,7 @@ def with_dask(
                     )
             except RuntimeError as error:
                 raise IncompatibleSetupError(
-                    f"the worker processes cannot be started ({error}). A script that calls survey "
-                    "needs `if __name__ == '__main__':`; workers = 0 does without processes"
+                    f"the worker processes cannot be started ({error}). " + _why_not_spawned()
                 ) from error
             address = stack.enter_context(cluster)
         try:
@@ -163,6 +163,21 @@ def with_dask(
                     "no worker process is left, and none can be started. Look at the memory of the "
                     "machine and start the survey again: finished jobs are kept"
                 )
+
+
+def _why_not_spawned() -> str:
+    """What keeps new processes from importing the main module, as far as it can be seen."""
+    main = sys.modules.get("__main__")
+    name = str(getattr(main, "__file__", None) or "<stdin>")
+    if name.startswith("<") and not hasattr(sys, "ps1"):
+        return (
+            "The script came from standard input, which they cannot read again, with or without a "
+            "guard: save it as a file; workers = 0 does without processes"
+        )
+    return (
+        "A script that calls survey needs `if __name__ == '__main__':`; workers = 0 does without "
+        "processes"
+    )
 
 
 @contextmanager

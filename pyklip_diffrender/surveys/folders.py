@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.surveys.jobs import Job
 
 __all__ = [
@@ -141,7 +142,7 @@ def encodable(value: Any) -> Any:
 def read_record(final: Path) -> Record | None:
     """Record of a published job; None if there is none, or not all of its products."""
     try:
-        record = json.loads((final / RECORD).read_text(encoding="utf-8"))
+        record = json.loads(read_text(final / RECORD))
         sizes = {name: (final / name).stat().st_size for name in record["products"]}
         whole = sizes == record["products"]
         whole &= record["job"]["key"].startswith(final.name.rpartition("_")[2])

@@ -13,7 +13,7 @@ from typing import Any
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
-from pyklip_diffrender.io.files import sha256
+from pyklip_diffrender.io.files import fits_files, sha256
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.opd_map import FLAT
 from pyklip_diffrender.scene.sequence import Sequence
@@ -27,8 +27,6 @@ _SWITCHES = ("wide", "disk", "completeness")
 
 _DIGITS = 12
 """Digits of the key at the end of the name of a folder."""
-
-_SUFFIXES = (".fits", ".fits.gz")
 
 
 @dataclass(frozen=True)
@@ -238,7 +236,7 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
     """Files of a folder, or the files themselves."""
     if len(paths) > 1 or not paths[0].is_dir():
         return list(paths)
-    inside = sorted(each for each in paths[0].iterdir() if each.name.endswith(_SUFFIXES))
+    inside = fits_files(paths[0])
     if not inside:
         raise CorruptFileError(f"{paths[0]}: the folder has no FITS files")
     return inside

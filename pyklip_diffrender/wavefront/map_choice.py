@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -21,11 +20,17 @@ from pyklip_diffrender.errors import (
     IncompatibleSetupError,
     MissingOPDError,
 )
+from pyklip_diffrender.io.files import BROKEN, fits_files
 from pyklip_diffrender.io.headers import header_text, merged_header, sensing_date
 from pyklip_diffrender.io.opd_map import FLAT, OPDMap
 from pyklip_diffrender.optics.grid import resample
 from pyklip_diffrender.wavefront.opd import as_opd_map, read_opd
-from pyklip_diffrender.wavefront.wss import EXTENSION, interpolate_wss
+from pyklip_diffrender.wavefront.wss import (
+    EXTENSION,
+    analysis_of,
+    interpolate_wss,
+    why_not_sensed_well,
+)
 
 __all__ = ["RULES", "Rule", "choose_map", "dated_maps", "wavefront_for"]
 
@@ -34,14 +39,6 @@ _log = logging.getLogger(__name__)
 Rule = Literal["nearest", "before", "after", "interpolate"]
 
 RULES: tuple[Rule, ...] = ("nearest", "before", "after", "interpolate")
-
-_SUFFIXES = (".fits", ".fits.gz", ".fit")
-
-_BROKEN = (
-    OSError, EOFError, ValueError, TypeError, KeyError, zlib.error, fits.VerifyError,
-    AstropyUserWarning,
-)  # fmt: skip
-"""Exceptions, and the warning, that astropy raises for files that are cut or damaged."""
 
 _OUTDATED = 200.0
 """Days between a map and the frames above which a warning is given: the telescope is realigned
@@ -56,7 +53,9 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
     folder : path
         Wavefront-sensing files of MAST, stpsf's files and other maps may be mixed. The date of a
         map is that of its header, else the one in the file's name. Files that are not wavefront
-        maps, and maps without a date, are skipped with a message to the log.
+        maps, and maps without a date, are skipped with a message to the log. So are those that
+        stpsf leaves out: analyses with known faults, and sensing in F187N. Of several analyses of
+        one sensing the last is used.
     date : str (ISO, UTC) or Time
         When the frames were taken.
     rule : "nearest", "before", "after" or "interpolate"
@@ -66,7 +65,8 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
     Returns
     -------
     OPDMap
-        Its `history` says how many days lie between the map and the date.
+        Its `history` says how many days lie between the map and the date, and which earlier
+        analyses it replaces.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
     if rule not in RULES:
         raise IncompatibleSetupError(f"rule: got {rule!r}, expected one of {', '.join(RULES)}")
     when = Time(date)
-    maps = dated_maps(Path(folder))
+    maps, superseded = _last_analyses(dated_maps(Path(folder)))
     before = max((each for each in maps if each[0] <= when), default=None)
     after = min((each for each in maps if each[0] >= when), default=None)
     sides = {"before": [before], "after": [after], "interpolate": [before, after]}
@@ -104,14 +104,40 @@ def choose_map(folder: str | os.PathLike[str], date: str | Time, rule: Rule = "n
             f"{max(maps)[0].isot[:10]}. The rule 'nearest' takes one of them"
         )
     # Once if a map is of exactly that date.
-    chosen = [read_opd(path) for _, path in sorted(set(filter(None, wanted)))]
+    paths = [path for _, path in sorted(set(filter(None, wanted)))]
+    chosen = [read_opd(path) for path in paths]
     notes = [f"{opd.name}, {opd.age(when)}" for opd in chosen]
     for opd in chosen:
         _warn_if_outdated(opd, when)
     opd = chosen[0] if len(chosen) == 1 else _interpolated(chosen[0], chosen[1], when)
     note = f"{rule} of {len(maps)} maps: {', '.join(notes)} {when.isot[:19]}"
     _log.info("wavefront map %s", note)
-    return replace(opd, history=(*opd.history, note))
+    replaced = [
+        f"{path.name} is the last analysis of its sensing, in place of {', '.join(earlier)}"
+        for path in paths
+        if (earlier := superseded.get(path))
+    ]
+    for line in replaced:
+        _log.warning("%s", line)
+    return replace(opd, history=(*opd.history, note, *replaced))
+
+
+def _last_analyses(
+    maps: list[tuple[Time, Path]],
+) -> tuple[list[tuple[Time, Path]], dict[Path, list[str]]]:
+    """Maps without those of which there is a later analysis, and the names that each replaces.
+
+    Maps of one moment to the second are of one sensing, whatever the order of the files.
+    """
+    sensings: dict[float, list[tuple[Time, Path]]] = {}
+    for date, path in maps:
+        sensings.setdefault(round(date.mjd * 86400.0), []).append((date, path))
+    last, superseded = [], {}
+    for several in sensings.values():
+        *earlier, latest = sorted(several, key=lambda each: analysis_of(each[1].name))
+        last.append(latest)
+        superseded[latest[1]] = [path.name for _, path in earlier]
+    return last, superseded
 
 
 def wavefront_for(opd: Any, date: Time | None) -> OPDMap:
@@ -146,7 +172,7 @@ def dated_maps(folder: Path) -> list[tuple[Time, Path]]:
     """Date and path of every wavefront map in a folder."""
     if not folder.is_dir():
         raise MissingOPDError(f"{folder}: no such folder, expected a folder of wavefront maps")
-    files = sorted(p for p in folder.iterdir() if p.name.endswith(_SUFFIXES) and p.is_file())
+    files = fits_files(folder)
     maps = []
     for path in files:
         try:
@@ -179,11 +205,18 @@ def _date_of_map(path: Path) -> Time:
                 if hdu.header.get("NAXIS") == 2 and hdu.header["NAXIS1"] == hdu.header["NAXIS2"]
             ]
             primary = hdus[0].header
-    except _BROKEN as error:
+    except BROKEN as error:
         raise CorruptFileError(f"not a complete FITS file ({error})") from error
     if not squares:
         raise LookupError("it has no square image")
     header = merged_header(primary, squares[0], path.name)
+    if sensed:
+        correction, observation = (
+            header_text(header, key, path.name) or "" for key in ("CORR_ID", "OBS_ID")
+        )
+        reason = why_not_sensed_well(correction or path.name.split("-")[0], observation)
+        if reason:
+            raise LookupError(reason)
     unit = header_text(header, "BUNIT", path.name)
     if not (sensed or _is_length(unit)):
         raise LookupError(f"its image is not a wavefront map: BUNIT is {unit!r}")

@@ -8,12 +8,16 @@ both at the sensing field point.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from astropy import units as u
 from astropy.time import Time
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
@@ -37,12 +41,71 @@ from pyklip_diffrender.wavefront.sensing import (
     stpsf_module,
 )
 
-__all__ = ["EXTENSION", "interpolate_wss", "load_wss_opd", "load_wss_opd_by_date"]
+__all__ = [
+    "EXTENSION",
+    "analysis_of",
+    "interpolate_wss",
+    "load_wss_opd",
+    "load_wss_opd_by_date",
+    "why_not_sensed_well",
+]
+
+_log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
 EXTENSION = "RESULT_PHASE"
 """Name of the extension that holds the map; only these files have one."""
+
+_INVALID = ("R2022083106",)
+"""Analyses with known faults (stpsf 2.2, ``mast_wss.deduplicate_opd_table``)."""
+
+_F187N = ("02106", "0210E", "03109", "0310H", "04109", "0410H")
+"""Activities of visits that sense in F187N as well, in which NIRCam's focus is another one than in
+F212N, of which the sensing terms are (stpsf 2.2, ``mast_wss.infer_pre_or_post_correction``)."""
+
+_NEVER_F187N = ("V01163111001", "V01445")
+"""Visits, or their beginnings, to which that does not apply (ibid.)."""
+
+_NAME = re.compile(r"([A-Z]\d{10})-\w+?-(\d+)(?=\.|$)")
+"""Correction and number of the analysis in the name of a file of MAST."""
+
+_WINDOWS = (3.0, 6.0, 12.0)
+"""Days around a date in which MAST is asked for maps; they are sensed every two to four days."""
+
+
+def analysis_of(name: str) -> tuple[str, int]:
+    """Key by which the analyses of one sensing are sorted, the last one at the end.
+
+    Examples
+    --------
+    >>> names = ["R2022081102-NRCA3_FP1-2.fits", "R2022081102-NRCA3_FP1-10.fits.gz"]
+    >>> max(names, key=analysis_of)
+    'R2022081102-NRCA3_FP1-10.fits.gz'
+    """
+    match = _NAME.search(name)
+    # The letter says who asked for the correction; its number counts the day's.
+    return (name, 0) if match is None else (match[1][1:], int(match[2]))
+
+
+def why_not_sensed_well(correction: str, observation: str) -> str:
+    """Why a measurement is not used where there are others; empty for those that are.
+
+    These are the ones that stpsf leaves out of its tables of wavefronts, too.
+
+    Parameters
+    ----------
+    correction : str
+        Such as "R2022083106" (CORR_ID).
+    observation : str
+        The identifier of the exposure (OBS_ID), which ends in the activity.
+    """
+    if correction in _INVALID:
+        return f"the analysis {correction} has known faults"
+    visit = observation if observation.startswith("V") else f"V{observation}"
+    if observation[-5:] in _F187N and not visit.startswith(_NEVER_F187N):
+        return "it was sensed in F187N, in which the camera has another focus"
+    return ""
 
 
 def load_wss_opd(
@@ -185,15 +248,12 @@ def load_wss_opd_by_date(
         raise IncompatibleSetupError(
             f"choice: got {choice!r}, expected 'nearest', 'before', 'after' or 'interpolate'"
         )
-    choice = "closest" if choice == "nearest" else choice  # As stpsf calls it.
     mast_wss = stpsf_module("to ask MAST").mast_wss
     when = Time(date)
     cache = None if folder is None else os.fspath(folder)
-    choices = ("before", "after") if choice == "interpolate" else (choice,)
     try:
-        paths = [
-            mast_wss.get_opd_at_time(when, choice=which, output_path=cache) for which in choices
-        ]
+        names = _names_in_archive(mast_wss, when, choice)
+        paths = [mast_wss.mast_retrieve_opd(name, output_path=cache) for name in names]
     except (OSError, RuntimeError, ValueError, LookupError, TypeError) as error:
         # No network, an answer from a proxy instead of the service, or no map within a week.
         raise MissingOPDError(
@@ -204,6 +264,35 @@ def load_wss_opd_by_date(
         ) from error
     maps = [load_wss_opd(path, npix=npix, backout_si_wfe=backout_si_wfe) for path in paths]
     return maps[0] if len(maps) == 1 else interpolate_wss(maps[0], maps[1], when)
+
+
+def _names_in_archive(mast_wss: Any, when: Time, choice: str) -> list[str]:
+    """Names of the files at MAST that a rule chooses, in order of time.
+
+    `LookupError` if there are none within twelve days on the side that is asked for.
+    """
+    for days in _WINDOWS:
+        # The last analysis of each sensing.
+        rows: dict[float, str] = {}
+        for row in mast_wss.mast_wss_date_query(when, days * u.day):
+            name, moment = str(row["fileName"]), float(row["date_obs_mjd"])
+            reason = why_not_sensed_well(str(row["corr_id"]), str(row["obs_id"]))
+            if reason:
+                _log.info("%s is not used: %s", name, reason)
+            elif moment not in rows or analysis_of(name) > analysis_of(rows[moment]):
+                if moment in rows:
+                    _log.info("%s is not used: %s is a later analysis", rows[moment], name)
+                rows[moment] = name
+        before = max((t for t in rows if t <= when.mjd), default=None)
+        after = min((t for t in rows if t >= when.mjd), default=None)
+        nearest = min(rows, key=lambda t: abs(t - when.mjd), default=None)
+        sides = {"before": [before], "after": [after], "interpolate": [before, after]}
+        wanted = sides.get(choice, [nearest])
+        # The nearest is known where there are some on both sides.
+        sure = choice in sides or (before is not None and after is not None)
+        if None not in wanted and (sure or days == _WINDOWS[-1]):
+            return [rows[t] for t in sorted({t for t in wanted if t is not None})]
+    raise LookupError(f"no map {choice} that date within {_WINDOWS[-1]:g} days")
 
 
 def interpolate_wss(before: OPDMap, after: OPDMap, date: str | Time) -> OPDMap:

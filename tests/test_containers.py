@@ -1,0 +1,178 @@
+"""Masks and units of every container of numbers: container x mask x unit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+from astropy.nddata import (
+    CCDData,
+    InverseVariance,
+    NDData,
+    StdDevUncertainty,
+    UnknownUncertainty,
+    VarianceUncertainty,
+)
+from astropy.table import Column, MaskedColumn, QTable, Table
+from astropy.utils.masked import Masked
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError, ShapeError, UnitError
+from pyklip_diffrender.io import native_float64, to_metres, to_unit
+from pyklip_diffrender.io.units import to_mask
+
+VALUES = np.arange(1.0, 13.0).reshape(3, 4)
+MASK = VALUES % 5 == 0
+SURFACE = u.MJy / u.sr
+
+Unit = u.UnitBase | None
+
+
+def quantity(values: Any, mask: Any, unit: Unit) -> Any:
+    values = values if mask is None else Masked(values, mask=mask)
+    return values if unit is None else values << unit
+
+
+def numpy_masked(values: Any, mask: Any, unit: Unit) -> Any:
+    assert unit is None
+    return np.ma.MaskedArray(values, mask=np.zeros(values.shape, bool) if mask is None else mask)
+
+
+def nddata(values: Any, mask: Any, unit: Unit) -> Any:
+    return NDData(values, mask=mask, unit=unit)
+
+
+def nddata_of_masked(values: Any, mask: Any, unit: Unit) -> Any:
+    return NDData(values if mask is None else Masked(values, mask=mask), unit=unit)
+
+
+def ccddata(values: Any, mask: Any, unit: Unit) -> Any:
+    flags = None if mask is None else np.where(mask, 4, 0)  # Bits of a data-quality array.
+    return CCDData(values, mask=flags, unit=unit)
+
+
+def column(values: Any, mask: Any, unit: Unit) -> Any:
+    return (
+        MaskedColumn(values, mask=mask, unit=unit)
+        if mask is not None
+        else Column(values, unit=unit)
+    )
+
+
+def of_qtable(values: Any, mask: Any, unit: Unit) -> Any:
+    return QTable({"flux": quantity(values, mask, unit)})["flux"]
+
+
+def of_table(values: Any, mask: Any, unit: Unit) -> Any:
+    table = Table({"flux": np.ma.MaskedArray(values, mask=mask) if mask is not None else values})
+    table["flux"].unit = unit
+    return table["flux"]
+
+
+def rows(values: Any, mask: Any, unit: Unit) -> Any:
+    return [
+        quantity(values[k], None if mask is None else mask[k], unit) for k in range(len(values))
+    ]
+
+
+def rows_of_ccddata(values: Any, mask: Any, unit: Unit) -> Any:
+    return [ccddata(values[k], None if mask is None else mask[k], unit) for k in range(len(values))]
+
+
+def rows_of_rows(values: Any, mask: Any, unit: Unit) -> Any:
+    return [tuple(quantity(values[k], None if mask is None else mask[k], unit)) for k in range(3)]
+
+
+CONTAINERS = [
+    quantity, numpy_masked, nddata, nddata_of_masked, ccddata, column, of_qtable, of_table, rows,
+    rows_of_ccddata, rows_of_rows,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("unit", [None, SURFACE, u.Jy / u.sr], ids=str)
+@pytest.mark.parametrize("mask", [None, MASK], ids=["all", "masked"])
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_masked_values_are_nan_and_units_are_converted(
+    container: Any, mask: Any, unit: Unit
+) -> None:
+    if unit is not None and container is numpy_masked:
+        pytest.skip("numpy has no units")
+    if unit is None and container in (ccddata, rows_of_ccddata):
+        unit = u.dimensionless_unscaled  # It has to have one.
+    before = VALUES.copy()
+    value = container(before, mask, unit)
+    wanted = SURFACE if unit != u.dimensionless_unscaled else unit
+    factor = 1.0 if unit is None else float(unit.to(wanted))
+    got = to_unit(value, wanted, "data")
+    expected = np.where(MASK, np.nan, VALUES) if mask is not None else VALUES
+    assert got.dtype == np.float64
+    assert got.flags.c_contiguous
+    np.testing.assert_allclose(got, factor * expected, rtol=1e-14)
+    np.testing.assert_array_equal(before, VALUES)
+    np.testing.assert_allclose(native_float64(value), expected, rtol=1e-14)
+    if unit is not None:
+        with pytest.raises(UnitError, match="data: got the unit"):
+            to_unit(value, u.s, "data")
+
+
+@pytest.mark.parametrize("container", [quantity, nddata, ccddata, column, rows, rows_of_ccddata])
+def test_an_observation_masks_what_its_container_masks(container: Any) -> None:
+    frame = container(1e6 * VALUES, MASK, u.Jy / u.sr)
+    got = dr.Observation.from_arrays(
+        frame, StdDevUncertainty(VALUES, unit=SURFACE), unit="MJy/sr", pixelscale=0.063
+    )
+    np.testing.assert_array_equal(got.valid[0], ~MASK)
+    np.testing.assert_allclose(got.data[0], np.where(MASK, 0, VALUES))
+    np.testing.assert_allclose(got.error[0], np.where(MASK, 1, VALUES))
+
+
+def test_a_column_in_centimetres_is_a_length() -> None:
+    assert to_metres(Table({"x": Column([150.0], unit="cm")})["x"], "x") == pytest.approx([1.5])
+    assert dr.Observation.from_arrays(
+        VALUES, VALUES, pixelscale=Column([63.0, 64.0], unit="mas")
+    ).pixelscale == pytest.approx((0.063, 0.064))
+
+
+def test_masks_of_masks() -> None:
+    valid = np.ma.MaskedArray(np.ones((3, 4), bool), mask=MASK)
+    got = dr.Observation.from_arrays(VALUES, VALUES, valid=valid, pixelscale=0.063)
+    np.testing.assert_array_equal(got.valid[0], ~MASK)
+    np.testing.assert_array_equal(
+        to_mask([[1, 0], [0, 1]], "valid"), [[True, False], [False, True]]
+    )
+    with pytest.raises(IncompatibleSetupError, match="valid: got numbers, expected True or False"):
+        to_mask(VALUES, "valid")
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "words"),
+    [
+        (VALUES + 1j, IncompatibleSetupError, "data: got complex numbers"),
+        (Masked(VALUES + 1j, mask=MASK), IncompatibleSetupError, "data: got complex numbers"),
+        (VALUES * (1 + 1j) * u.Jy, IncompatibleSetupError, "data: got complex numbers"),
+        (torch.ones(2, dtype=torch.complex128), IncompatibleSetupError, "got complex numbers"),
+        ([1.0, 2j], IncompatibleSetupError, "data: got complex numbers"),
+        (np.array(["2022-08-11"], "M8[D]"), IncompatibleSetupError, "data: got dates"),
+        (VarianceUncertainty(VALUES), IncompatibleSetupError, "data: got VarianceUncertainty"),
+        (InverseVariance(VALUES), IncompatibleSetupError, "got InverseVariance.*represent_as"),
+        (UnknownUncertainty(VALUES), IncompatibleSetupError, "data: got UnknownUncertainty"),
+        (object(), IncompatibleSetupError, "data: got object"),
+        (["a", "b"], IncompatibleSetupError, "data: got list.*expected real numbers"),
+        ([1 * SURFACE, 2.0], UnitError, "data: got values with a unit and others without"),
+        ([1 * SURFACE, 2.0 * u.m], UnitError, "data: got the unit 'm'"),
+        ([[1.0, 2.0], [3.0]], ShapeError, "data: got members of different shapes"),
+        ([[1.0, 2.0] * SURFACE, [3.0] * SURFACE], ShapeError, r"members of shapes \(2,\), \(1,\)"),
+    ],
+)
+def test_what_cannot_be_taken_is_refused_by_name(value: Any, error: type, words: str) -> None:
+    with pytest.raises(error, match=words) as caught:
+        to_unit(value, SURFACE, "data")
+    assert isinstance(caught.value, DiffrenderError)
+
+
+def test_a_position_in_another_unit_than_pixels_is_refused() -> None:
+    with pytest.raises(UnitError, match="center: got the unit 'arcsec'"):
+        dr.Observation.from_arrays(VALUES, VALUES, pixelscale=0.063, center=[1, 2] * u.arcsec)

@@ -1,0 +1,117 @@
+"""Files of many integrations are read in about as much memory as they are large."""
+
+from __future__ import annotations
+
+import gc
+import gzip
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import pyklip_diffrender as dr
+from benchmarks.calints_files import SIDE, calints
+from pyklip_diffrender.io import files
+from pyklip_diffrender.scene import integrations
+from pyklip_diffrender.scene.observation import Observation
+
+# The memory for shifting one integration, in double precision, is that of 28 images.
+MANY = 32
+
+
+def spoilt(arrays: dict[str, Any]) -> None:
+    """One integration is empty, one has an afterglow, and some pixels are flagged or NaN."""
+    arrays["DQ"][3] = 1
+    arrays["SCI"][7] += 30.0
+    arrays["DQ"][:, 20, 30], arrays["SCI"][5, 40, 50] = 1, np.nan
+
+
+def plain(folder: Path) -> Path:
+    return calints(folder / "a_calints.fits", integrations=MANY, change=spoilt)
+
+
+def shifted(folder: Path) -> Path:
+    """As spaceKLIP aligns frames: with recorded shifts, which are undone."""
+    path = plain(folder)
+    shifts = np.random.default_rng(1).uniform(-0.3, 0.3, (MANY, 2))
+    with fits.open(path, mode="append", memmap=False) as hdus:
+        hdus.append(fits.ImageHDU(shifts, name="IMSHIFTS"))
+    return path
+
+
+def packed(folder: Path) -> Path:
+    path = plain(folder)
+    target = path.with_name(f"{path.name}.gz")
+    target.write_bytes(gzip.compress(path.read_bytes(), 1))
+    path.unlink()
+    return target
+
+
+def peak(read: Any) -> int:
+    """Bytes that a call holds at most, of those that Python and numpy ask for."""
+    gc.collect()
+    tracemalloc.start()
+    try:
+        read()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("write", [plain, shifted, packed])
+def test_a_sequence_takes_at_most_one_and_a_half_times_its_largest_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Any
+) -> None:
+    monkeypatch.setattr(files, "_IN_MEMORY", 2**18)
+    path = write(tmp_path)
+    monkeypatch.setattr(integrations, "_AT_ONCE", 2**16)
+    size = 12 * MANY * SIDE**2  # Two of four bytes, and flags of four.
+    calints(tmp_path / "warm.fits")
+    Observation.means_from_fits(tmp_path / "warm.fits")  # What is imported and cached stays.
+    assert peak(lambda: Observation.means_from_fits(path)) < 1.5 * size
+
+
+@pytest.mark.parametrize("write", [plain, shifted, packed])
+def test_the_means_of_a_file_are_those_of_its_integrations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Any
+) -> None:
+    path = write(tmp_path)
+    frames = Observation.from_fits(path)
+    assert len(frames) == MANY - 2
+    wanted = frames.combined() if write is not shifted else None
+    monkeypatch.setattr(files, "_IN_MEMORY", 2**18)
+    means = Observation.means_from_fits(path)
+    assert means.count == MANY - 2
+    assert means.remarks == frames.remarks
+    parts = [frames.part(group.nonzero()[0]) for group in _groups(frames, means)]
+    assert sum(map(len, parts)) == len(frames)
+    for k, part in enumerate(parts):
+        expected = part.combined()
+        assert means.integrations[k] == len(part)
+        np.testing.assert_array_equal(means.valid[k], expected.valid[0])
+        scale = np.abs(expected.data).max()
+        np.testing.assert_allclose(means.data[k], expected.data[0], atol=1e-6 * scale)
+        np.testing.assert_allclose(means.error[k], expected.error[0], rtol=1e-5)
+        np.testing.assert_allclose(means.center[k], expected.center[0], atol=1e-9)
+    if wanted is not None:
+        np.testing.assert_allclose(means.combined().data, wanted.data, atol=1e-5)
+
+
+def _groups(frames: Observation, means: Observation) -> list[np.ndarray]:
+    """The integrations that each mean was made of: those of the pointings of the file."""
+    names = [part.center for part in frames.pointings()]
+    return [
+        np.array([any((c == m).all() for m in centers) for c in frames.center]) for centers in names
+    ]
+
+
+def test_a_sequence_counts_the_integrations_of_its_means(tmp_path: Path) -> None:
+    sequence = dr.Sequence.from_files([plain(tmp_path)])
+    assert len(sequence.science[0]) == 1
+    assert sequence.science[0].count == MANY - 2
+    assert sequence.science[0].cutout(40).combined().count == MANY - 2
+    (row,) = sequence.table
+    assert row["integrations"] == MANY - 2
