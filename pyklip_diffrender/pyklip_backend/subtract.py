@@ -21,6 +21,7 @@ from pyklip_diffrender.pyklip_backend.verdict import (
 )
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.sequence import Sequence as Frames
 from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.wavefront.opd import OPDMap
 
@@ -175,8 +176,9 @@ def subtract_by_refinement(
     from pyklip_diffrender.pattern import fit_with_pattern
 
     groups = list(pointings_of(observation) if pointings is None else pointings)
-    windows = [Window.about(g.observation.center[0], model.detector.shape) for g in groups]
-    cut = [g.observation.within(w) for g, w in zip(groups, windows, strict=True)]
+    whole = Frames(observation.target, tuple(group.observation for group in groups))
+    windows = whole.windows(model.detector.shape)
+    cut = whole.cutout(model.detector.shape, beyond_edges=True).science
 
     def frames_of_references() -> list[Observation]:
         tell("fitting the reference stars")

@@ -282,45 +282,37 @@ class Observation:
         matrix = rotation_matrix(self.roll_from(other))
         return np.reshape(places, (-1, 2)) @ matrix.T
 
-    def cutout(self, size: int, *, first_pixel: tuple[int, int] | None = None) -> Observation:
+    def cutout(self, size: int) -> Observation:
         """The `size` x `size` pixels about the star (whole pixels, without resampling).
-
-        Parameters
-        ----------
-        size : int
-        first_pixel : tuple of int, optional
-            Column and row on the full detector at which the square begins, for frames that say
-            where their pixels are. By default the star is in the middle of the square.
 
         Raises
         ------
         ShapeError
             If the square is not inside the frame.
         """
-        corners = np.round(self.center - (size - 1) / 2).astype(int)
-        if first_pixel is not None and self.first_pixel is not None:
-            corners = np.tile(np.subtract(first_pixel, self.first_pixel), (len(self), 1))
-        ny, nx = self.shape
-        if corners.min() < 0 or (corners + size > (nx, ny)).any():
-            x, y = self.center[0]
-            raise ShapeError(
-                f"{self.name}: {size} x {size} pixels about the star at x, y = {x:.1f}, {y:.1f} do "
-                f"not fit into {nx} x {ny}. Choose a smaller size (--size)"
-            )
-        return self._cut([Window(int(y), int(x), (size, size)) for x, y in corners])
+        windows = [Window.about(center, (size, size)) for center in self.center]
+        for window in windows:
+            self._require_inside(window)
+        return self._cut(windows)
 
-    def within(self, window: Window) -> Observation:
-        """Return the pixels in a box, which may reach beyond the frames, where it is masked.
+    def within(self, window: Window, *, beyond_edges: bool = True) -> Observation:
+        """Return the pixels in a box.
 
         Parameters
         ----------
         window : Window
+        beyond_edges : bool
+            Allow a box that reaches beyond the frames, where it is masked.
 
         Raises
         ------
+        ShapeError
+            If the box reaches beyond the frames and must not.
         NoValidPixelsError
             If a frame has no valid pixel there.
         """
+        if not beyond_edges:
+            self._require_inside(window)
         part = self._cut([window] * len(self))
         if not np.any(part.valid, axis=(1, 2)).all():
             raise NoValidPixelsError(
@@ -329,6 +321,15 @@ class Observation:
                 "larger size (--size)"
             )
         return part
+
+    def _require_inside(self, window: Window) -> None:
+        ny, nx = self.shape
+        if window not in Window(0, 0, self.shape):
+            x, y = self.center[0]
+            raise ShapeError(
+                f"{self.name}: {window.shape[1]} x {window.shape[0]} pixels about the star at x, "
+                f"y = {x:.1f}, {y:.1f} do not fit into {nx} x {ny}. Choose a smaller size (--size)"
+            )
 
     def _cut(self, windows: list[Window]) -> Observation:
         """Cut one box out of every frame; all boxes have the same shape."""

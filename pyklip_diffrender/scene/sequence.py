@@ -34,6 +34,7 @@ from pyklip_diffrender.scene.frame_files import (
 )
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.pixel_checks import why_other_brightness, why_turned
+from pyklip_diffrender.scene.window import Window
 
 __all__ = ["Sequence"]
 
@@ -298,24 +299,59 @@ class Sequence:
         rows = self.rows or (*_rows("target", self.science), *_rows("reference", self.references))
         return rows_table(rows)
 
-    def cutout(self, size: int) -> Sequence:
-        """Cut the `size` x `size` pixels about the star out of every frame.
+    def windows(self, shape: tuple[int, int]) -> tuple[Window, ...]:
+        """Boxes of `shape` about the star in the frames of the target, one for each observation.
 
-        Rolls whose stars are on nearly the same pixel of the detector are cut alike, so that
-        they share its pattern.
+        Rolls whose stars are on nearly the same pixel of the detector have boxes of the same
+        pixels, so that they share its pattern.
         """
-        science = [each.cutout(size) for each in self.science]
-        origin = science[0].first_pixel
-        for k, cut in enumerate(science):
-            if origin is None or cut.first_pixel is None or cut.first_pixel == origin:
+        windows = [Window.about(each.center.mean(axis=0), shape) for each in self.science]
+        places = [
+            None if each.first_pixel is None else np.add(each.first_pixel, (window.x, window.y))
+            for each, window in zip(self.science, windows, strict=True)
+        ]
+        first = places[0]
+        for k, place in enumerate(places):
+            if first is None or place is None:
                 continue
-            if np.abs(np.subtract(cut.first_pixel, origin)).max() <= _NEARLY_THE_SAME:
-                science[k] = self.science[k].cutout(size, first_pixel=origin)
-        return replace(
-            self,
-            science=tuple(science),
-            references=tuple(each.cutout(size) for each in self.references),
+            x, y = first - place
+            if max(abs(x), abs(y)) <= _NEARLY_THE_SAME:
+                windows[k] = Window(windows[k].y + int(y), windows[k].x + int(x), shape)
+        return tuple(windows)
+
+    def cutout(self, size: int | tuple[int, int], *, beyond_edges: bool = False) -> Sequence:
+        """Cut the pixels about the star out of every frame.
+
+        Rolls whose stars are on nearly the same pixel of the detector are cut alike, see
+        `windows`.
+
+        Parameters
+        ----------
+        size : int or tuple of int
+            Rows and columns; one number for a square.
+        beyond_edges : bool
+            Allow pixels beyond the edges of the frames, which are masked.
+
+        Raises
+        ------
+        ShapeError
+            If the pixels are not inside a frame, unless they may be beyond its edges.
+        NoValidPixelsError
+            If a frame has no valid pixel there.
+        """
+        shape = (size, size) if isinstance(size, int) else size
+        others = [Window.about(each.center.mean(axis=0), shape) for each in self.references]
+        science, references = (
+            tuple(
+                each.within(window, beyond_edges=beyond_edges)
+                for each, window in zip(frames, windows, strict=True)
+            )
+            for frames, windows in (
+                (self.science, self.windows(shape)),
+                (self.references, others),
+            )
         )
+        return replace(self, science=science, references=references)
 
 
 def _usable(

@@ -1,0 +1,335 @@
+"""The same files, map and settings give one answer in every door of the package.
+
+Doors are `reduce`, `klip_dataset` with ``algo="diffrender"``, `spaceklip.run_obs` and a survey.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import abc
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from astropy.io import fits
+from pyklip.instruments import JWST
+from test_spaceklip import KEY, StandIn, concatenation
+
+import pyklip_diffrender as dr
+from benchmarks.calints_files import SIDE, calints
+from pyklip_diffrender import spaceklip
+from pyklip_diffrender.detection import Detection, detect
+from pyklip_diffrender.errors import DiffrenderError
+from pyklip_diffrender.io.geometry import half_circle
+from pyklip_diffrender.pattern import PatternLibrary
+from pyklip_diffrender.pattern.library import package_library
+from pyklip_diffrender.pyklip_backend.reduce_files import reduce_jwst_files
+from pyklip_diffrender.refinement import Refinement, nircam_settings
+from pyklip_diffrender.scene.detector_pixels import shift_frames
+from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.scene.window import Window
+from pyklip_diffrender.wavefront import random_opd
+
+pytestmark = pytest.mark.filterwarnings("ignore:Mean of empty slice:RuntimeWarning")
+
+SIZE = 36
+OPD = 0.1 * random_opd(1, npix=128).data
+"""Metres; so small that the star is as symmetric as real ones."""
+FLUX = 5e8
+"""Of the star, in MJy/sr and pixels: about 150 MJy/sr at the brightest pixel."""
+PLANET = (4e-5, 0.9, 120.0)
+"""Contrast, separation (arcsec) and position angle (degrees)."""
+ROLLS = ((70.0, (88.7, 91.3)), (80.0, (87.9, 91.6)))
+"""Roll angle, and x, y of the star: so near to each other that the rolls are cut alike, and so far
+that each alone is cut elsewhere."""
+SETTINGS = {"cycles": 3.0, "max_iterations": 15, "max_companions": 0, "response_npix": 128}
+
+small_model = partial(model_for, monochromatic=4.44e-6, npix=128)
+
+
+class Answer(NamedTuple):
+    """What a door says about a star."""
+
+    fit: Refinement
+    detection: Detection
+    pattern: str
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small models without the package's library, whose pattern these frames do not have."""
+
+    def offline(**kw: Any) -> None:
+        raise OSError("offline")
+
+    monkeypatch.setattr(JWST.SvoFps, "get_filter_list", offline)
+    monkeypatch.setattr("pyklip_diffrender.reduction.pipeline.model_for", small_model)
+    monkeypatch.setattr("pyklip_diffrender.pyklip_backend.subtract.model_for", small_model)
+    monkeypatch.setattr("pyklip_diffrender.pattern.choice.package_library", PatternLibrary)
+    monkeypatch.setattr("pyklip_diffrender.drawing.to_png", lambda *_, **__: b"no picture")
+
+
+@pytest.fixture(scope="module")
+def light() -> Callable[[float, tuple[float, float]], np.ndarray]:
+    """Function of the roll angle and the star's place that makes star and planet, MJy/sr."""
+    ones = np.ones((SIDE, SIDE))
+    header = fits.Header({
+        "INSTRUME": "NIRCAM", "DETECTOR": "NRCALONG", "CORONMSK": "MASKA335R",
+        "PUPIL": "MASKRND", "MODULE": "A",
+    })  # fmt: skip
+    model = small_model(
+        Observation.from_arrays(ones, ones, pixelscale=0.0624, filter="F444W", header=header)
+    )
+
+    def image(roll: float, center: tuple[float, float]) -> np.ndarray:
+        contrast, separation, angle = PLANET
+        # The position angle of the +y axis is ROLL_REF minus V3I_YANG.
+        turn = np.radians(angle - (roll + 0.05))
+        place = separation * np.array([-np.sin(turn), np.cos(turn)])
+        away = (np.array(center) - (SIDE - 1) / 2) * model.detector.pixelscale
+        with torch.no_grad():
+            star, planet = (
+                model(OPD, star_offset=offset, detector_shift=tuple(away)).numpy()
+                for offset in ((0.0, 0.0), tuple(place))
+            )
+        return np.asarray(FLUX * (star + contrast * planet), dtype=float)
+
+    return image
+
+
+def written(folder: Path, light: Any, *, aligned: bool) -> list[Path]:
+    """Write two rolls of two integrations, as the pipeline or spaceKLIP does."""
+    paths = []
+    for k, (roll, center) in enumerate(ROLLS, 1):
+        cards = {
+            "CRPIX1": center[0] + 1, "CRPIX2": center[1] + 1, "PIXAR_A2": 0.0624**2,
+            "SUBSTRT1": 640 - 88 + 1, "SUBSTRT2": 1674 - 91 + 1, "PIXAR_SR": 9.2e-14,
+        }  # fmt: skip
+        path = calints(
+            folder / f"jw01184{k:03d}001_03106_00001_nrcalong_calints.fits",
+            observation=k, roll=roll, integrations=2, light=light(roll, center), cards=cards,
+        )  # fmt: skip
+        with fits.open(path, mode="update") as hdus:
+            science = hdus["SCI"].header
+            science["PIXAR_SR"] = 9.2e-14
+            science["CRVAL1"], science["CRVAL2"] = 100.0, 20.0
+            for key, value in (("CTYPE1", "RA---TAN"), ("CTYPE2", "DEC--TAN")):
+                science[key] = value
+            if aligned:
+                middle = np.array([SIDE - 1, SIDE - 1]) / 2
+                shift = middle - center
+                for name in ("SCI", "ERR"):
+                    moved = shift_frames(hdus[name].data.astype(float), np.tile(shift, (2, 1)))
+                    hdus[name].data = moved.astype(np.float32)
+                for key, value in zip(("1", "2"), middle, strict=True):
+                    science[f"CRPIX{key}"] = value + 1
+                science["STARCENX"], science["STARCENY"] = middle + 1
+                hdus.append(fits.ImageHDU(np.tile(shift, (2, 1)), name="IMSHIFTS"))
+                hdus.append(fits.ImageHDU(np.zeros((2, 2)), name="MASKOFFS"))
+        paths.append(path)
+    return paths
+
+
+def map_file(folder: Path) -> Path:
+    """Write the wavefront map, which surveys read from a file."""
+    path = folder / "opd.fits"
+    fits.PrimaryHDU(OPD, fits.Header({"BUNIT": "m"})).writeto(path, overwrite=True)
+    return path
+
+
+def through_reduce(files: list[Path], folder: Path) -> Answer:
+    sequence = Sequence.from_files(files)
+    settings = nircam_settings(sequence.science[0], **SETTINGS)
+    made = dr.reduce(sequence, map_file(folder), size=SIZE, settings=settings)
+    name = "none" if made.systematics is None else made.systematics.name
+    return Answer(made.fit, made.detection, name)
+
+
+def through_klip_dataset(files: list[Path], folder: Path) -> Answer:
+    settings = nircam_settings(Sequence.from_files(files).science[0], **SETTINGS)
+    dataset = reduce_jwst_files(
+        files, folder=folder, prefix="x", opd=map_file(folder), fit_pixels=SIZE, fit=settings
+    )
+    (record,) = dataset.diffrender_results
+    fit = record.subtraction.fits[0].result
+    return Answer(fit, detect(fit), record.subtraction.systematics)
+
+
+def through_spaceklip(files: list[Path], folder: Path) -> Answer:
+    settings = nircam_settings(Sequence.from_files(files).science[0], **SETTINGS)
+    database = StandIn(folder, {KEY: concatenation([str(path) for path in files])})
+    detection = spaceklip.run_obs(database, opd=map_file(folder), fit_pixels=SIZE, fit=settings)[
+        KEY
+    ]
+    fit = detection.fits[0]
+    return Answer(fit, detection, "none" if fit.systematics is None else fit.systematics.name)
+
+
+def through_a_survey(files: list[Path], folder: Path) -> Answer:
+    config = {
+        "workers": 0,
+        "sequence": [{
+            "files": [str(each) for each in files], "opd": str(map_file(folder)), "size": SIZE,
+            "settings": SETTINGS,
+        }],
+    }  # fmt: skip
+    dr.survey(config, folder / "survey")
+    (job,) = (each for each in (folder / "survey" / "jobs").iterdir() if each.is_dir())
+    fit = Refinement.read(job / "fit.fits")
+    name = "none" if fit.systematics is None else fit.systematics.name
+    return Answer(fit, Detection.read(job), name)
+
+
+def shares_pattern(
+    observations: abc.Iterable[Observation], systematics: Systematics | None
+) -> bool:
+    """Whether frames show the same pixels of the detector, whose pattern is one unknown then."""
+    places = {(each.first_pixel, each.shape) for each in observations}
+    return systematics is not None and len(places) == 1 and None not in next(iter(places))
+
+
+def assert_same_frames(
+    ours: abc.Sequence[Observation], others: abc.Sequence[Observation], rtol: float = 1e-6
+) -> None:
+    """Assert that the same pixels are fitted, as an average for a fit that comes from a file."""
+    assert len(ours) == len(others)
+    for one, other in zip(ours, others, strict=True):
+        assert (one.first_pixel, one.shape) == (other.first_pixel, other.shape)
+        assert half_circle(one.position_angle - other.position_angle) == pytest.approx(0, abs=1e-9)
+        assert one.star_offset == other.star_offset
+        one, other = (each if len(each) == 1 else each.combined() for each in (one, other))
+        np.testing.assert_allclose(other.center, one.center, atol=1e-6)
+        np.testing.assert_array_equal(other.valid, one.valid)
+        np.testing.assert_allclose(other.data, one.data, rtol=rtol, atol=1e-6)
+        np.testing.assert_allclose(other.error, one.error, rtol=rtol)
+
+
+class Stopped(Exception):
+    """The fit would begin now."""
+
+
+class Call(NamedTuple):
+    """Arguments of a fit."""
+
+    science: tuple[Observation, ...]
+    opd: Any
+    systematics: Any
+    settings: Any
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[Call]:
+    """Fits that would begin; all of them stop there."""
+    begun: list[Call] = []
+
+    def refine(model: Any, science: Any, opd: Any, **options: Any) -> None:
+        begun.append(Call(tuple(science), opd, options["systematics"], options["settings"]))
+        raise Stopped
+
+    for module in ("reduction.pipeline", "refinement"):
+        monkeypatch.setattr(f"pyklip_diffrender.{module}.refine", refine)
+    return begun
+
+
+def assert_same_call(one: Call, other: Call) -> None:
+    assert_same_frames(one.science, other.science)
+    assert one.settings == other.settings
+    assert one.opd.sha256 == other.opd.sha256
+    patterns = [each.systematics for each in (one, other)]
+    assert (patterns[0] is None) == (patterns[1] is None)
+    if patterns[0] is not None:
+        assert patterns[0].name == patterns[1].name
+        np.testing.assert_array_equal(patterns[0].pattern, patterns[1].pattern)
+        np.testing.assert_array_equal(patterns[0].error, patterns[1].error)
+    assert shares_pattern(one.science, patterns[0]) == shares_pattern(other.science, patterns[1])
+
+
+DOORS = pytest.mark.parametrize(
+    "door",
+    [through_klip_dataset, through_spaceklip, through_a_survey],
+    ids=["klip_dataset", "spaceklip", "survey"],
+)
+
+
+@pytest.mark.parametrize("aligned", [False, True], ids=["unaligned", "aligned"])
+@DOORS
+def test_every_door_begins_the_same_fit(
+    door: Any, aligned: bool, light: Any, tmp_path: Path, calls: list[Call]
+) -> None:
+    files = written(tmp_path, light, aligned=aligned)
+    for each in (through_reduce, door):
+        with contextlib.suppress(Stopped, ExceptionGroup, DiffrenderError):
+            each(files, tmp_path)
+    expected, call = calls
+    # What is compared is worth comparing: alone, each roll would be cut elsewhere.
+    assert shares_pattern(expected.science, expected.systematics)
+    assert len({Window.about(each.center[0], each.shape) for each in expected.science}) == 2
+    assert_same_call(expected, call)
+
+
+@pytest.mark.parametrize("visits", ["001 002", "003 004", "005 006"])
+@pytest.mark.parametrize("exposure", ["03106", "03107"], ids=["F444W", "F356W"])
+def test_real_pairs_are_the_same_in_both_doors(
+    exposure: str, visits: str, shared_data: Path, tmp_path: Path, calls: list[Call],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """The frames, the map and the pattern of the library, without a fit."""
+    monkeypatch.setattr("pyklip_diffrender.pattern.choice.package_library", package_library)
+    folder = shared_data / "gto1184"
+    files = [next(folder.glob(f"jw01184{visit}001_{exposure}*")) for visit in visits.split()]
+    for each in (through_reduce, through_klip_dataset):
+        with contextlib.suppress(Stopped):
+            each(files, tmp_path)
+    assert_same_call(*calls)
+
+
+def assert_same(one: Answer, other: Answer) -> None:
+    """Assert that two doors give one answer."""
+    ours, others = ([frame.observation for frame in each.fit.frames] for each in (one, other))
+    assert_same_frames(ours, others)
+    assert one.pattern == other.pattern
+    assert shares_pattern(ours, one.fit.systematics)
+    assert shares_pattern(others, other.fit.systematics)
+    assert one.fit.status == other.fit.status
+    assert other.fit.chi2_per_pixel == pytest.approx(one.fit.chi2_per_pixel, rel=1e-5)
+    curves = [each.detection.contrast_curve for each in (one, other)]
+    for name in ("separation", "contrast"):
+        np.testing.assert_allclose(
+            np.asarray(curves[1][name]), np.asarray(curves[0][name]), rtol=1e-4
+        )
+    tables = [each.detection.candidates for each in (one, other)]
+    assert len(tables[0]) == len(tables[1])
+    for name in ("separation", "position_angle", "contrast", "contrast_error", "snr"):
+        np.testing.assert_allclose(
+            np.asarray(tables[1][name]), np.asarray(tables[0][name]), rtol=1e-3
+        )
+
+
+@pytest.fixture(scope="module")
+def answers() -> dict[bool, Answer]:
+    """Answers of `reduce`, for unaligned and aligned files."""
+    return {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("aligned", [False, True], ids=["unaligned", "aligned"])
+@DOORS
+def test_every_door_gives_one_answer(
+    door: Any, aligned: bool, light: Any, tmp_path: Path, answers: dict[bool, Answer]
+) -> None:
+    files = written(tmp_path, light, aligned=aligned)
+    if aligned not in answers:
+        answers[aligned] = through_reduce(files, tmp_path)
+    candidates = answers[aligned].detection.candidates
+    assert len(candidates) == 1
+    assert candidates["separation"][0].value == pytest.approx(PLANET[1], abs=0.1)
+    out = tmp_path / "out"
+    out.mkdir()
+    assert_same(answers[aligned], door(files, out))
