@@ -80,7 +80,7 @@ def render(observation: Any, opd: OPDMap, settings: DiffrenderSettings) -> Subtr
         star[i] = np.tensordot(weights, terms, 1)
         chi2 += float(np.mean(((star[i] - observation.data[i]) / observation.error[i])[good] ** 2))
     fit = Fit(tuple(range(len(star))), "converged", chi2 / len(star), observation)
-    return Subtraction(star, "least-squares", 7, (fit,))
+    return Subtraction(star, (fit,))
 
 
 def calints(

@@ -211,7 +211,7 @@ def test_companions_injected_after_reading_are_in_what_is_fitted_and_kept(
 ) -> None:
     dataset = JWSTData(files)
     copied = copy.deepcopy(dataset)
-    dataset.diffrender = DiffrenderSettings(seed=5)
+    dataset.diffrender = DiffrenderSettings(fit_pixels=24)
     fakes.inject_planet(
         copied.input, copied.centers, 3.0, copied.wcs, radius=13.0, pa=0.0, fwhm=4.0
     )

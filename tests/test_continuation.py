@@ -190,7 +190,6 @@ def test_a_fit_goes_on_from_where_it_ended() -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ({"plan": "cheap"}, r"plan: got 'cheap', expected 'auto' or 'off'"),
         ({"settings": "gauss-newton"}, r"settings: got a str, expected GaussNewton"),
         ({"start": [{}, {}, {}]}, r"start: got 3 dicts for 2 observations"),
     ],

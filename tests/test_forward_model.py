@@ -19,7 +19,7 @@ from pyklip.fmlib.nofm import NoFM
 from pyklip.klip import rotate
 from pyklip.parallelized import klip_dataset
 
-from pyklip_diffrender.detection import measure
+from pyklip_diffrender.detection import detect, measure
 from pyklip_diffrender.detection.error_factor import ErrorFactor
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.instrument import nircam_coronagraph
@@ -28,7 +28,6 @@ from pyklip_diffrender.pyklip_backend import (
     DiffrenderSettings,
     backend,
     register,
-    subtract,
     unregister,
 )
 from pyklip_diffrender.refinement import GaussNewton
@@ -87,7 +86,7 @@ def shots(model: OpticalSystem, opd: Image, flipx: bool = False) -> tuple[Image,
 def dataset(cube: Image, model: OpticalSystem, errors: Image, **settings: Any) -> Any:
     made = generic(cube, ANGLES, center=CENTER)
     made.diffrender = DiffrenderSettings(
-        **{"opd": OLD, "model": model, "error": errors, "plan": "off", "fit": LINEAR, **settings}
+        **{"opd": OLD, "model": model, "error": errors, "fit": LINEAR, **settings}
     )
     return made
 
@@ -231,9 +230,12 @@ def test_errors_include_the_scatter_of_the_search(
     distance = np.hypot(grid[..., 0], grid[..., 1])
     factor = ErrorFactor(2 + distance / (PIXEL * SEPARATION), np.full((81, 81), 50.0), grid)
     headers = []
-    for keep, found in ((False, None), (True, factor)):
-        monkeypatch.setattr(subtract, "_with_companions", lambda fits, tell, f=found: (fits, f))
-        made = dataset(star + planet, model, np.sqrt(star), keep_detected=keep)
+    for found in (ErrorFactor.constant(1.0), factor):
+        monkeypatch.setattr(
+            "pyklip_diffrender.reduction.pipeline.detect",
+            lambda fit, f=found, **options: replace(detect(fit, **options), error_factor=f),
+        )
+        made = dataset(star + planet, model, np.sqrt(star))
         modelled(made, planet_psf(OLD.data, made), tmp_path, algo="diffrender")
         headers.append(fits.getheader(tmp_path / "x-klipped-KLmodes-all.fits"))
     assert [each["DRFMFACT"] for each in headers] == pytest.approx([1.0, 3.0], rel=0.02)
@@ -307,7 +309,7 @@ def test_without_a_forward_model_the_product_is_that_of_klip_dataset(
     klip_dataset(made, verbose=False, **options)
     expected, header = fits.getdata(tmp_path / "x-KLmodes-all.fits", header=True)
     np.testing.assert_allclose(product, expected, atol=1e-4)
-    for key in ("PSFCENTX", "PSFCENTY", "KLMODE1", "CTYPE3", "DRMETH", "DRSHA256"):
+    for key in ("PSFCENTX", "PSFCENTY", "KLMODE1", "CTYPE3", "DRSTAT", "DRSHA256"):
         assert cards[key] == header[key]
     inside = modelled(made, NoFM(cube.shape, MODES), tmp_path, **{**options, "annuli": [(5, 9)]})[1]
     y, x = np.nonzero(np.isfinite(inside[0]))

@@ -36,7 +36,7 @@ def fit() -> dr.Refinement:
         shot = dr.simulate(model, scene, opd, seed=k)
         frames.append(replace(shot, position_angles=np.full(len(shot), angle)))
     settings = dr.GaussNewton(cycles=3, max_companions=0)
-    return dr.refine(model, frames, opd, settings=settings, plan="off")
+    return dr.refine(model, frames, opd, settings=settings)
 
 
 @cache

@@ -150,7 +150,6 @@ def plain(tiny: Case) -> Refinement:
 def test_gauss_newton_explains_the_data(fit: Refinement) -> None:
     assert fit.status is Status.CONVERGED
     assert fit.status.usable
-    assert fit.method == "gauss-newton"
     # 1024 pixels less about 100 parameters that they determine, and the scatter of chi2.
     expected = 1 - fit.effective_parameters / 1024
     assert fit.chi2_per_pixel == pytest.approx(expected, abs=0.1)
@@ -249,10 +248,8 @@ def test_the_parameters_are_readable_on_80_columns(
 
 def test_the_summary_holds_what_provenance_needs(bright: Case, fit: Refinement) -> None:
     summary = fit.summary()
-    assert summary["method"] == "gauss-newton"
     assert summary["status"] == "CONVERGED"
     assert summary["opd_sha256"] == fit.initial.sha256
-    assert summary["seed"] == 0
     assert summary["seconds"] > 0
     assert "CONVERGED, 1 frame, chi2/pixel" in repr(fit)
     assert "test star" in repr(fit.frames[0])
@@ -434,11 +431,10 @@ def test_missing_pixels_cost_precision_not_truth(
 
 @pytest.mark.hard
 def test_the_same_fit_gives_the_same_bits(tiny: Case, plain: Refinement) -> None:
-    first, again = quick(tiny, seed=5), plain
+    first, again = quick(tiny), plain
     assert first.wavefront.tobytes() == again.wavefront.tobytes()
     assert first.frames[0].star.tobytes() == again.frames[0].star.tobytes()
     assert first.history == again.history
-    assert first.seed == 5
 
 
 def test_nothing_that_was_passed_in_is_modified(tiny: Case) -> None:

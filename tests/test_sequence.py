@@ -304,7 +304,7 @@ def rolled_fit() -> Refinement:
 def test_a_refinement_survives_the_file(tmp_path: Path) -> None:
     fit = rolled_fit()
     back = Refinement.read(fit.write(tmp_path / "fit.fits"))
-    assert (back.status, back.settings, back.seed) == (fit.status, fit.settings, fit.seed)
+    assert (back.status, back.settings) == (fit.status, fit.settings)
     for ours, theirs in zip(back.frames, fit.frames, strict=True):
         np.testing.assert_array_equal(ours.star, theirs.star)
         np.testing.assert_array_equal(ours.opd, theirs.opd)

@@ -285,7 +285,7 @@ def test_a_concatenation_from_frames_to_sources(
     )  # fmt: skip
     database.obs[KEY] = concatenation(files)
     detections = spaceklip.run_obs(
-        database, opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED, save_rolls=True,
+        database, opd=OPD, model=model, systematics="off", fit=ALIGNED, save_rolls=True,
         image="subtracted",
     )  # fmt: skip
     assert list(detections) == list(database.red) == [KEY]
@@ -320,14 +320,14 @@ def test_a_catalogues_star_is_that_of_the_search(
     model, files = two_rolls(tmp_path, monkeypatch)
     tied: list[tuple[float, float]] = []
 
-    def with_star_flux(fit: Refinement, jansky: float, error: float) -> Refinement:
+    def with_star_flux(fit: Refinement, jansky: float, error: float, **options: Any) -> Refinement:
         tied.append((jansky, error))
         return replace(fit, catalogue_error=error)
 
-    monkeypatch.setattr(run, "with_star_flux", with_star_flux)
+    monkeypatch.setattr("pyklip_diffrender.reduction.pipeline.with_star_flux", with_star_flux)
     detections = spaceklip.run_obs(
         StandIn(tmp_path, {KEY: concatenation(files)}), opd=OPD, model=model, systematics="off",
-        plan="off", fit=ALIGNED, star_flux={"F444W": "450 mJy"}, star_flux_error=0.3,
+        fit=ALIGNED, star_flux={"F444W": "450 mJy"}, star_flux_error=0.3,
     )  # fmt: skip
     assert tied == [(pytest.approx(0.45), 0.3)]
     table = detections[KEY].candidates
@@ -357,7 +357,7 @@ def test_spaceklips_own_subtraction(
     table["ROLL_REF"], reference["ROLL_REF"] = SKY_ANGLES, [0.0]
     real_database.obs[KEY] = vstack([table, reference])
     monkeypatch.setattr(pipeline, "get_transmission", lambda *args: None, raising=False)
-    with backend(opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED):
+    with backend(opd=OPD, model=model, systematics="off", fit=ALIGNED):
         pipeline.run_obs(
             real_database,
             kwargs={"mode": ["ADI+RDI"], "annuli": [1], "subsections": [1], "numbasis": [1],
@@ -379,9 +379,7 @@ def test_spaceklips_own_injections_need_one_fit(
         "mode": "ADI", "annuli": 1, "subsections": 1, "numbasis": [1], "movement": 1,
         "calibrate_flux": False, "highpass": False, "verbose": False, "outputdir": f"{tmp_path}/",
     }  # fmt: skip
-    with backend(
-        opd=OPD, model=model, systematics="off", plan="off", fit=ALIGNED, image="subtracted"
-    ):
+    with backend(opd=OPD, model=model, systematics="off", fit=ALIGNED, image="subtracted"):
         dataset = JWST.JWSTData(files, None, highpass=False)
         before = copy.deepcopy(dataset)
         klip_dataset(dataset, fileprefix="once", **options)

@@ -22,7 +22,7 @@ from pyklip_diffrender.detection.metrics import annulus_snr, star_model_error, t
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import write_fits, write_table
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.pyklip_backend.klip import klip_rdi
+from pyklip_diffrender.reduction.klip_rdi import klip_rdi
 from pyklip_diffrender.refinement import Refinement, refine
 from pyklip_diffrender.scene.objects import (
     ALPHA_PICTORIS_W2,
@@ -135,7 +135,7 @@ def run_demo(
     began = time.perf_counter()
     outdated = star_photons(model, scene, measured)
     seconds = {"initial": time.perf_counter() - began}
-    fit = refine(model, observation, measured, seed=seed, progress=progress)
+    fit = refine(model, observation, measured, progress=progress)
     seconds["refined"] = fit.seconds
     began = time.perf_counter()
     detection = detect(fit, progress=progress)

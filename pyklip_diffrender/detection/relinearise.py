@@ -18,6 +18,7 @@ from pyklip_diffrender.refinement import Refinement, refine_again
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
+    "are_companions",
     "in_derivatives",
     "lacks_candidates",
     "unconfirmed_companions",
@@ -111,6 +112,13 @@ def _confirmed(
     allowed = np.hypot(_SIMILAR * contrasts, _SIGMAS * fit.companion_errors[:, None, 0])
     same = (near < _NEAR * fit.model.resolution) & (difference < allowed)
     return np.asarray(same.any(axis=1))
+
+
+def are_companions(fit: Refinement, candidates: Candidates) -> NDArray[np.bool_]:
+    """Which candidates are at the place of a companion of the fit, (candidates,)."""
+    away = candidates.offsets.numpy()[:, None] - fit.companions[None, :, 1:]
+    near = np.hypot(*np.moveaxis(away, -1, 0)) < _NEAR * fit.model.resolution
+    return np.asarray(near.any(axis=1))
 
 
 def with_companions(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from typing import Self
 
 from tqdm import tqdm
 
-__all__ = ["ProgressBar", "duration", "numbered_stages", "stage"]
+__all__ = ["ProgressBar", "duration", "heard_by", "numbered_stages", "stage"]
 
 _log = logging.getLogger(__name__)
 
@@ -21,6 +21,8 @@ _STAGE: ContextVar[str] = ContextVar("stage", default="")
 
 _SCHEDULE: ContextVar[_Schedule | None] = ContextVar("schedule", default=None)
 """None where stages are not numbered."""
+
+_LISTENER: ContextVar[Callable[[str], None] | None] = ContextVar("listener", default=None)
 
 _BUSY: ContextVar[bool] = ContextVar("busy", default=False)
 """Whether a bar is shown already; bars inside it are not."""
@@ -113,6 +115,16 @@ def _left() -> str:
 
 
 @contextmanager
+def heard_by(listener: Callable[[str], None]) -> Iterator[None]:
+    """Call a function with the name of every stage inside, besides the log."""
+    token = _LISTENER.set(listener)
+    try:
+        yield
+    finally:
+        _LISTENER.reset(token)
+
+
+@contextmanager
 def stage(name: str) -> Iterator[None]:
     """Name what is being done, such as "wavefront", for bars inside and for the log."""
     schedule = _SCHEDULE.get()
@@ -120,6 +132,9 @@ def stage(name: str) -> Iterator[None]:
         name = schedule.begin(name)
     token = _STAGE.set(name)
     _log.info("%s%s", name, _left())
+    listener = _LISTENER.get()
+    if listener is not None:
+        listener(name)
     try:
         yield
     finally:

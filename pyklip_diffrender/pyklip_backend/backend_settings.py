@@ -84,8 +84,6 @@ class DiffrenderSettings:
         one, else estimated from the frames.
     unit : Unit, optional
         Unit of the frames. Read from BUNIT if present, else dimensionless.
-    seed : int, optional
-        Passed to `refine`; 0 by default.
     fit : GaussNewton, optional
         Settings of the fit; see `refine`.
     start : dict, optional
@@ -96,17 +94,19 @@ class DiffrenderSettings:
         them in any case and uses both; a library, its file, or a folder of such files is searched
         besides the package's; see `reduce`. Reference frames are those of a psf_library that
         `JWSTData` has read, if the mode contains RDI, and any in the dataset.
-    plan : "auto" or "off", optional
-        Has no effect; see `refine`.
     keep_detected : bool, optional
-        Search the fit for companions (`detect`) and refine the star once more with them in the
-        model, so that none of their light is subtracted with the star; True by default for real
-        NIRCam frames, else False. Undetected companions still lose light, as much as the
-        throughput map says.
+        Subtract none of the light of detected companions with the star; True by default for real
+        NIRCam frames, else False. Bright ones are part of the fit in any case, as in `reduce`.
+        Undetected companions still lose light, as much as the throughput map says.
+    threshold : float, optional
+        S/N of a detected companion; see `reduce`.
     disk : bool, optional
         Fit extended light about the star together with it, see `fit_disk`, so that a disk is not
-        subtracted with the star. It includes companions, and `keep_detected` has no effect. False
-        by default.
+        subtracted with the star. False by default.
+    star_flux : float, str or Quantity, optional
+        Flux density of the star in the filter, to which contrasts then refer; see `reduce`.
+    star_flux_error : float, optional
+        Its relative error.
     image : {"cleaned", "flux", "subtracted"}, optional
         Image that the products carry. "subtracted", always that of forward models and the default
         but for real NIRCam frames, is each frame minus its star. "cleaned", the default for real
@@ -137,7 +137,7 @@ class DiffrenderSettings:
     Examples
     --------
     >>> import pyklip_diffrender as dr
-    >>> settings = dr.DiffrenderSettings(opd="opd.fits", fit_pixels=80, seed=1)
+    >>> settings = dr.DiffrenderSettings(opd="opd.fits", fit_pixels=80)
 
     For one `dataset` that pyKLIP has read:
 
@@ -152,13 +152,14 @@ class DiffrenderSettings:
     fit_pixels: int | None = None
     error: ArrayLike | None = None
     unit: u.UnitBase | None = None
-    seed: int | None = None
     fit: GaussNewton | None = None
     start: Mapping[str, Any] | None = None
     systematics: Systematics | PatternLibrary | str | os.PathLike[str] | None = None
-    plan: str | None = None
     keep_detected: bool | None = None
+    threshold: float | None = None
     disk: bool | None = None
+    star_flux: float | str | u.Quantity | None = None
+    star_flux_error: float | None = None
     image: Literal["cleaned", "flux", "subtracted"] | None = None
     max_chi2: float | None = None
     injected_into: Any = None

@@ -207,7 +207,7 @@ def frames_of(
     recorded = every.pixels == "recorded"
     details = [
         FrameDetails(
-            source.filenames[i],
+            source.paths[i].name,
             source.headers[i],
             source.first_pixels[i] if recorded else None,
             source.star_offsets[i],

@@ -133,13 +133,13 @@ class ForwardReduction(DatasetReduction):
             )
             if len(self.records) == 1:
                 first = next(part for part in record.subtraction.pointings if part.index == 0)
-                k = int(first.pointing.frames[0])
+                k, reduction = int(first.pointing.frames[0]), record.subtraction.reduction
                 self._planet_cards = planet_cards(
                     first,
                     replace(planets[k], contrast=planets[k].contrast / record.frames.factor[k]),
                     parangs[frames[k]],
                     flipx,
-                    record.subtraction.error_factor,
+                    None if reduction is None else reduction.detection.error_factor,
                 )
             for k, planet in planets.items():
                 fill(planet.left, record.frames.observation.valid[k])

@@ -50,7 +50,7 @@ def subtract_from_copy(record: ReductionRecord, frames: Frames) -> Subtraction:
         change = result.linear.response(light)[:, 0]
         for part in parts:
             star[part.pointing.frames] += part.change_in_frames(change)
-    return dataclasses.replace(before, star=star, method=f"{before.method}, linear response")
+    return dataclasses.replace(before, star=star)
 
 
 def _require_copy(record: ReductionRecord, frames: Frames) -> None:

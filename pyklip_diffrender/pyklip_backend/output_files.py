@@ -116,8 +116,7 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
     fits_of_all = [fit for record in records for fit in record.subtraction.fits]
     worst = max(fits_of_all, key=lambda fit: fit.chi2)
     first = records[0]
-    # Other subtractors may know nothing of companions.
-    companions = max(len(getattr(fit.result, "companions", ())) for fit in fits_of_all)
+    companions = max(record.subtraction.kept for record in records)
     header = fits.Header()
     values: list[tuple[str, Any, str]] = [
         ("DRALGO", "diffrender", "star subtraction algorithm"),
@@ -130,12 +129,10 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
             _shared(r.frames.observation.filter or "" for r in records),
             "filter of the model",
         ),
-        ("DRMETH", _shared(r.subtraction.method for r in records), "refinement method"),
         ("DRSTAT", worst.status, "how the refinement ended"),
-        ("DRSEED", first.subtraction.seed, "random seed"),
         ("DRCHI2", _number(worst.chi2), "chi2 per fitted pixel"),
         ("DRNFIT", len(fits_of_all), "number of refinements"),
-        ("DRKEPT", companions, "most companions that a fit knew of"),
+        ("DRKEPT", companions, "companions whose light is not in the star"),
         (
             "DRSYST",
             _shared(r.subtraction.systematics for r in records),
@@ -173,7 +170,7 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
         frames, subtraction = record.frames, record.subtraction
         line = (
             f"diffrender: {frames.observation.name}, {frames.observation.filter or 'given model'}, "
-            f"opd {record.opd.name}, {subtraction.method}, seed {subtraction.seed}, "
+            f"opd {record.opd.name}, "
             f"{frames.pixels} pixels, errors {frames.noise}"
         )
         header.add_history(fits_text(line))

@@ -11,8 +11,8 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from pyklip_diffrender.io.geometry import half_circle
-from pyklip_diffrender.scene.exposure import beginning
+from pyklip_diffrender.scene.exposure import beginning, middle
+from pyklip_diffrender.scene.integrations import pointings
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = [
@@ -22,18 +22,11 @@ __all__ = [
     "pointings_of",
 ]
 
-_SAME_PLACE = 0.05
-"""Pixels by which the star may move within a pointing."""
-
-_SAME_ANGLE = 0.01
-"""Degrees by which the position angle may change within a pointing: a tenth of a pixel 10 arcsec
-from the star."""
-
 
 class FrameDetails(NamedTuple):
     """Details of one frame, from its file, that an `Observation` of several does not hold."""
 
-    name: str
+    file: str
     header: fits.Header
     first_pixel: tuple[int, int] | None = None
     star_offset: tuple[float, float] | None = None
@@ -71,46 +64,48 @@ def part_of(observation: Observation, which: NDArray[np.intp] | NDArray[np.bool_
 def pointings_of(
     observation: Observation, details: Sequence[FrameDetails] | None = None
 ) -> list[Pointing]:
-    """Sort the frames of an observation by where they show the star.
+    """Sort the frames of an observation by file and by where they show the star.
+
+    The rule is that of `Observation.pointings`. As in a `Sequence`, the pointings are in order of
+    time.
 
     Parameters
     ----------
     observation : Observation
         Several pointings.
     details : sequence of FrameDetails, optional
-        One for each frame; default what the observation says.
+        One for each frame; by default all frames are as if from one file.
     """
     known = observation.position_angles
-    angles = np.zeros(len(observation)) if known is None else known
-    groups: list[list[int]] = []
-    for k, (center, angle) in enumerate(zip(observation.center, angles, strict=True)):
-        for group in groups:
-            other = group[0]
-            if (
-                np.hypot(*(center - observation.center[other])) <= _SAME_PLACE
-                and abs(half_circle(angle - angles[other])) <= _SAME_ANGLE
-                and (details is None or details[k].first_pixel == details[other].first_pixel)
-            ):
-                group.append(k)
-                break
-        else:
-            groups.append([k])
-    pointings = []
-    for group in groups:
-        frames = np.array(group)
-        part = part_of(observation, frames)
-        # One place for all: what is averaged has one star.
-        center = np.tile(part.center.mean(axis=0), (len(frames), 1))
-        part = dataclasses.replace(part, center=center, position_angles=angles[frames])
-        if details is not None:
+    if details is None:
+        groups = list(pointings(observation.center, known))
+        return [Pointing(group, _at_one_place(observation, group)) for group in groups]
+    files: dict[str, list[int]] = {}
+    for k, each in enumerate(details):
+        files.setdefault(each.file, []).append(k)
+    made = []
+    for file, rows in files.items():
+        inside = np.array(rows)
+        angles = None if known is None else known[inside]
+        groups = [inside[each] for each in pointings(observation.center[inside], angles)]
+        for k, group in enumerate(groups, 1):
             first = details[group[0]]
             part = dataclasses.replace(
-                part,
-                name=first.name if len(group) == 1 else f"{first.name} and {len(group) - 1} more",
+                _at_one_place(observation, group),
+                name=file if len(groups) == 1 else f"{file} (pointing {k})",
                 header=first.header,
-                date=beginning(first.header, first.name),
+                date=beginning(first.header, file),
+                mid_date=middle(first.header, file),
                 first_pixel=first.first_pixel,
                 star_offset=first.star_offset,
             )
-        pointings.append(Pointing(frames, part))
-    return pointings
+            made.append(Pointing(group, part))
+    return sorted(
+        made, key=lambda each: 0.0 if each.observation.date is None else each.observation.date.mjd
+    )
+
+
+def _at_one_place(observation: Observation, group: NDArray[np.intp]) -> Observation:
+    """Some frames, with their star at one place: what is averaged has one star."""
+    part = part_of(observation, group)
+    return dataclasses.replace(part, center=np.tile(part.center.mean(axis=0), (len(group), 1)))

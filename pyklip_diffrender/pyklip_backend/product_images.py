@@ -68,7 +68,7 @@ class ProductImages:
     def __init__(self, subtraction: Subtraction) -> None:
         self.pointings = subtraction.pointings
         self.fits = list(dict.fromkeys(part.result for part in self.pointings))
-        self._disk = subtraction.disk
+        self._disk = None if subtraction.reduction is None else subtraction.reduction.disk
 
     @cached_property
     def sky(self) -> SkyModel:

@@ -94,7 +94,7 @@ def unregister() -> None:
     Examples
     --------
     >>> import pyklip_diffrender as dr
-    >>> dr.register(seed=1)
+    >>> dr.register(fit_pixels=64)
     >>> dr.unregister()
     """
     with REGISTRY.lock:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, cast
@@ -12,24 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.progress import heard_by
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 from pyklip_diffrender.pyklip_backend.pointings import Pointing, pointings_of
-from pyklip_diffrender.pyklip_backend.verdict import (
-    require_plausible,
-    warn_of_status,
-)
+from pyklip_diffrender.reduction.verdict import MAX_CHI2, warn_of_status
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
-from pyklip_diffrender.scene.sequence import Sequence as Frames
+from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
 from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.wavefront.opd import OPDMap
 
 if TYPE_CHECKING:
-    from pyklip_diffrender.detection import Disk
-    from pyklip_diffrender.detection.error_factor import ErrorFactor
+    from pyklip_diffrender.detection import Detection
     from pyklip_diffrender.optics.system import OpticalSystem
-    from pyklip_diffrender.pattern import PatternChoice, PatternRequest
+    from pyklip_diffrender.pattern import PatternRequest
+    from pyklip_diffrender.reduction import ReduceOptions, Reduction
     from pyklip_diffrender.refinement import Refinement
 
 __all__ = ["FIT_PIXELS", "Fit", "Subtraction", "Subtractor", "subtract_by_refinement"]
@@ -38,8 +35,6 @@ logger = logging.getLogger(__name__)
 
 FIT_PIXELS = 80
 """Default side of the fitted square: 5 arcsec, the reach of the occulter."""
-
-SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,10 +68,6 @@ class Subtraction:
     star : ndarray
         (n, ny, nx) star and uniform background to subtract, in the unit and on the pixels of the
         observation; NaN outside the model's field.
-    method : str
-        Name of the method.
-    seed : int
-        Random seed.
     fits : tuple of Fit
         At least one; together they cover all frames.
     systematics : str
@@ -85,21 +76,19 @@ class Subtraction:
         Number of frames of reference stars that were used.
     pointings : tuple of FittedPointing
         The parts of the fits, one for each pointing; empty for other subtractors.
-    error_factor : ErrorFactor, optional
-        By how much the S/N scatters more than it should, if companions were searched.
-    disk : Disk, optional
-        Extended light in the frames, which the data of the fit do not have.
+    reduction : Reduction, optional
+        Fit, search and extended light, as `reduce` has them; None for other subtractors.
+    kept : int
+        Number of candidates whose light was kept out of the star.
     """
 
     star: NDArray[np.float64]
-    method: str
-    seed: int
     fits: tuple[Fit, ...]
     systematics: str = "none"
     references: int = 0
     pointings: tuple[FittedPointing, ...] = ()
-    error_factor: ErrorFactor | None = None
-    disk: Disk | None = None
+    reduction: Reduction | None = None
+    kept: int = 0
 
     @property
     def worst(self) -> Fit:
@@ -141,7 +130,7 @@ def subtract_by_refinement(
     references: Sequence[Observation] = (),
     tell: Callable[[str], None] = logger.info,
 ) -> Subtraction:
-    """Refine the wavefront until the rendered star matches the frames (the default).
+    """Reduce the frames as `pyklip_diffrender.reduce` does, and render the star (the default).
 
     All frames are fitted together: those with the same star centre and position angle, such as
     the integrations of one exposure, are averaged first, and all rolls and dithers share a
@@ -152,7 +141,8 @@ def subtract_by_refinement(
     observation, opd, settings
         See `Subtractor`.
     pointings : sequence of Pointing, optional
-        The frames by pointing, with what their files say; found from `observation` by default.
+        The frames by pointing, in order of time, with what their files say; by default the
+        frames of `observation` are sorted by where they show the star.
     references : sequence of Observation
         Frames of reference stars.
     tell : callable
@@ -161,8 +151,8 @@ def subtract_by_refinement(
     Raises
     ------
     IncompatibleSetupError
-        If there is neither a model nor a filter to make one for, for `keep_detected` with a
-        method that `detect` cannot use, or if "references" is asked for without any.
+        If there is neither a model nor a filter to make one for, or if "references" is asked for
+        without any.
     RefinementError
         If a refinement has no usable or no plausible result.
 
@@ -173,66 +163,90 @@ def subtract_by_refinement(
     """
     model = model_of(observation, settings)
     # Takes a second to import, so only after the input has been checked.
-    from pyklip_diffrender.pattern import fit_with_pattern
+    from pyklip_diffrender.reduction import prepare
 
     groups = list(pointings_of(observation) if pointings is None else pointings)
-    whole = Frames(observation.target, tuple(group.observation for group in groups))
-    windows = whole.windows(model.detector.shape)
-    cut = whole.cutout(model.detector.shape, beyond_edges=True).science
-
-    def frames_of_references() -> list[Observation]:
-        tell("fitting the reference stars")
-        shape = model.detector.shape
-        return [each.within(Window.about(each.center[0], shape)) for each in references]
-
-    def fit(choice: PatternChoice, again: bool) -> Refinement:
-        if again:
-            tell("the frames do not show the pattern of the library")
-        elif references and not choice.references:
-            tell("the reference frames are not needed")
-        return _refined(choice, model, opd, settings, tell)
-
-    choice, result = fit_with_pattern(
-        cut,
-        frames_of_references if references else (),
-        model,
-        opd,
-        fit,
-        systematics=_requested_pattern(settings, observation, references),
-        settings=settings.fit,
+    science = tuple(group.observation for group in groups)
+    sequence = FrameSequence(observation.target, science, tuple(references))
+    options = _options(settings, observation, references)
+    preparation = prepare(sequence, opd, options, model=model)
+    tell(
+        f"fitting {_counted(sum(map(len, science)), 'frame')} of "
+        f"{_counted(len(science), 'pointing')}"
+        f"{'' if len(science) == 1 else ' together'}, {model.detector.shape[1]} x "
+        f"{model.detector.shape[0]} pixels"
     )
-    keep, error_factor, disk = settings.keep_detected, None, None
-    if settings.disk:
-        from pyklip_diffrender.detection import fit_disk
-
-        tell("fitting the extended light")
-        disk = fit_disk(result)
-        result = disk.fit
-        tell(f"{disk}: {_described(result)}")
-    if observation.is_nircam if keep is None else keep:
-        result, error_factor = _with_companions(result, tell)
+    with heard_by(tell):
+        reduction = preparation.run()
+    fit, number = reduction.fit, len(reduction.detection.sources)
+    tell(f"{_described(fit)}, {fit.seconds:.0f} s, flat-field pattern: {reduction.pattern}")
+    tell(f"{_counted(number, 'companion')} detected")
+    warn_of_status(science[0].name, fit)
+    windows = sequence.windows(model.detector.shape)
+    cut = preparation.sequence.science
+    fitted = tuple(
+        FittedPointing(
+            fit, k, group, window, fit.frames[k].observation.center[0] - cut[k].center.mean(axis=0)
+        )
+        for k, (group, window) in enumerate(zip(groups, windows, strict=True))
+    )
     star = np.full(observation.data.shape, np.nan)
-    # It may have been refined again with companions.
-    require_plausible(cut[0].name, result, settings.max_chi2)
-    warn_of_status(cut[0].name, result)
-    fitted = []
-    for k, (group, window) in enumerate(zip(groups, windows, strict=True)):
-        away = result.frames[k].observation.center[0] - cut[k].center[0]
-        fitted.append(FittedPointing(result, k, group, window, away))
-        star[group.frames] = fitted[-1].star()
+    for part in fitted:
+        star[part.pointing.frames] = part.star()
+    keep = settings.keep_detected
+    kept = observation.is_nircam if keep is None else keep
+    if kept:
+        _give_back(star, fitted, reduction.detection)
     frames = np.sort(np.concatenate([group.frames for group in groups]))
-    status = result.status.name.lower()
     return Subtraction(
         star,
-        result.method,
-        _seed_of(settings),
-        (Fit(tuple(map(int, frames)), status, float(result.chi2_per_pixel), result),),
-        choice.label,
-        choice.reference_frames,
-        tuple(fitted),
-        error_factor,
-        disk,
+        (Fit(tuple(map(int, frames)), fit.status.name.lower(), float(fit.chi2_per_pixel), fit),),
+        reduction.pattern,
+        reduction.reference_frames,
+        fitted,
+        reduction,
+        number if kept else len(fit.companions),
     )
+
+
+def _give_back(
+    star: NDArray[np.float64], fitted: Sequence[FittedPointing], detection: Detection
+) -> None:
+    """Take the light of candidates out of the star (n, Ny, Nx) in place, to first order.
+
+    Those that are companions of the fit have lost nothing to the star.
+    """
+    # Takes a second to import.
+    from pyklip_diffrender.detection.relinearise import are_companions
+
+    candidates = detection.sources
+    for k in np.flatnonzero(are_companions(detection.fits[0], candidates))[::-1]:
+        candidates = candidates.without(int(k))
+    if not len(candidates):
+        return
+    linear, templates = detection.groups[0]
+    change = linear.response(candidates.light(templates))[:, 0]
+    for part in fitted:
+        star[part.pointing.frames] -= part.change_in_frames(change)
+
+
+def _options(
+    settings: DiffrenderSettings, observation: Observation, references: Sequence[Observation]
+) -> ReduceOptions:
+    """Options of the reduction; the settings that are None are those of `reduce`."""
+    from pyklip_diffrender.reduction import ReduceOptions
+
+    given = {
+        "settings": settings.fit,
+        "start": settings.start,
+        "threshold": settings.threshold,
+        "disk": settings.disk,
+        "star_flux": settings.star_flux,
+        "star_flux_error": settings.star_flux_error,
+        "systematics": _requested_pattern(settings, observation, references),
+        "max_chi2": MAX_CHI2 if settings.max_chi2 is None else settings.max_chi2,
+    }
+    return ReduceOptions(**{key: value for key, value in given.items() if value is not None})
 
 
 def _requested_pattern(
@@ -259,42 +273,6 @@ def _requested_pattern(
     return as_request(requested)
 
 
-def _refined(
-    choice: PatternChoice,
-    model: OpticalSystem,
-    opd: OPDMap,
-    settings: DiffrenderSettings,
-    tell: Callable[[str], None],
-) -> Refinement:
-    """Fit all pointings together with a pattern."""
-    from pyklip_diffrender.refinement import refine
-
-    science = choice.science
-    tell(
-        f"fitting {_counted(sum(map(len, science)), 'frame')} of "
-        f"{_counted(len(science), 'pointing')}"
-        f"{'' if len(science) == 1 else ' together'}, {model.detector.shape[1]} x "
-        f"{model.detector.shape[0]} pixels, flat-field pattern: {choice.label}"
-    )
-    result = refine(
-        model,
-        science,
-        opd,
-        settings=choice.settings,
-        start=settings.start,
-        systematics=choice.systematics,
-        plan="auto" if settings.plan is None else settings.plan,
-        seed=_seed_of(settings),
-    )
-    require_plausible(science[0].name, result, settings.max_chi2)
-    tell(f"{_described(result)}, {result.seconds:.0f} s")
-    return result
-
-
-def _seed_of(settings: DiffrenderSettings) -> int:
-    return SEED if settings.seed is None else settings.seed
-
-
 def _described(result: Refinement) -> str:
     """How a fit ended, in a few words."""
     return f"{result.status.name.lower()}, chi2 per pixel {result.chi2_per_pixel:.3g}"
@@ -302,30 +280,6 @@ def _described(result: Refinement) -> str:
 
 def _counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
-def _with_companions(
-    result: Refinement, tell: Callable[[str], None]
-) -> tuple[Refinement, ErrorFactor]:
-    """Refine again with the companions that are detected.
-
-    The second value is the factor by which the errors of the search are too small.
-    """
-    from pyklip_diffrender.detection import detect
-    from pyklip_diffrender.detection.relinearise import lacks_candidates, with_companions
-
-    # No relinearisation: the star is refined again below.
-    tell("searching for companions")
-    detection = detect(result, relinearise=math.inf)
-    logger.info("companions kept out of the star: %s", detection.candidates)
-    number = _counted(len(detection.sources), "companion")
-    if not lacks_candidates([result], detection.sources):
-        tell(f"{number} detected, as many as the fit has")
-        return result, detection.error_factor
-    tell(f"{number} detected, {len(result.companions)} in the fit: the star is fitted again")
-    (result,) = with_companions([result], detection.sources)
-    tell(_described(result))
-    return result, detection.error_factor
 
 
 def model_of(observation: Observation, settings: DiffrenderSettings) -> OpticalSystem:

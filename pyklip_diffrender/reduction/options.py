@@ -68,6 +68,11 @@ class ReduceOptions:
     memory : float, str or Quantity, optional
         Memory that the process may take, bytes or such as "2 GB"; see `GaussNewton`, whose value
         it replaces.
+    start : dict, optional
+        Starting values of the fit by parameter name, as for `refine`.
+    max_chi2 : float, optional
+        Reduced chi-squared of a fit above which the reduction stops with a `RefinementError`; by
+        default a fit that does not explain the frames is reported.
 
     Attributes
     ----------
@@ -105,6 +110,8 @@ class ReduceOptions:
     star_flux_error: float = 0.05
     device: str = "cpu"
     memory: float | str | u.Quantity | None = None
+    start: Mapping[str, Any] | None = None
+    max_chi2: float | None = None
 
     def __post_init__(self) -> None:
         _require_whole(self.size, "size", _SMALLEST)
@@ -123,6 +130,10 @@ class ReduceOptions:
             )
         if self.star_flux is not None:
             object.__setattr__(self, "star_flux", to_jansky(self.star_flux))
+        if self.max_chi2 is not None and not self.max_chi2 > 0:
+            raise IncompatibleSetupError(
+                f"max_chi2: got {self.max_chi2}, expected a positive number; inf for no limit"
+            )
         if self.memory is not None:
             object.__setattr__(self, "memory", to_bytes(self.memory, "memory"))
         object.__setattr__(self, "systematics", as_request(self.systematics))

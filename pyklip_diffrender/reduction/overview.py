@@ -57,7 +57,7 @@ class Klip:
         science = None if reduction.disk is None else sequence.science
         try:
             # pyKLIP is loaded only if it is needed.
-            from pyklip_diffrender.pyklip_backend.klip import klip_curve, klip_image
+            from pyklip_diffrender.reduction.klip_curve import klip_curve, klip_image
 
             curve = klip_curve(detection, sequence.references)
             modes = int(np.median(curve["modes"]))

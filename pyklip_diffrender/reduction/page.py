@@ -379,7 +379,6 @@ def _provenance(summary: Mapping[str, Any], files: Mapping[str, str]) -> str:
     versions = ", ".join(" ".join(each) for each in summary["versions"].items())
     facts = [
         ("Time of the fits", number(seconds, ".1f", "s")),
-        ("Seed", str(summary["seed"])),
         ("Chi-squared per pixel", number(summary["fit"]["chi2_per_pixel"])),
     ]
     settings = "; ".join(f"{name}: {value}" for name, value in summary["settings"].items())

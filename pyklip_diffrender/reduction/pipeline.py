@@ -26,6 +26,7 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.pattern import PatternChoice, fit_with_pattern
 from pyklip_diffrender.reduction.options import ReduceOptions
 from pyklip_diffrender.reduction.reduction_result import Reduction
+from pyklip_diffrender.reduction.verdict import require_plausible
 from pyklip_diffrender.refinement import (
     Refinement,
     refine,
@@ -112,7 +113,13 @@ def reduce(
     return prepare(sequence, opd, options).run(progress=progress)
 
 
-def prepare(sequence: Sequence, opd: Any, options: ReduceOptions) -> Preparation:
+def prepare(
+    sequence: Sequence,
+    opd: Any,
+    options: ReduceOptions,
+    *,
+    model: OpticalSystem | None = None,
+) -> Preparation:
     """Check that a sequence can be reduced, and make what the reduction starts from.
 
     Parameters
@@ -120,6 +127,10 @@ def prepare(sequence: Sequence, opd: Any, options: ReduceOptions) -> Preparation
     sequence : Sequence
     opd : path, OPDMap, Quantity, array or "flat"
     options : ReduceOptions
+    model : OpticalSystem, optional
+        By default that of the frames' filter and mask, with `size` pixels a side, which must be
+        inside the frames. With a model, as many pixels as its detector has are fitted; those beyond
+        the edges of the frames are masked.
 
     Returns
     -------
@@ -141,8 +152,12 @@ def prepare(sequence: Sequence, opd: Any, options: ReduceOptions) -> Preparation
         )
     if options.wide:
         require_outer_pixels(sequence.science[0], options.size)
-    model = model_for(sequence.science[0], options.size, device=options.device)
-    return Preparation(sequence, sequence.cutout(options.size), model, wavefront, options)
+    if model is None:
+        model = model_for(sequence.science[0], options.size, device=options.device)
+        cut = sequence.cutout(options.size)
+    else:
+        cut = sequence.cutout(model.detector.shape, beyond_edges=True)
+    return Preparation(sequence, cut, model, wavefront, options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +228,7 @@ class _Run:
         if options.completeness and len(detection.contrast_curve):
             with stage("completeness"):
                 fractions = completeness(detection, progress=self.progress)
+        self._require_plausible(detection.fits[0])  # It may have been fitted with companions.
         return Reduction(
             sequence,
             detection.fits[0],
@@ -220,6 +236,7 @@ class _Run:
             choice.references,
             choice.systematics,
             choice.failed,
+            choice.label,
             wide,
             disk,
             injections,
@@ -237,14 +254,21 @@ class _Run:
             self.preparation.model,
             tuple(science),
             self.preparation.wavefront,
-            systematics=choice.systematics,
             settings=choice.settings,
+            start=options.start,
+            systematics=choice.systematics,
             progress=self.progress,
         )
+        self._require_plausible(fit)
         if options.star_flux is None:
             return fit
         flux, error = to_jansky(options.star_flux), options.star_flux_error
         return with_star_flux(fit, flux, error, progress=self.progress)
+
+    def _require_plausible(self, fit: Refinement) -> None:
+        limit = self.preparation.options.max_chi2
+        if limit is not None:
+            require_plausible(fit.frames[0].observation.name, fit, limit)
 
     def _search(self, fit: Refinement, disk: Disk | None = None) -> Detection:
         return detect(

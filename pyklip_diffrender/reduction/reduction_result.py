@@ -45,6 +45,8 @@ class Reduction:
         The flat-field pattern that was used.
     failed : tuple of (str, str)
         Reference stars that could not be fitted, and why.
+    pattern : str
+        Origin of the flat-field pattern, with the names of its stars.
     wide : WideField or None
         The search of the whole frames, if it was asked for.
     disk : Disk or None
@@ -70,10 +72,18 @@ class Reduction:
     references: tuple[Refinement, ...] = ()
     systematics: Systematics | None = None
     failed: tuple[tuple[str, str], ...] = ()
+    pattern: str = "none"
     wide: WideField | None = None
     disk: Disk | None = None
     injections: QTable | None = None
     completeness: QTable | None = None
+
+    @property
+    def reference_frames(self) -> int:
+        """Number of frames of reference stars that the flat-field pattern was learned from."""
+        if self.systematics is None:
+            return 0
+        return sum(len(frame.observation) for fit in self.references for frame in fit.frames)
 
     @property
     def remark(self) -> str:

@@ -104,7 +104,6 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
             *({"name": f"reference star {n}", "reason": why} for n, why in reduction.failed),
         ],
         "settings": _settings(fit.settings),
-        "seed": fit.seed,
         "seconds": sum(each.seconds for each in (fit, *reduction.references)),
         "versions": {
             "pyklip_diffrender": __version__,

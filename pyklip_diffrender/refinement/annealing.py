@@ -136,14 +136,8 @@ class Annealing:
         self._first_scales = self.solver.priors.scales
         self.history: list[dict[str, Any]] = []
 
-    def run(self, seed: int) -> Refinement:
-        """Fit the alignment, then alignment and wavefront; return the best iterate.
-
-        Parameters
-        ----------
-        seed : int
-            Recorded with the result.
-        """
+    def run(self) -> Refinement:
+        """Fit the alignment, then alignment and wavefront; return the best iterate."""
         began = time.perf_counter()
         course, converged = self._beginning(), False
         with ProgressBar("wavefront", shown=self.progress) as bar:
@@ -160,7 +154,6 @@ class Annealing:
             status,
             history=self.history,
             seconds=time.perf_counter() - began,
-            seed=seed,
         )
 
     def _beginning(self) -> Course:

@@ -35,7 +35,7 @@ def conclude(
         Error of the star model that errors include, as a fraction of the star.
     status : Status
     **about
-        History, duration and seed of the fit.
+        History and duration of the fit.
     """
     problems = [forward.problem for forward in solver.objective.forwards]
     modes = len(solver.basis) if settings.wavefront else 0

@@ -72,7 +72,6 @@ def fit_in_stages(
     settings: GaussNewton,
     warm: Mapping[Unknown, float] | None = None,
     *,
-    seed: int,
     progress: bool,
 ) -> Refinement:
     """Refine with the basis of the settings, or the first default basis that explains the data.
@@ -86,15 +85,13 @@ def fit_in_stages(
     settings : GaussNewton
     warm : mapping of Unknown to float, optional
         Starting values.
-    seed : int
-        Recorded with the result.
     progress : bool
         Show progress bars.
     """
     pupil = problems[0].model.entrance
     if settings.basis is not None or not settings.cycles:
         basis = settings.basis or default_basis(pupil=pupil)
-        return Annealing(problems, settings, basis, warm, progress).run(seed)
+        return Annealing(problems, settings, basis, warm, progress).run()
     # The number of modes that drift is fixed.
     grows = settings.wavefront and settings.grow_basis and settings.drift is None
     cycles_to_try = settings.cycles if grows else settings.cycles[:1]
@@ -105,7 +102,7 @@ def fit_in_stages(
             _log.info("residuals have structure: adding modes up to %g cycles per pupil", cycles)
             adapted, warm = continue_from(fit, cycles=settings.cycles[k:])
         earlier = fit
-        fit = Annealing(problems, adapted, default_basis(cycles, pupil), warm, progress).run(seed)
+        fit = Annealing(problems, adapted, default_basis(cycles, pupil), warm, progress).run()
         if earlier is not None:
             seconds, history = earlier.seconds + fit.seconds, earlier.history + fit.history
             fit = replace(fit, seconds=seconds, history=history)
@@ -137,5 +134,5 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
         for frame in fit.frames
     ]
     with breakdown_explained(problems[0].observation.name):
-        again = fit_in_stages(problems, settings, warm, seed=fit.seed, progress=progress)
+        again = fit_in_stages(problems, settings, warm, progress=progress)
     return replace(again, catalogue_error=fit.catalogue_error)

@@ -50,7 +50,7 @@ Image = NDArray[np.float64]
 _ARRAYS = ("companions", "companion_errors")
 _PLAIN = (
     "settings", "basis", "chi2_per_pixel", "model_error", *_ARRAYS, "scales", "prior_ratios",
-    "effective_parameters", "log_evidence", "history", "seconds", "seed", "catalogue_error",
+    "effective_parameters", "log_evidence", "history", "seconds", "catalogue_error",
 )  # fmt: skip
 """Attributes of a refinement that are written as text."""
 
@@ -95,7 +95,6 @@ class Refinement:
     history : list of dict
         One entry for each iteration.
     seconds : float
-    seed : int
     catalogue_error : float or None
         Relative error of the star's flux if a catalogue has stated it, see `star_flux_error`.
 
@@ -134,7 +133,6 @@ class Refinement:
     systematics: Systematics | None = None
     history: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = math.nan
-    seed: int = 0
     catalogue_error: float | None = None
 
     def __repr__(self) -> str:
@@ -183,11 +181,6 @@ class Refinement:
         0 where the amplitude was not fitted.
         """
         return np.array(np.imag(self.frames[0].opd))
-
-    @property
-    def method(self) -> str:
-        """Name of the method."""
-        return "gauss-newton"
 
     @property
     def planets(self) -> tuple[Planet, ...]:
@@ -402,13 +395,11 @@ class Refinement:
     def summary(self) -> Mapping[str, Any]:
         """Return metadata for a header or a log, without arrays."""
         return {
-            "method": self.method,
             "status": self.status.name,
             "frames": len(self.frames),
             "chi2_per_pixel": self.chi2_per_pixel,
             "model_error": self.model_error,
             "seconds": self.seconds,
-            "seed": self.seed,
             "opd": self.initial.name,
             "opd_sha256": self.initial.sha256,
             "systematics": "none" if self.systematics is None else self.systematics.name,

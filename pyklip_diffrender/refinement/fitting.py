@@ -38,8 +38,6 @@ def refine(
     settings: GaussNewton | None = None,
     start: Start | Sequence[Start] | None = None,
     systematics: Systematics | None = None,
-    plan: str = "auto",
-    seed: int = 0,
     progress: bool = False,
 ) -> Refinement:
     """Refine an outdated wavefront until the rendered star matches the data.
@@ -64,11 +62,6 @@ def refine(
         is by default that of the star in the observation.
     systematics : Systematics, optional
         Known flat-field pattern, see `learn_systematics`.
-    plan : "auto" or "off"
-        Has no effect: the fit uses `model` and the modes of the settings, whatever the noise. It is
-        accepted because earlier versions chose a coarser model where the noise allowed one.
-    seed : int
-        Recorded with the result; the fit is deterministic.
     progress : bool
         Show progress bars.
 
@@ -82,8 +75,7 @@ def refine(
     MissingOPDError
         If `opd` is None.
     IncompatibleSetupError
-        For settings or systematics that do not fit the model and the observations, and for another
-        value of `plan`.
+        For settings or systematics that do not fit the model and the observations.
     ShapeError, UnitError, NonFiniteError, NoValidPixelsError, CorruptFileError
         As their names say.
     RefinementError
@@ -123,15 +115,13 @@ def refine(
         # A system without a Lyot stop has no parameters of one.
         available = (*model.parameters, "flux", "background")
         adapted = replace(adapted, free=tuple(name for name in adapted.free if name in available))
-    if plan not in ("auto", "off"):
-        raise IncompatibleSetupError(f"plan: got {plan!r}, expected 'auto' or 'off'")
     wavefront = as_opd_map(opd)
     problems = [
         Problem(model, each, wavefront, _with_position(model, each, begin), systematics)
         for each, begin in zip(observations, _one_by_one(start, len(observations)), strict=True)
     ]
     with breakdown_explained(observations[0].name):
-        return fit_in_stages(problems, adapted, seed=seed, progress=progress)
+        return fit_in_stages(problems, adapted, progress=progress)
 
 
 def _one_by_one(start: Start | Sequence[Start] | None, count: int) -> list[Start]:

@@ -51,7 +51,8 @@ _MOST = 0.25
 
 _SAME_PLACE = 0.3
 """Pixels between the stars of frames that are averaged: a planet is then blurred by less than
-a tenth of its width."""
+a tenth of its width. Positions in aligned files were measured for each integration, to a tenth of
+a pixel or so; a tighter rule would take their errors for pointings of their own."""
 
 _SAME_ANGLE = 0.05
 """Degrees between frames that are averaged: a tenth of a pixel 7 arcsec from the star."""

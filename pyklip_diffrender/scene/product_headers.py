@@ -23,12 +23,10 @@ _OBSERVED = (
 
 _REDUCED = {
     "software": ("DRVERS", "version of the software"),
-    "method": ("DRMETH", "refinement method"),
     "status": ("DRSTAT", "how the refinement ended"),
     "chi2_per_pixel": ("DRCHI2", "chi-squared per fitted pixel"),
     "model_error": ("DRMODERR", "error of the model, fraction of the star"),
     "frames": ("DRNFRAME", "number of fitted frames"),
-    "seed": ("DRSEED", "random seed"),
     "seconds": ("DRSECS", "duration of the refinement, s"),
     "opd": ("DROPD", "wavefront map at the start"),
     "opd_sha256": ("DRSHA256", ""),

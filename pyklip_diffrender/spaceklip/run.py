@@ -13,7 +13,7 @@ import numpy as np
 from astropy import units as u
 from astropy.table import QTable, Table
 
-from pyklip_diffrender.detection import Detection, detect
+from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.errors import (
     DiffrenderError,
     DiffrenderWarning,
@@ -22,7 +22,7 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.units import require_bound
 from pyklip_diffrender.pyklip_backend.reduce_files import reduce_jwst_files
-from pyklip_diffrender.refinement import to_jansky, with_star_flux
+from pyklip_diffrender.refinement import to_jansky
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.spaceklip.database_files import (
     complete_header,
@@ -173,10 +173,15 @@ def run_obs(
                 table,
                 frames,
                 folder,
-                threshold,
                 save_rolls,
-                (fluxes.get(_filter(table)), star_flux_error),
-                {"opd": opd, "verbose": verbose, **settings},
+                {
+                    "opd": opd,
+                    "verbose": verbose,
+                    "threshold": threshold,
+                    "star_flux": fluxes.get(_filter(table)),
+                    "star_flux_error": star_flux_error,
+                    **settings,
+                },
             )
         except Exception as error:  # Reported after the other concatenations.
             logger.exception("concatenation %s failed", key)
@@ -255,15 +260,12 @@ def _reduced(
     table: Table,
     frames: QTable,
     folder: Path,
-    threshold: float,
     save_rolls: bool,
-    star_flux: tuple[float | None, float],
     settings: dict[str, Any],
 ) -> tuple[Path, Detection]:
     """Reduce one concatenation and write its files; the path of the product.
 
-    `frames` is the table of admission, and `star_flux` the flux density, Jy, and its relative
-    error.
+    `frames` is the table of admission.
     """
     kinds = np.array(table["TYPE"], dtype=str)
     files = np.array(table["FITSFILE"], dtype=object)
@@ -272,11 +274,9 @@ def _reduced(
     dataset = reduce_jwst_files(
         files[kinds == "SCI"], files[kinds == "REF"], folder=folder, prefix=prefix, **settings
     )
-    fits = [fit.result for record in dataset.diffrender_results for fit in record.subtraction.fits]
-    jansky, error = star_flux
-    if jansky is not None:
-        fits = [with_star_flux(fit, jansky, error) for fit in fits]
-    detection = detect(fits, threshold=threshold)
+    # A concatenation has one filter, so one wavelength.
+    (record,) = dataset.diffrender_results
+    detection = record.subtraction.reduction.detection
     product = folder / f"{prefix}-KLmodes-all.fits"
     complete_header(product, table, mode)
     if save_rolls:

@@ -34,7 +34,7 @@ _ADVICE = {
 }
 
 
-def require_plausible(name: str, result: Refinement, limit: float | None) -> None:
+def require_plausible(name: str, result: Refinement, limit: float) -> None:
     """Refuse a fit that failed, or that has nothing to do with the frames.
 
     Raises
@@ -45,7 +45,7 @@ def require_plausible(name: str, result: Refinement, limit: float | None) -> Non
 
     if not result.status.usable:
         raise RefinementError(f"{name}: {result.status.message}", result)
-    chi2, limit = reduced_chi2(result), MAX_CHI2 if limit is None else limit
+    chi2 = reduced_chi2(result)
     if chi2 > limit:
         raise RefinementError(
             f"{name}: reduced chi-squared is {chi2:.3g}, above max_chi2={limit:g}: the rendered "
