@@ -179,7 +179,7 @@ def test_a_failure_is_reported_after_the_others(
     }
     database = StandIn(tmp_path, obs)
 
-    def reduced(key: str, table: Table, frames: QTable, folder: Path, *others: Any) -> Any:
+    def reduced(key: str, table: Table, judged: Any, folder: Path, *others: Any) -> Any:
         if key == "bad":
             raise IncompatibleSetupError("no such filter")
         header = {name: good[name][0] for name in good.colnames if len(name) <= 8
@@ -223,9 +223,9 @@ def test_files_are_judged_before_any_is_fitted(tmp_path: Path) -> None:
     table = concatenation([*rolls, str(confirmation), str(own), str(other)])
     table["TYPE"] = ["SCI"] * 3 + ["REF"] * 2
     with pytest.warns(DiffrenderWarning) as caught:
-        left, frames = run._admitted(KEY, table)
+        left, judged = run._admitted(KEY, table)
     assert list(left["FITSFILE"]) == [*rolls, str(other)]
-    uses = {row["file"]: row["use"] for row in frames}
+    uses = {row["file"]: row["use"] for row in judged.sequence.table}
     assert uses == {
         "1_calints.fits": "target", "2_calints.fits": "target", "psf.fits": "reference",
         "own.fits": "excluded", "ta.fits": "excluded",

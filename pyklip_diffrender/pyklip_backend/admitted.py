@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import abc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from pyklip_diffrender.io.headers import header_text
 from pyklip_diffrender.pyklip_backend.source import REFERENCES, SourceFrames
 from pyklip_diffrender.scene.catalogue_star import star_of
 from pyklip_diffrender.scene.exposure import is_reference
+from pyklip_diffrender.scene.frame_files import FrameFile
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.sequence import Sequence
 
@@ -74,25 +76,14 @@ def admit(source: SourceFrames, frames: NDArray[np.intp], library: abc.Sequence[
         For every file that is not used, or not entirely, with the reason.
     """
     paths = [source.paths[k] for k in frames]
-    gone = [path.name for path in dict.fromkeys(paths) if not path.exists()]
-    if gone:
-        warnings.warn(
-            f"the frames of {', '.join(gone)} are not judged: the files are gone",
-            DiffrenderWarning,
-            stacklevel=2,
-        )
-        return Admitted(np.ones(len(frames), dtype=bool), ())
-    headers = [source.headers[k] for k in frames]
-    first = next((k for k, h in enumerate(headers) if not is_reference(h)), 0)
-    name = source.filenames[frames[first]]
-    sequence = Sequence.from_files(
-        list(dict.fromkeys(paths)),
-        references=library,
-        target=next(iter(star_of(headers[first], name).names), None),
-        filter=header_text(headers[first], "FILTER", name),
-    )
+    sequence = source.sequence
+    known = sequence is not None
+    if sequence is None:
+        sequence = _sequence(source, frames, paths, library)
     others = {str(each.get("FILTER")) for each in source.headers} - {str(sequence.filter)}
     for row in sequence.rows:
+        if known and row.use == "excluded":
+            continue  # Whoever has judged the files has said so.
         if row.remark and row.exposure.filter not in others:
             what = "is not used: " if row.use == "excluded" else ""
             warnings.warn(
@@ -117,3 +108,22 @@ def admit(source: SourceFrames, frames: NDArray[np.intp], library: abc.Sequence[
         )
     used = [uses.get(path) == "target" and not a for path, a in zip(paths, again, strict=True)]
     return Admitted(np.array(used), sequence.references)
+
+
+def _sequence(
+    source: SourceFrames,
+    frames: NDArray[np.intp],
+    paths: abc.Sequence[Path],
+    library: abc.Sequence[Path],
+) -> Sequence:
+    """Sort the files of frames, and those of the library, none of which is opened twice."""
+    headers = [source.headers[k] for k in frames]
+    first = next((k for k, h in enumerate(headers) if not is_reference(h)), 0)
+    name = source.filenames[frames[first]]
+    return Sequence.of_opened(
+        # Copies, into which the reasons are written.
+        [replace(source.files[path]) for path in dict.fromkeys(paths)],
+        [FrameFile.opened(path, frames=True) for path in library],
+        target=next(iter(star_of(headers[first], name).names), None),
+        filter=header_text(headers[first], "FILTER", name),
+    )

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,14 +26,19 @@ from pyklip_diffrender.errors import CorruptFileError, NoValidPixelsError
 from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import fits_text, merged_header
 from pyklip_diffrender.scene.detector_pixels import SHIFTS
+from pyklip_diffrender.scene.frame_files import FrameFile
 from pyklip_diffrender.scene.jwst_files import BAD_PIXEL_BITS
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.sequence import Sequence
 
 __all__ = [
     "ATTRIBUTE",
     "REFERENCES",
+    "JudgedFiles",
+    "OpenedFile",
     "SourceFrames",
     "attach_source",
+    "judged_before",
     "keeping_references",
     "keeping_source",
     "read_source",
@@ -87,11 +94,15 @@ class SourceFrames:
         x, y of the star from the occulter as the file says, arcsec, where it does.
     paths : list of Path
         The file of every frame.
+    files : dict of Path to FrameFile
+        The files, as they were read.
+    sequence : Sequence or None
+        The sequence that the files were sorted into, if they were before pyKLIP read them.
     """
 
     headers: list[fits.Header]
-    data: NDArray[np.float32]
-    error: NDArray[np.float32] | None
+    data: NDArray[np.floating[Any]]
+    error: NDArray[np.float64] | None
     usable: NDArray[np.bool_]
     centers: NDArray[np.float64]
     aligned: NDArray[np.floating[Any]]
@@ -100,6 +111,8 @@ class SourceFrames:
     first_pixels: list[tuple[int, int] | None]
     star_offsets: list[tuple[float, float] | None]
     paths: list[Path]
+    files: dict[Path, FrameFile]
+    sequence: Sequence | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> SourceFrames:
         """Itself: it never changes, so copies of a dataset can share it."""
@@ -234,6 +247,7 @@ def read_source(
             for path, n in zip(paths, counts, strict=True)
             for k in range(n)
         )
+    judged = _JUDGED.get()
     source = SourceFrames(
         headers=[file.header for file, n in zip(files, counts, strict=True) for _ in range(n)],
         data=np.concatenate([file.data for file in files]),
@@ -247,7 +261,9 @@ def read_source(
         filenames=names,
         first_pixels=[f.first_pixel for f, n in zip(files, counts, strict=True) for _ in range(n)],
         star_offsets=[f.star_offset for f, n in zip(files, counts, strict=True) for _ in range(n)],
-        paths=[Path(p).absolute() for p, n in zip(paths, counts, strict=True) for _ in range(n)],
+        paths=[f.file.path for f, n in zip(files, counts, strict=True) for _ in range(n)],
+        files={each.file.path: each.file for each in files},
+        sequence=None if judged is None else judged.sequence,
     )
     if not late:
         same_shape = source.data.shape == aligned.shape
@@ -265,9 +281,10 @@ def _is_close(one: NDArray[Any], other: NDArray[Any]) -> bool:
 class _File(NamedTuple):
     """The frames of one file; see `SourceFrames`."""
 
+    file: FrameFile
     header: fits.Header
-    data: NDArray[np.float32]
-    error: NDArray[np.float32] | None
+    data: NDArray[np.floating[Any]]
+    error: NDArray[np.float64] | None
     usable: NDArray[np.bool_]
     centers: NDArray[np.float64]
     first_pixel: tuple[int, int] | None
@@ -277,14 +294,64 @@ class _File(NamedTuple):
     center_read: NDArray[np.float64]
 
 
+class OpenedFile(NamedTuple):
+    """What a file holds, for `reduce` and as pyKLIP reads it."""
+
+    file: FrameFile
+    primary: fits.Header
+    science: fits.Header
+    pixels: NDArray[Any]
+    flags: NDArray[Any]
+    aligned: bool
+
+    @classmethod
+    def at(cls, path: str | os.PathLike[str]) -> OpenedFile:
+        """Open a file, once.
+
+        Raises
+        ------
+        CorruptFileError, KeyError
+            If it cannot be read, or has no SCI extension.
+        """
+        where = Path(path).absolute()
+        with open_fits(where) as hdus:
+            return cls(
+                FrameFile.in_hdus(hdus, where, frames=True),
+                hdus[0].header,
+                hdus["SCI"].header,
+                hdus["SCI"].data,
+                hdus["DQ"].data if "DQ" in hdus else np.zeros((), np.uint32),
+                any(name in hdus for name in SHIFTS),
+            )
+
+
+class JudgedFiles(NamedTuple):
+    """Files that were opened and judged before pyKLIP reads them, by path."""
+
+    files: Mapping[Path, OpenedFile]
+    sequence: Sequence
+
+
+_JUDGED: ContextVar[JudgedFiles | None] = ContextVar("judged", default=None)
+
+
+@contextmanager
+def judged_before(files: JudgedFiles) -> Iterator[None]:
+    """Take files that were opened already for datasets that are read inside."""
+    token = _JUDGED.set(files)
+    try:
+        yield
+    finally:
+        _JUDGED.reset(token)
+
+
 def _read(path: str, dataset: Any) -> _File:
     """Read one file as `reduce` does, for the star's position that pyKLIP has read."""
-    with open_fits(path) as hdus:
-        primary, science = hdus[0].header, hdus["SCI"].header
-        as_read = np.array(hdus["SCI"].data)
-        flags = hdus["DQ"].data if "DQ" in hdus else np.uint32(0)
-        aligned = any(name in hdus for name in SHIFTS)
-        header = merged_header(primary, science, path)
+    judged = _JUDGED.get()
+    known = None if judged is None else judged.files.get(Path(path).absolute())
+    file, primary, science, pixels, flags, aligned = known or OpenedFile.at(path)
+    header = merged_header(primary, science, path)
+    as_read = np.array(pixels)
     as_read = as_read[np.newaxis] if as_read.ndim == 2 else as_read
     flags = np.broadcast_to(flags, as_read.shape)
     as_read[(flags & NON_SCIENCE) != 0] = np.nan
@@ -295,15 +362,14 @@ def _read(path: str, dataset: Any) -> _File:
         offset = np.array([primary["XOFFSET"], primary["YOFFSET"]])
         center += offset / np.sqrt(science["PIXAR_A2"])
     centers = np.tile(center, (len(as_read), 1))
-    try:
-        frames = Observation.from_fits(path, every_integration=True)
-    except (CorruptFileError, NoValidPixelsError) as reason:
+    frames = file.frames
+    if isinstance(frames, CorruptFileError | NoValidPixelsError):
         # Such as a file without errors, or a frame of which all pixels are flagged.
-        logger.warning("only the pixels and flags are used: %s", reason)
+        logger.warning("only the pixels and flags are used: %s", frames)
         usable = (flags & BAD_PIXEL_BITS) == 0
-        return _File(
-            header, as_read.astype(np.float32), None, usable, centers, None, None, as_read, center
-        )
+        return _File(file, header, as_read, None, usable, centers, None, None, as_read, center)
+    if not isinstance(frames, Observation):
+        raise frames or CorruptFileError(f"{path}: no frames")
     if aligned:
         # Frames are back on the pixels of the detector, so that flat-field errors are, too.
         stated = [
@@ -312,9 +378,10 @@ def _read(path: str, dataset: Any) -> _File:
         ]
         centers += frames.center - (np.array(stated, dtype=float) - 1)
     return _File(
+        file,
         header,
-        np.where(np.isfinite(as_read), frames.data, np.nan).astype(np.float32),
-        np.where(frames.valid, frames.error, 0.0).astype(np.float32),
+        np.where(np.isfinite(as_read), frames.data, np.nan),
+        np.where(frames.valid, frames.error, 0.0),
         frames.valid,
         centers,
         frames.first_pixel,

@@ -4,34 +4,36 @@ from __future__ import annotations
 
 import logging
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from astropy.io import fits
 from numpy.typing import NDArray
 
+from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.scene.checked_frames import checked_frames, selected
 from pyklip_diffrender.scene.exposure import instrument_of
 from pyklip_diffrender.scene.integrations import Judgement, judge_pointings
 from pyklip_diffrender.scene.jwst_files import on_detector_pixels, read_calints, without_empty
 from pyklip_diffrender.scene.measured_noise import calibrated_errors
 
-__all__ = ["frames_of_file"]
+__all__ = ["frames_in", "frames_of_file"]
 
 _log = logging.getLogger(__name__)
 
 
 def frames_of_file(path: str | os.PathLike[str], *, every_integration: bool) -> dict[str, Any]:
-    """Read and judge a calints file; see `Observation.from_fits`.
+    """Read and judge a calints file: the attributes of `Observation.from_fits`."""
+    with open_fits(path) as hdus:
+        return frames_in(hdus, Path(path).name, every_integration=every_integration)
 
-    Returns
-    -------
-    dict
-        The attributes of the observation.
-    """
-    arguments, shifts = read_calints(path)
+
+def frames_in(hdus: fits.HDUList, name: str, *, every_integration: bool) -> dict[str, Any]:
+    """Read and judge the calints file of that name, which is open, see `frames_of_file`."""
+    arguments, shifts = read_calints(hdus, name)
     arguments, shifts, empty = without_empty(arguments, shifts)
     frames = checked_frames(**arguments)
-    name = frames["name"]
     if shifts is not None:
         frames |= on_detector_pixels(arguments, frames["center"], shifts)
     if instrument_of(frames["header"], name) == "NIRCAM":

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from astropy.io import fits
 
 from pyklip_diffrender.errors import DiffrenderError, NoValidPixelsError
 from pyklip_diffrender.io.files import open_fits
@@ -16,7 +17,14 @@ from pyklip_diffrender.scene.exposure import Exposure
 from pyklip_diffrender.scene.jwst_files import BEHIND_THE_MASK
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["FrameFile", "admissible", "exclude_unusable", "exposures_in", "require_some"]
+__all__ = [
+    "FrameFile",
+    "admissible",
+    "exclude_unusable",
+    "exposures_in",
+    "require_some",
+    "with_references",
+]
 
 _SUFFIXES = (".fits", ".fits.gz")
 
@@ -54,6 +62,9 @@ class FrameFile:
         Why the file is excluded; empty for those that are not.
     for_reference : bool
         Whether it was asked for as a file of a reference star, whatever its header says.
+    frames : Observation or DiffrenderError, optional
+        Its frames, one for every integration, or why they cannot be read; None for a file that is
+        read when its frames are needed.
     """
 
     path: Path
@@ -61,6 +72,34 @@ class FrameFile:
     star: str = ""
     reason: str = field(default="", repr=False)
     for_reference: bool = False
+    frames: Observation | DiffrenderError | None = field(default=None, repr=False)
+
+    @classmethod
+    def in_hdus(cls, hdus: fits.HDUList, path: Path, *, frames: bool) -> FrameFile:
+        """Read the header of an open file, and its frames if they are asked for."""
+        try:
+            header, shape = hdus[0].header, ()
+            if "SCI" in hdus:
+                header = merged_header(header, hdus["SCI"].header, path.name)
+                shape = np.shape(hdus["SCI"].data)
+            file = cls(path, Exposure.of(header, path.name, shape))
+        except DiffrenderError as error:
+            file = cls(path, Exposure(path.name), reason=_without_name(error, path.name))
+        if frames:
+            try:
+                file.frames = Observation.from_hdus(hdus, path.name)
+            except DiffrenderError as error:
+                file.frames = error
+        return file
+
+    @classmethod
+    def opened(cls, path: Path, *, frames: bool) -> FrameFile:
+        """Open a file once, and read its header, and its frames if they are asked for."""
+        try:
+            with open_fits(path) as hdus:
+                return cls.in_hdus(hdus, path, frames=frames)
+        except DiffrenderError as error:
+            return cls(path, Exposure(path.name), reason=_without_name(error, path.name))
 
     @property
     def name(self) -> str:
@@ -68,12 +107,18 @@ class FrameFile:
         return self.path.name
 
     def read(self) -> Observation | None:
-        """Read the frames; if they cannot be read, None, with the reason."""
+        """The frames of integrations that are used; if there are none, None, with the reason."""
         try:
-            return Observation.from_fits(self.path)
+            frames = self.frames
+            if isinstance(frames, DiffrenderError):
+                raise frames
+            if frames is None:
+                return Observation.from_fits(self.path)
         except DiffrenderError as error:
             self.reason = _without_name(error, self.name)
             return None
+        used = frames.valid.any(axis=(1, 2))
+        return frames if used.all() else frames.part(np.flatnonzero(used))
 
 
 def _without_name(error: Exception, name: str) -> str:
@@ -110,8 +155,14 @@ def exposures_in(
             paths.append(each)
     if not paths:
         raise NoValidPixelsError("files: got none, expected at least one")
-    listed = [_frame_file(path) for path in paths]
-    marked = [_frame_file(Path(path)) for path in references]
+    listed = [FrameFile.opened(path, frames=False) for path in paths]
+    return with_references(
+        listed, [FrameFile.opened(Path(path), frames=False) for path in references]
+    )
+
+
+def with_references(listed: list[FrameFile], marked: list[FrameFile]) -> list[FrameFile]:
+    """Add files of reference stars, whatever their headers say, see `exposures_in`."""
     if marked and all(file.exposure.reference for file in listed):
         for file in listed:
             file.exposure = replace(file.exposure, reference=False)
@@ -119,18 +170,6 @@ def exposures_in(
         file.exposure = replace(file.exposure, reference=True)
         file.for_reference = True
     return listed + marked
-
-
-def _frame_file(path: Path) -> FrameFile:
-    try:
-        with open_fits(path) as hdus:
-            header, shape = hdus[0].header, ()
-            if "SCI" in hdus:
-                header = merged_header(header, hdus["SCI"].header, path.name)
-                shape = np.shape(hdus["SCI"].data)
-            return FrameFile(path, Exposure.of(header, path.name, shape))
-    except DiffrenderError as error:
-        return FrameFile(path, Exposure(path.name), reason=_without_name(error, path.name))
 
 
 def admissible(files: Iterable[FrameFile]) -> list[FrameFile]:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import os
 import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,6 @@ from pyklip_diffrender.errors import (
     NoValidPixelsError,
     UnitError,
 )
-from pyklip_diffrender.io.files import open_fits
 from pyklip_diffrender.io.headers import header_number, header_text, merged_header
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.scene.archive_names import detector_of
@@ -65,8 +62,14 @@ _CROPPED = 32
 """Whole pixels beyond which frames were cropped, and not only aligned."""
 
 
-def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[Any] | None]:
-    """Read a calints file; see `Observation.from_fits`.
+def read_calints(hdus: fits.HDUList, name: str) -> tuple[dict[str, Any], NDArray[Any] | None]:
+    """Read an open calints file; see `Observation.from_fits`.
+
+    Parameters
+    ----------
+    hdus : HDUList
+    name : str
+        The file's.
 
     Returns
     -------
@@ -75,44 +78,41 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
     shifts : ndarray, (frames, 2), or None
         By how much spaceKLIP has shifted the frames, see `recorded_shifts`.
     """
-    path = Path(path)
-    with open_fits(path) as hdus:
-        if "SCI" not in hdus:
+    if "SCI" not in hdus:
+        raise CorruptFileError(
+            f"{name}: no SCI extension, only {[h.name for h in hdus]}; expected a JWST calints file"
+        )
+    science = hdus["SCI"]
+    header = merged_header(hdus[0].header, science.header, name)
+    for hdu in hdus:
+        if hdu.name in ("SCI", "ERR", "DQ") and not hdu.is_image:
+            raise CorruptFileError(f"{name}: {hdu.name} is a table, not an image")
+        if hdu.name in ("SCI", "ERR", "DQ") and hdu.data is None:
+            raise CorruptFileError(f"{name}: {hdu.name} has no data, so no frames")
+    data = native_float64(science.data)
+    if "ERR" not in hdus:
+        raise CorruptFileError(f"{name}: no ERR extension; the fit needs errors")
+    error = native_float64(hdus["ERR"].data)
+    if "DQ" in hdus:
+        quality = np.asarray(hdus["DQ"].data)
+        if quality.dtype.kind not in "iu":
             raise CorruptFileError(
-                f"{path.name}: no SCI extension, only {[h.name for h in hdus]}; expected a "
-                "JWST calints file"
+                f"{name}: DQ holds {quality.dtype.name}, expected integers (flags)"
             )
-        science = hdus["SCI"]
-        header = merged_header(hdus[0].header, science.header, path.name)
-        for hdu in hdus:
-            if hdu.name in ("SCI", "ERR", "DQ") and not hdu.is_image:
-                raise CorruptFileError(f"{path.name}: {hdu.name} is a table, not an image")
-            if hdu.name in ("SCI", "ERR", "DQ") and hdu.data is None:
-                raise CorruptFileError(f"{path.name}: {hdu.name} has no data, so no frames")
-        data = native_float64(science.data)
-        if "ERR" not in hdus:
-            raise CorruptFileError(f"{path.name}: no ERR extension; the fit needs errors")
-        error = native_float64(hdus["ERR"].data)
-        if "DQ" in hdus:
-            quality = np.asarray(hdus["DQ"].data)
-            if quality.dtype.kind not in "iu":
-                raise CorruptFileError(
-                    f"{path.name}: DQ holds {quality.dtype.name}, expected integers (flags)"
-                )
-        else:
-            warnings.warn(
-                f"{path.name}: no DQ extension; only NaN pixels are masked",
-                DiffrenderWarning,
-                stacklevel=3,
-            )
-            quality = np.zeros(data.shape, dtype=np.uint32)
-        mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
-        details = _details(header, 1 if data.ndim == 2 else len(data), path.name)
-        frames = data.reshape(-1, *data.shape[-2:]).shape
-        shifts = recorded_shifts(hdus, np.asarray(details["center"], float), frames, path.name)
-        # A star whose position is stated was moved, unless the file has shifts not yet applied.
-        records = any(name in hdus for name in SHIFTS)
-        moved = "STARCENX" in header and not records
+    else:
+        warnings.warn(
+            f"{name}: no DQ extension; only NaN pixels are masked",
+            DiffrenderWarning,
+            stacklevel=3,
+        )
+        quality = np.zeros(data.shape, dtype=np.uint32)
+    mask = hdus["MASKOFFS"].data if "MASKOFFS" in hdus else None
+    details = _details(header, 1 if data.ndim == 2 else len(data), name)
+    frames = data.reshape(-1, *data.shape[-2:]).shape
+    shifts = recorded_shifts(hdus, np.asarray(details["center"], float), frames, name)
+    # A star whose position is stated was moved, unless the file has shifts not yet applied.
+    records = any(key in hdus for key in SHIFTS)
+    moved = "STARCENX" in header and not records
     arguments = {
         "data": data,
         "error": error,
@@ -124,7 +124,7 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
         offset = native_float64(mask).reshape(-1, 2).mean(axis=0) * arguments["pixelscale"]
         arguments["star_offset"] = (float(offset[0]), float(offset[1]))
     elif not moved and not records:
-        offset = dither(header, path.name)
+        offset = dither(header, name)
         if offset is not None:
             arguments["star_offset"] = offset
             if arguments["center"] is not None:
@@ -134,7 +134,7 @@ def read_calints(path: str | os.PathLike[str]) -> tuple[dict[str, Any], NDArray[
         star = arguments["center"]
         if star is None:
             star = np.array([nx - 1, ny - 1]) / 2
-        arguments["first_pixel"] = first_pixel(header, star, (ny, nx), path.name)
+        arguments["first_pixel"] = first_pixel(header, star, (ny, nx), name)
     return arguments, shifts
 
 

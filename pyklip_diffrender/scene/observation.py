@@ -19,7 +19,7 @@ from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.catalogue_star import star_of
 from pyklip_diffrender.scene.checked_frames import checked_frames, selected
 from pyklip_diffrender.scene.exposure import instrument_of
-from pyklip_diffrender.scene.file_frames import frames_of_file
+from pyklip_diffrender.scene.file_frames import frames_in, frames_of_file
 from pyklip_diffrender.scene.integrations import pointings
 from pyklip_diffrender.scene.measured_noise import weighted_mean
 from pyklip_diffrender.scene.window import Window
@@ -182,6 +182,14 @@ class Observation:
             As `from_arrays`.
         """
         return cls(**frames_of_file(path, every_integration=every_integration))
+
+    @classmethod
+    def from_hdus(cls, hdus: fits.HDUList, name: str) -> Observation:
+        """Read an open calints file of that name, with a frame for every integration.
+
+        See `from_fits`.
+        """
+        return cls(**frames_in(hdus, name, every_integration=True))
 
     def part(self, which: NDArray[np.intp]) -> Observation:
         """Select frames by their indices."""

@@ -31,6 +31,7 @@ from pyklip_diffrender.scene.frame_files import (
     exclude_unusable,
     exposures_in,
     require_some,
+    with_references,
 )
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.pixel_checks import why_other_brightness, why_turned
@@ -144,6 +145,26 @@ class Sequence:
             If no frame of the target is left.
         """
         sequences = cls.by_epoch(files, target=target, filter=filter, references=references)
+        return cls._only(sequences, epoch)
+
+    @classmethod
+    def of_opened(
+        cls,
+        files: list[FrameFile],
+        references: list[FrameFile],
+        *,
+        target: str | None = None,
+        filter: str | None = None,
+    ) -> Sequence:
+        """Sort files that were opened, see `from_files`, and fill in their reasons."""
+        listed = with_references(files, references)
+        exclude_unusable(listed)
+        require_some(listed)
+        return cls._only(cls._by_epoch(listed, target, filter), None)
+
+    @staticmethod
+    def _only(sequences: tuple[Sequence, ...], epoch: str | Time | None) -> Sequence:
+        """The sequence of an epoch, or the only one."""
         if epoch is not None:
             date = Time(epoch)
             near = [

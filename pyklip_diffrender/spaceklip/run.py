@@ -6,15 +6,17 @@ import logging
 import os
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from astropy import units as u
-from astropy.table import QTable, Table
+from astropy.table import Table
 
 from pyklip_diffrender.detection import Detection
 from pyklip_diffrender.errors import (
+    CorruptFileError,
     DiffrenderError,
     DiffrenderWarning,
     IncompatibleSetupError,
@@ -22,7 +24,9 @@ from pyklip_diffrender.errors import (
 from pyklip_diffrender.instrument.masks import MASKS, mask_of_header
 from pyklip_diffrender.io.units import require_bound
 from pyklip_diffrender.pyklip_backend.reduce_files import reduce_jwst_files
+from pyklip_diffrender.pyklip_backend.source import JudgedFiles, OpenedFile, judged_before
 from pyklip_diffrender.refinement import to_jansky
+from pyklip_diffrender.scene.frame_files import FrameFile
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.spaceklip.database_files import (
     complete_header,
@@ -112,7 +116,7 @@ def run_obs(
     star_flux : mapping of str to float, str or Quantity, optional
         Flux density of the star by filter, such as ``{"F444W": "0.45 Jy"}``, to which contrasts
         then refer; see `pyklip_diffrender.reduce`. Without it, or in other filters, the diffracted
-        light determines it. The subtracted images are the same.
+        light determines it. The subtracted images hardly change.
     star_flux_error : float
         Relative error of these, with that of the photometric calibration.
     verbose : bool
@@ -152,7 +156,7 @@ def run_obs(
     products: dict[str, Path] = {}
     detections: dict[str, Detection] = {}
     failures: list[Exception] = []
-    admitted: dict[str, tuple[Table, QTable]] = {}
+    admitted: dict[str, tuple[Table, JudgedFiles]] = {}
     for key, table in database.obs.items():
         if restrict_to is not None and restrict_to not in key:
             continue
@@ -165,13 +169,14 @@ def run_obs(
         except DiffrenderError as error:
             error.add_note(f"concatenation {key}")
             failures.append(error)
-    for key, (table, frames) in admitted.items():
+    for key in list(admitted):
+        table, judged = admitted.pop(key)
         logger.info("concatenation %s", key)
         try:
             products[key], detections[key] = _reduced(
                 key,
                 table,
-                frames,
+                judged,
                 folder,
                 save_rolls,
                 {
@@ -230,8 +235,8 @@ def why_unsupported(table: Table) -> str | None:
     return None
 
 
-def _admitted(key: str, table: Table) -> tuple[Table, QTable]:
-    """Rows of a concatenation whose files are used, and what every file is used for and why.
+def _admitted(key: str, table: Table) -> tuple[Table, JudgedFiles]:
+    """Rows of a concatenation whose files are used, and the files, which are opened once.
 
     Raises
     ------
@@ -243,37 +248,41 @@ def _admitted(key: str, table: Table) -> tuple[Table, QTable]:
     DiffrenderWarning
         For every file that is left out.
     """
-    is_target = np.array(table["TYPE"], dtype=str) == "SCI"
-    files = [Path(str(path)) for path in table["FITSFILE"]]
-    sequence = Sequence.from_files(
-        [path for path, chosen in zip(files, is_target, strict=True) if chosen],
-        references=[path for path, chosen in zip(files, is_target, strict=True) if not chosen],
-    )
+    paths = [Path(str(path)).absolute() for path in table["FITSFILE"]]
+    opened: dict[Path, OpenedFile] = {}
+    listed: dict[bool, list[FrameFile]] = {True: [], False: []}
+    for path, kind in zip(paths, table["TYPE"], strict=True):
+        try:
+            opened[path] = OpenedFile.at(path)
+            file = replace(opened[path].file)
+        except (CorruptFileError, KeyError):
+            file = FrameFile.opened(path, frames=False)  # It says what is wrong.
+        listed[str(kind) == "SCI"].append(file)
+    sequence = Sequence.of_opened(listed[True], listed[False])
     for name, reason in sequence.excluded:
         warnings.warn(f"{key}: {name} is left out: {reason}", DiffrenderWarning, stacklevel=3)
     used = {row.path for row in sequence.rows if row.use != "excluded"}
-    return table[np.array([path in used for path in files])], sequence.table
+    chosen = np.array([path in used for path in paths])
+    return table[chosen], JudgedFiles(opened, sequence)
 
 
 def _reduced(
     key: str,
     table: Table,
-    frames: QTable,
+    judged: JudgedFiles,
     folder: Path,
     save_rolls: bool,
     settings: dict[str, Any],
 ) -> tuple[Path, Detection]:
-    """Reduce one concatenation and write its files; the path of the product.
-
-    `frames` is the table of admission.
-    """
+    """Reduce one concatenation and write its files; the path of the product."""
     kinds = np.array(table["TYPE"], dtype=str)
     files = np.array(table["FITSFILE"], dtype=object)
     mode = "ADI+RDI" if (kinds == "REF").any() else "ADI"
     prefix = f"{mode}_NANNU1_NSUBS1_{key}"
-    dataset = reduce_jwst_files(
-        files[kinds == "SCI"], files[kinds == "REF"], folder=folder, prefix=prefix, **settings
-    )
+    with judged_before(judged):
+        dataset = reduce_jwst_files(
+            files[kinds == "SCI"], files[kinds == "REF"], folder=folder, prefix=prefix, **settings
+        )
     # A concatenation has one filter, so one wavelength.
     (record,) = dataset.diffrender_results
     detection = record.subtraction.reduction.detection
@@ -288,7 +297,9 @@ def _reduced(
     source_table(detection, product).write(
         folder / f"{prefix}-results.ecsv", format="ascii.ecsv", overwrite=True
     )
-    frames.write(folder / f"{prefix}-frames.ecsv", format="ascii.ecsv", overwrite=True)
+    judged.sequence.table.write(
+        folder / f"{prefix}-frames.ecsv", format="ascii.ecsv", overwrite=True
+    )
     write_database(folder / f"{key}.dat", table)
     write_mask(folder / f"{key}_psfmask.fits", table)
     return product, detection
