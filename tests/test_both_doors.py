@@ -6,7 +6,7 @@ Doors are `reduce`, `klip_dataset` with ``algo="diffrender"``, `spaceklip.run_ob
 from __future__ import annotations
 
 import contextlib
-from collections import abc
+from collections import Counter, abc
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -22,17 +22,17 @@ from test_spaceklip import KEY, StandIn, concatenation
 import pyklip_diffrender as dr
 from benchmarks.calints_files import SIDE, calints
 from pyklip_diffrender import spaceklip
-from pyklip_diffrender.detection import Detection
+from pyklip_diffrender.detection import Detection, search
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.geometry import half_circle
 from pyklip_diffrender.pattern import PatternLibrary
 from pyklip_diffrender.pattern.library import package_library
 from pyklip_diffrender.pyklip_backend.reduce_files import reduce_jwst_files
-from pyklip_diffrender.refinement import Refinement, nircam_settings
+from pyklip_diffrender.refinement import GaussNewton, Refinement, fitting
+from pyklip_diffrender.scene import sequence
 from pyklip_diffrender.scene.detector_pixels import shift_frames
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
-from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.scene.systematics import Systematics
 from pyklip_diffrender.scene.window import Window
 from pyklip_diffrender.wavefront import random_opd
@@ -144,16 +144,20 @@ def map_file(folder: Path) -> Path:
     return path
 
 
+def settings_of(files: list[Path]) -> GaussNewton:
+    """Settings that do not take the files to be opened by the package."""
+    passband = fits.getheader(files[0])["FILTER"]
+    return GaussNewton.nircam(passband, image_mask="MASK335R", module="A", **SETTINGS)
+
+
 def through_reduce(files: list[Path], folder: Path) -> Answer:
-    sequence = Sequence.from_files(files)
-    settings = nircam_settings(sequence.science[0], **SETTINGS)
-    made = dr.reduce(sequence, map_file(folder), size=SIZE, settings=settings)
+    made = dr.reduce(files, map_file(folder), size=SIZE, settings=settings_of(files))
     name = "none" if made.systematics is None else made.systematics.name
     return Answer(made.fit, made.detection, name)
 
 
 def through_klip_dataset(files: list[Path], folder: Path) -> Answer:
-    settings = nircam_settings(Sequence.from_files(files).science[0], **SETTINGS)
+    settings = settings_of(files)
     dataset = reduce_jwst_files(
         files, folder=folder, prefix="x", opd=map_file(folder), fit_pixels=SIZE, fit=settings
     )
@@ -164,7 +168,7 @@ def through_klip_dataset(files: list[Path], folder: Path) -> Answer:
 
 
 def through_spaceklip(files: list[Path], folder: Path) -> Answer:
-    settings = nircam_settings(Sequence.from_files(files).science[0], **SETTINGS)
+    settings = settings_of(files)
     database = StandIn(folder, {KEY: concatenation([str(path) for path in files])})
     detection = spaceklip.run_obs(database, opd=map_file(folder), fit_pixels=SIZE, fit=settings)[
         KEY
@@ -274,6 +278,42 @@ def test_every_door_begins_the_same_fit(
     assert_same_call(expected, call)
 
 
+@pytest.mark.parametrize(
+    "door",
+    [through_reduce, through_klip_dataset, through_spaceklip],
+    ids=lambda each: each.__name__,
+)
+def test_files_are_opened_twice_at_most_and_judged_once(
+    door: Any, light: Any, tmp_path: Path, calls: list[Call], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = written(tmp_path, light, aligned=True)
+    opened: Counter[str] = Counter()
+    read_bytes, open_fits, judge = Path.read_bytes, fits.open, sequence.judge_frames
+
+    def count_read(path: Path) -> bytes:
+        opened[path.name] += 1
+        return read_bytes(path)
+
+    def count_open(name: Any, *args: Any, **options: Any) -> Any:
+        # Others are files that this package has read already.
+        if isinstance(name, str | Path):
+            opened[Path(name).name] += 1
+        return open_fits(name, *args, **options)
+
+    def count_judged(*args: Any) -> None:
+        opened["judged"] += 1
+        judge(*args)
+
+    monkeypatch.setattr(Path, "read_bytes", count_read)
+    monkeypatch.setattr(fits, "open", count_open)
+    monkeypatch.setattr(sequence, "judge_frames", count_judged)
+    with contextlib.suppress(Stopped, ExceptionGroup):
+        door(files, tmp_path)
+    assert len(calls) == 1
+    assert opened["judged"] == 1
+    assert {path.name: opened[path.name] for path in files} == {path.name: 2 for path in files}
+
+
 @pytest.mark.parametrize("visits", ["001 002", "003 004", "005 006"])
 @pytest.mark.parametrize("exposure", ["03106", "03107"], ids=["F444W", "F356W"])
 def test_real_pairs_are_the_same_in_both_doors(
@@ -319,12 +359,23 @@ def answers() -> dict[bool, Answer]:
     return {}
 
 
+def counting(function: Callable[..., Any], calls: Counter[str], name: str) -> Callable[..., Any]:
+    """A function that also counts its calls."""
+
+    def counted(*args: Any, **options: Any) -> Any:
+        calls[name] += 1
+        return function(*args, **options)
+
+    return counted
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("aligned", [False, True], ids=["unaligned", "aligned"])
 @DOORS
 def test_every_door_gives_one_answer(
-    door: Any, aligned: bool, light: Any, tmp_path: Path, answers: dict[bool, Answer]
-) -> None:
+    door: Any, aligned: bool, light: Any, tmp_path: Path, answers: dict[bool, Answer],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     files = written(tmp_path, light, aligned=aligned)
     if aligned not in answers:
         answers[aligned] = through_reduce(files, tmp_path)
@@ -333,4 +384,8 @@ def test_every_door_gives_one_answer(
     assert candidates["separation"][0].value == pytest.approx(PLANET[1], abs=0.1)
     out = tmp_path / "out"
     out.mkdir()
+    made: Counter[str] = Counter()
+    for module, name in ((search, "Detection"), (fitting, "fit_in_stages")):
+        monkeypatch.setattr(module, name, counting(getattr(module, name), made, name))
     assert_same(answers[aligned], door(files, out))
+    assert made == {"Detection": 1, "fit_in_stages": 1}

@@ -377,10 +377,12 @@ def _read(path: str, dataset: Any) -> _File:
             for k, axis in ((1, "X"), (2, "Y"))
         ]
         centers += frames.center - (np.array(stated, dtype=float) - 1)
+    # The gaps of frames that are put back are where they were before the shift.
+    seen = frames.valid if aligned else np.isfinite(as_read)
     return _File(
         file,
         header,
-        np.where(np.isfinite(as_read), frames.data, np.nan),
+        np.where(seen, frames.data, np.nan),
         np.where(frames.valid, frames.error, 0.0),
         frames.valid,
         centers,

@@ -15,7 +15,6 @@ from pyklip_diffrender.io.progress import heard_by
 from pyklip_diffrender.pyklip_backend.backend_settings import DiffrenderSettings
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 from pyklip_diffrender.pyklip_backend.pointings import Pointing, pointings_of
-from pyklip_diffrender.reduction.verdict import MAX_CHI2, warn_of_status
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.real_frames import model_for
 from pyklip_diffrender.scene.sequence import Sequence as FrameSequence
@@ -164,6 +163,7 @@ def subtract_by_refinement(
     model = model_of(observation, settings)
     # Takes a second to import, so only after the input has been checked.
     from pyklip_diffrender.reduction import prepare
+    from pyklip_diffrender.reduction.verdict import warn_of_status
 
     groups = list(pointings_of(observation) if pointings is None else pointings)
     science = tuple(group.observation for group in groups)
@@ -235,6 +235,7 @@ def _options(
 ) -> ReduceOptions:
     """Options of the reduction; the settings that are None are those of `reduce`."""
     from pyklip_diffrender.reduction import ReduceOptions
+    from pyklip_diffrender.reduction.verdict import MAX_CHI2
 
     given = {
         "settings": settings.fit,
