@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 from collections import Counter, abc
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +24,7 @@ from pyklip_diffrender import spaceklip
 from pyklip_diffrender.detection import Detection, search
 from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.geometry import half_circle
+from pyklip_diffrender.optics import OpticalSystem
 from pyklip_diffrender.pattern import PatternLibrary
 from pyklip_diffrender.pattern.library import package_library
 from pyklip_diffrender.pyklip_backend.reduce_files import reduce_jwst_files
@@ -51,7 +51,11 @@ ROLLS = ((70.0, (88.7, 91.3)), (80.0, (87.9, 91.6)))
 that each alone is cut elsewhere."""
 SETTINGS = {"cycles": 3.0, "max_iterations": 15, "max_companions": 0, "response_npix": 128}
 
-small_model = partial(model_for, monochromatic=4.44e-6, npix=128)
+
+def small_model(observation: Observation, size: int | None = None, **options: Any) -> OpticalSystem:
+    """Make a model of one wavelength, that in the name of the filter."""
+    wavelength = int(str(observation.filter)[1:4]) * 1e-8
+    return model_for(observation, size, monochromatic=wavelength, npix=128, **options)
 
 
 class Answer(NamedTuple):
