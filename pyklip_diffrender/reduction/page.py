@@ -235,6 +235,7 @@ def _wide(summary: Mapping[str, Any]) -> str:
             scientific(each["contrast"], each["contrast_error"]),
             f"{each['snr']:.1f}",
             "" if each["fit_chi2"] is None else f"{each['fit_chi2']:.1f}",
+            _shape(each),
         ]
         for k, each in enumerate(candidates, 1)
     ]
@@ -242,13 +243,22 @@ def _wide(summary: Mapping[str, Any]) -> str:
         return html.note(f"No candidate has an S/N above {summary['threshold_snr']:g}.")
     angle = "east of north" if summary["oriented"] else "from +y of the first frame"
     header = ["", "Separation (arcsec)", f"Position angle (deg, {angle})", "Contrast", "S/N",
-              "Chi-squared of the image"]  # fmt: skip
+              "Chi-squared of a point source", "Shape (arcsec)"]  # fmt: skip
     note = (
-        "The last column is the reduced chi-squared of a fit of a point source, for candidates "
-        "outside the pixels in which the star was fitted; much above 1, the source is extended, "
-        "blended, or no source."
+        "The last columns are the reduced chi-squared of a fit of a point source and the shape, "
+        "for candidates outside the pixels in which the star was fitted. An extended source, or "
+        "several that are blended, are one row with all of their light, and with the full widths "
+        "at half maximum and the position angle of a Gaussian."
     )
     return "<h3>Candidates</h3>" + html.table(header, rows) + html.note(note)
+
+
+def _shape(candidate: Mapping[str, Any]) -> str:
+    """Shape of a source in words."""
+    if candidate["shape"] != "extended":
+        return str(candidate["shape"])
+    widths = " × ".join(f"{candidate[f'fwhm_{axis}_arcsec']:.2f}" for axis in ("major", "minor"))
+    return f"extended, {widths} at {candidate['axis_angle_deg']:.0f} deg"
 
 
 PHOTOMETRY = (

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import QTable
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.detection import Detection, Disk, WideField, draw_curve, draw_search
+from pyklip_diffrender.detection import Detection, Disk, WideField, draw_curve
 from pyklip_diffrender.reduction.html import Picture
 from pyklip_diffrender.reduction.overview import Overview
 from pyklip_diffrender.reduction.reduction_result import Reduction
@@ -123,16 +123,19 @@ def _scaled(detection: Detection) -> str:
 def wide_pictures(wide: WideField) -> list[Picture]:
     """The S/N map of the whole frames, and the contrast curve to their edge."""
     figures, axes = _panels(2)
-    draw_search(axes, wide)
+    wide.plot(axes)
     count = len(wide.candidates)
     some = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {wide.threshold:g}"
+    oriented = wide.observation.position_angles is not None
+    up = "north up" if oriented else "oriented like the first frame"
     return _pictures(
         figures,
         (
             f"Map of the signal-to-noise ratio of a point source in the whole frames, {some}.",
-            "S/N of a point source in the whole frames. About the star it is that of the search "
-            "above; elsewhere the star, extrapolated from its fit, and the background were "
-            "subtracted. Errors follow the scatter of the S/N at every separation.",
+            f"S/N of a point source in the whole frames, {up}. Circles have the numbers of the "
+            "table. About the star it is that of the search above; elsewhere the star, "
+            "extrapolated from its fit, and the background were subtracted. Errors follow the "
+            "scatter of the S/N at every separation.",
         ),
         (
             "Curve of the contrast limit against separation in arcsec, to the edge of the frames.",
