@@ -265,8 +265,14 @@ search = _all(
            help="Flat-field pattern: auto (the package's library, else the reference "
            "stars), references (both), off, a folder or file of patterns to search besides the "
            "package's (command learn), or a systematics.fits of an earlier reduction."),
+    option("--quick", is_flag=True, section="Fit and search",
+           help="A first look with a coarser model, in two thirds of the time or less: limits "
+                "within 15 %."),
     option("--memory", metavar="SIZE", section="Fit and search",
            help='Memory that the process may take, such as "2 GB"; default: as much as it needs.'),
+    option("--resume", is_flag=True, section="Output",
+           help="Go on with a reduction that was interrupted: its fit and search are kept in the "
+                "folder of the products."),
     option("--dry-run", is_flag=True, section="Output",
            help="Make all checks, show frames, wavefront map, steps, time and memory, and stop."),
     option("--derivatives", is_flag=True, section="Output",

@@ -4,6 +4,8 @@ from pyklip_diffrender.reduction.options import ReduceOptions
 from pyklip_diffrender.reduction.pipeline import Preparation, prepare, reduce
 from pyklip_diffrender.reduction.products import (
     PRODUCTS,
+    UNFINISHED,
+    ProductFolder,
     existing_products,
     write_products,
     write_report,
@@ -19,7 +21,9 @@ from pyklip_diffrender.reduction.summary import summarise
 __all__ = [
     "COMPARISON",
     "PRODUCTS",
+    "UNFINISHED",
     "Preparation",
+    "ProductFolder",
     "ReduceOptions",
     "Reduction",
     "compare_reductions",

@@ -13,7 +13,12 @@ from pyklip_diffrender.refinement.flux_scale import (
     with_star_flux,
 )
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.settings import GaussNewton, nircam_settings, settings_for
+from pyklip_diffrender.refinement.settings import (
+    GaussNewton,
+    nircam_settings,
+    quick_settings,
+    settings_for,
+)
 from pyklip_diffrender.refinement.status import Status
 
 __all__ = [
@@ -23,6 +28,7 @@ __all__ = [
     "Status",
     "jansky_per_unit",
     "nircam_settings",
+    "quick_settings",
     "refine",
     "refine_again",
     "require_calibrated",
