@@ -438,7 +438,10 @@ def _is_cut_off(first: WholeFrame, source: _Measurement) -> bool:
     """Whether a source is blended with a brighter one outside the searched pixels, or its lobe."""
     column, row = np.rint(first.pixels_of(source.values[1:])).astype(int)
     numerator, information = first.products(first.residual)
-    snr = np.where(information > 0, numerator / np.sqrt(np.maximum(information, 1e-300)), 0.0)
+    # Where all pixels about one are masked, the numerator is no number to divide.
+    snr = np.divide(
+        numerator, np.sqrt(information), out=np.zeros_like(numerator), where=information > 0
+    )
     about = np.s_[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
     height = float(snr[about].max())
     outside = ~first.searches(first.grid)
