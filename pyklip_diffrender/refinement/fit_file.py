@@ -34,6 +34,7 @@ from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = [
     "decoded",
+    "encoded",
     "image",
     "linear_hdus",
     "linear_of",

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from astropy import units as u
 from astropy.table import MaskedColumn, Table
 
 from pyklip_diffrender.surveys.folders import Record
@@ -52,6 +53,16 @@ COLUMNS: dict[str, type] = {
 
 Contrasts come first, because a table that is too wide to print loses its middle."""
 
+_UNITS = {
+    "separation_arcsec": u.arcsec,
+    "position_angle_deg": u.deg,
+    "injected_separation_arcsec": u.arcsec,
+    "injected_angle_deg": u.deg,
+    "seconds": u.s,
+    "peak_memory_bytes": u.byte,
+}
+"""Contrasts, S/N and counts have none."""
+
 _FORMATS = {"contrast": ".2e", "snr": ".1f"}
 
 
@@ -92,6 +103,7 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
         values = [each[name] for each in rows]
         known = [kind() if value is None else kind(value) for value in values]
         table[name] = MaskedColumn(known, mask=[value is None for value in values], dtype=kind)
+        table[name].unit = _UNITS.get(name)
         table[name].info.format = _FORMATS.get(name)
     return table
 
