@@ -33,7 +33,7 @@ from pyklip_diffrender.cli.shared_options import read_config
 from pyklip_diffrender.errors import DiffrenderWarning, MissingOPDError, RefinementError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
-from pyklip_diffrender.reduction import Preparation, ReduceOptions
+from pyklip_diffrender.reduction import UNFINISHED, Preparation, ReduceOptions
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.wavefront.map_choice import RULES
 from pyklip_diffrender.wavefront.opd import OPDMap, random_opd, resample
@@ -417,6 +417,34 @@ def test_a_full_disk_is_noticed_before_the_work(
     assert reduced == []
 
 
+def test_an_interrupted_reduction_is_resumed_and_a_finished_one_is_kept(
+    tmp_path: Path,
+    frames: Path,
+    maps: Path,
+    reduced: Reduced,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    products = tmp_path / "products"
+    arguments = ["reduce", str(frames), "--opd", str(maps), "-o", str(products), "--size", "8"]
+    products.mkdir()
+    (products / UNFINISHED).write_text("{}")
+    reduced.error = KeyboardInterrupt()
+    assert main([*arguments, "--resume"]) == 130
+    assert "--resume" in capsys.readouterr().err
+    reduced.error = None
+    # Without the option, nothing is replaced.
+    assert main(arguments) == 1
+    assert UNFINISHED in capsys.readouterr().err
+    assert main([*arguments, "--resume", "--quick"]) == 0
+    assert reduced[0].given.options.accuracy == "quick"
+    (products / UNFINISHED).unlink()
+    assert main([*arguments, "--resume"]) == 0
+    assert "this reduction has finished" in capsys.readouterr().out
+    assert len(reduced) == 1
+    assert main([*arguments, "--resume", "--overwrite"]) == 2
+    assert "--resume keeps products" in capsys.readouterr().err
+
+
 def test_frames_without_a_map_start_from_a_flat_wavefront(
     tmp_path: Path, frames: Path, reduced: Reduced, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -445,16 +473,19 @@ def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
     assert one < two < 2 * one
     more = steps(twice, systematics="off", disk=True, references="off")
     assert more.items() > both.items()
+    assert more["search without extended light"] == more["search"]
     assert more["extended light, and wavefront without it"] > one
     eight = steps(twice, systematics="off", injections=8, references="off")
-    assert eight["8 injected planets"] == 2 * sum(list(both.values())[:2])
+    assert eight["8 injected planets"] == 2 * (both["wavefront"] + both["search"])
     both_kinds = steps(twice, systematics="off", injections=8, disk=True)
     longer = both_kinds["8 injected planets"] - eight["8 injected planets"]
     assert longer == pytest.approx(2 * more["extended light, and wavefront without it"])
     tied = steps(twice, systematics="off", star_flux=0.4)
     assert tied["wavefront"] == pytest.approx(1.6 * two)
     whole = steps(twice, systematics="off", wide=True)
-    assert whole["search"] > both["search"]
+    assert whole["whole frames"] > 0
+    quick = steps(twice, systematics="off", accuracy="quick")
+    assert quick["wavefront"] < both["wavefront"]
 
 
 # -- a reduction, with a stub in the place of the fit --------------------------------------------
@@ -497,7 +528,7 @@ def reduced(monkeypatch: pytest.MonkeyPatch) -> Reduced:
     """Stub for the fits and searches."""
     made = Reduced()
 
-    def stub(given: Preparation, *, progress: bool) -> StubReduction:
+    def stub(given: Preparation, *, progress: bool, products: Any) -> StubReduction:
         print("a library says hello")
         if isinstance(made.error, RefinementError):
             for _ in range(2):

@@ -938,7 +938,10 @@ def test_the_page_fits_the_screen(folder: Path, tmp_path: Path, width: int, dark
 def test_the_search_of_whole_frames_has_a_section_of_its_own(tmp_path: Path) -> None:
     inner = reduction().detection
     table = inner.candidates.copy()
-    table["fit_chi2"] = 1.3
+    table["fit_chi2"], table["shape"] = 1.3, ""
+    for name in ("fwhm_major", "fwhm_minor"):
+        table[name] = np.nan * u.arcsec
+    table["axis_angle"] = np.nan * u.deg
     wide = dr.WideField(
         inner, 5.0, inner.contrast, inner.error, inner.snr, inner.grid, inner.error_factor, table,
         inner.contrast_curve,
@@ -947,7 +950,7 @@ def test_the_search_of_whole_frames_has_a_section_of_its_own(tmp_path: Path) -> 
     assert tmp_path / "wide_field.fits" in written
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "<h2>Whole frames</h2>" in text
-    assert "Chi-squared of the image" in text
+    assert "Chi-squared of a point source" in text
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     (row,) = summary["wide_field"]["candidates"]
     assert row["fit_chi2"] == 1.3

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,13 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection import sources_of_references
 from pyklip_diffrender.linear.frames import FrameRows
 from pyklip_diffrender.pattern import PatternChoice, choose_systematics, pattern_for_visit
-from pyklip_diffrender.reduction import ReduceOptions, Visit
+from pyklip_diffrender.reduction import (
+    Preparation,
+    ProductFolder,
+    ReduceOptions,
+    Visit,
+    pipeline,
+)
 from pyklip_diffrender.reduction.visit import rough_settings, with_references
 from pyklip_diffrender.refinement import GaussNewton, Refinement, align_frame, join_frames, refine
 from pyklip_diffrender.refinement.mode_priors import ModePriors, exposure_sequences
@@ -307,3 +314,37 @@ def test_use_of_references_is_one_of_three() -> None:
     assert ReduceOptions().references == "joint"
     with pytest.raises(dr.errors.IncompatibleSetupError, match="joint, pattern, off"):
         ReduceOptions(references="both")
+
+
+def test_a_resumed_reduction_knows_what_the_references_contributed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: Any, **__: Any) -> Any:
+        raise KeyboardInterrupt
+
+    # The second star is so faint that its frame is left out.
+    references = (reference(0), reference(1, brightness=0.01))
+    sequence = dr.Sequence("HD 1", science(), references)
+    options = ReduceOptions(size=SIZE, settings=SETTINGS, injections=2)
+    prepared = Preparation(sequence, sequence, model(), OPD, options, SETTINGS)
+    monkeypatch.setattr(pipeline, "recover_planets", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        prepared.run(products=ProductFolder(tmp_path))
+    before = dr.Detection.read(tmp_path)
+    for name in ("refine", "with_references", "detect"):
+        monkeypatch.setattr(pipeline, name, interrupted)
+    monkeypatch.setattr(pipeline, "recover_planets", lambda *_: None)
+    products = ProductFolder(tmp_path, resume=True)
+    result = prepared.run(products=products)
+    assert [each.use for each in result.visit.contributions] == ["joint", "left out"]
+    first, second = result.visit.contributions
+    assert first.flux == pytest.approx(2.0, rel=0.05)
+    assert "of the target's flux" in second.reason
+    assert np.isnan(second.chi2)
+    assert result.visit.gain > 1
+    assert [each.observation.reference for each in result.fit.frames] == [False, False, True]
+    np.testing.assert_array_equal(result.detection.candidates["snr"], before.candidates["snr"])
+    assert result.systematics is not None
+    assert result.pattern == result.systematics.name == "the rolls themselves"
+    products.finish(result)
+    assert "1 of them in the likelihood" in (tmp_path / "report.html").read_text(encoding="utf-8")

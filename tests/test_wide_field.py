@@ -73,6 +73,109 @@ def test_sources_that_a_joint_fit_leaves_faint_are_no_candidates() -> None:
     assert wide_search._significant((), [], factor, 5.0) == []
 
 
+POINT = dr.Planet.from_offset(3e-5, -1.7, 1.4)
+WIDTHS, AXIS = (0.3, 0.12), 130.0
+"""Standard deviations of an extended source, arcsec, and angle of its long axis from +y, deg."""
+
+
+def gaussian(contrast: float, x: float, y: float) -> tuple[dr.Planet, ...]:
+    """A Gaussian of point sources 0.14 arcsec apart, out to 2.4 standard deviations."""
+    steps = np.mgrid[-6:7, -6:7].reshape(2, -1).T * 0.14
+    angle = np.deg2rad(AXIS)
+    along = steps @ [-np.sin(angle), np.cos(angle)]
+    across = steps @ [np.cos(angle), np.sin(angle)]
+    weights = np.exp(-((along / WIDTHS[0]) ** 2 + (across / WIDTHS[1]) ** 2) / 2)
+    shown = weights > 0.05
+    weights = contrast * weights[shown] / weights[shown].sum()
+    return tuple(
+        dr.Planet.from_offset(w, x + step[0], y + step[1])
+        for w, step in zip(weights, steps[shown], strict=True)
+    )
+
+
+@pytest.fixture(scope="module")
+def crowded() -> tuple[Detection, dr.Observation]:
+    """A point source, an extended one, and another one at the lower edge; the star is known."""
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=100)
+    opd = dr.random_opd(1, npix=128)
+    planets = (POINT, *gaussian(4e-4, 1.3, 0.2), *gaussian(1e-3, -0.4, -2.4))
+    frame = dr.simulate(model, dr.Scene(STAR, planets=planets), opd, seed=5)
+    model = dr.nircam_coronagraph("F444W", monochromatic=4.5e-6, npix=128, fov_pixels=24)
+    settings = dr.GaussNewton(wavefront=False, companions_if_stalled=False)
+    fit = dr.refine(model, frame.cutout(24), opd, settings=settings)
+    return dr.detect(fit, relinearise=False), frame
+
+
+def test_an_extended_source_is_one_row_with_its_shape(
+    crowded: tuple[Detection, dr.Observation],
+) -> None:
+    detection, frame = crowded
+    table = wide_field(detection, [frame]).candidates
+    table = table[np.isfinite(table["fit_chi2"])]
+    assert sorted(table["shape"]) == ["extended", "point"]
+    (point,), (extended,) = (table[table["shape"] == kind] for kind in ("point", "extended"))
+    assert np.hypot(point["x"].value - POINT.offset[0], point["y"].value - POINT.offset[1]) < 0.02
+    assert point["fit_chi2"] < 2
+    assert point["contrast"] == pytest.approx(POINT.contrast, rel=0.2)
+    assert np.isnan(point["fwhm_major"])
+    assert np.hypot(extended["x"].value - 1.3, extended["y"].value - 0.2) < 0.05
+    assert extended["fit_chi2"] > 3
+    # The background takes some of its outskirts.
+    assert extended["contrast"] == pytest.approx(4e-4, rel=0.3)
+    widths = [extended[name].value for name in ("fwhm_major", "fwhm_minor")]
+    np.testing.assert_allclose(widths, 2.355 * np.array(WIDTHS), rtol=0.25)
+    assert extended["axis_angle"].value == pytest.approx(AXIS, abs=8)
+
+
+def test_nothing_is_found_outside_the_searched_pixels(
+    crowded: tuple[Detection, dr.Observation],
+) -> None:
+    """Those are 16 pixels from the last valid rows and columns, also where the file has more."""
+    detection, frame = crowded
+    valid = frame.valid.copy()
+    valid[:, -20:] = False
+    wide = wide_field(detection, [replace(frame, valid=valid)])
+    rows, columns = np.nonzero(np.isfinite(wide.snr))
+    # The fitted pixels are in the middle of the frame.
+    assert (rows.min(), rows.max()) == (16, 99 - 20 - 16)
+    assert (columns.min(), columns.max()) == (16, 99 - 16)
+    x, y = (wide.candidates[name].value for name in ("x", "y"))
+    edge = (50 - 16) * 0.0629
+    assert (np.abs(x) < edge).all()
+    assert (y > -edge).all()
+    assert (y < edge - 20 * 0.0629).all()
+    # The point source is now beyond the last rows that are searched.
+    assert "point" not in wide.candidates["shape"][np.isfinite(wide.candidates["fit_chi2"])]
+
+
+def test_the_map_has_north_up_and_numbered_circles(
+    crowded: tuple[Detection, dr.Observation],
+) -> None:
+    detection, frame = crowded
+    wide = wide_field(detection, [frame])
+    turned = replace(frame, position_angles=np.array([90.0]))
+    fit = detection.fits[0]
+    part = replace(fit.frames[0], observation=turned.cutout(24))
+    oriented = replace(wide, detection=replace(
+        detection, fits=(replace(fit, frames=(part,)),)
+    ))  # fmt: skip
+    for each, turn in ((wide, lambda x, y: (x, y)), (oriented, lambda x, y: (-y, x))):
+        ax, _ = each.plot()
+        labels = {text.get_text(): text.xy for text in ax.texts if text.get_text().isdigit()}
+        assert len(labels) == len(wide.candidates)
+        for k, row in enumerate(wide.candidates, 1):
+            place = turn(row["x"].value, row["y"].value)
+            np.testing.assert_allclose(labels[str(k)], place, atol=1e-9)
+            # The map has the source where the circle is.
+            (image,) = ax.images
+            left, right, bottom, top = image.get_extent()
+            ny, nx = image.get_array().shape
+            column = int((place[0] - left) / (right - left) * nx)
+            line = int((place[1] - bottom) / (top - bottom) * ny)
+            near = image.get_array()[line - 1 : line + 2, column - 1 : column + 2]
+            assert near.max() > 0.6 * row["snr"] if row["shape"] != "extended" else near.max() > 5
+
+
 @pytest.mark.slow
 def test_planets_are_measured_wherever_they_are(wide: WideField) -> None:
     assert len(wide.candidates) == len(PLANETS)

@@ -27,6 +27,7 @@ __all__ = ["describe_plan", "size_of_products", "steps_of"]
 # documented.
 _FIT = 29.0
 _PLACE = 0.6
+_QUICK = 0.7
 _SEARCH = 8.0
 _DISK = 1.4
 _TIED = 0.6
@@ -62,7 +63,7 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
     count = len(sequence.science)
     systematics = options.systematics
     area = (options.size / 80) ** 2
-    fit = _FIT * area**_PIXELS
+    fit = _FIT * area**_PIXELS * (_QUICK if options.accuracy == "quick" else 1.0)
     steps = []
     searched = systematics == "auto" or isinstance(systematics, PatternLibrary)
     libraries = [systematics] if isinstance(systematics, PatternLibrary) else []
@@ -83,9 +84,16 @@ def steps_of(sequence: Sequence, options: ReduceOptions) -> list[tuple[str, floa
     if others:
         steps.append(("reference stars and target together", fit * _JOINT * (count + others)))
     refit = _DISK * joint * options.disk
+    search = _SEARCH * area * count
+    steps.append(("search", search))
+    more = options.disk or options.wide or options.injections or options.completeness
+    if more:
+        steps.append(("products after the stage search", _WRITE))
     if options.disk:
         steps.append(("extended light, and wavefront without it", refit))
-    steps.append(("search", _SEARCH * area * count + _WIDE * count * options.wide))
+        steps.append(("search without extended light", search))
+    if options.wide:
+        steps.append(("whole frames", _WIDE * count))
     if options.injections:
         seconds = joint + refit + _SEARCH * area * count
         rounds = math.ceil(options.injections / TOGETHER)

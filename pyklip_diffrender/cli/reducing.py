@@ -24,6 +24,8 @@ from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.reduction import (
     COMPARISON,
     PRODUCTS,
+    UNFINISHED,
+    ProductFolder,
     ReduceOptions,
     existing_products,
     prepare,
@@ -52,6 +54,8 @@ def run_reduction(
     figures: Literal["pdf", "png", "svg"] | None,
     json: bool,
     dry_run: bool,
+    resume: bool,
+    quick: bool,
     opd: str,
     opd_date: Rule | None,
     star_sed: str | None,
@@ -63,13 +67,16 @@ def run_reduction(
     """
     if dry_run and json:
         raise click.UsageError("A --dry-run has no summary to print with --json.")
+    if resume and overwrite:
+        raise click.UsageError("--resume keeps products, and --overwrite replaces them.")
     if star_sed is not None and options["star_flux"] is not None:
         raise click.UsageError("--star-flux and --star-sed both say how bright the star is.")
     try:
-        checked = ReduceOptions(device=run.device, **options)
+        accuracy: Literal["full", "quick"] = "quick" if quick else "full"
+        checked = ReduceOptions(device=run.device, accuracy=accuracy, **options)
     except DiffrenderError as error:
         raise click.UsageError(with_options(str(error)) + config_remark()) from error
-    run.claim_folder(output, (*PRODUCTS, *COMPARISON), overwrite)
+    run.claim_folder(output, (*PRODUCTS, *COMPARISON), overwrite or resume)
     # Libraries may print, too.
     with redirect_stdout(sys.stderr) if json else nullcontext():
         sequences = read()
@@ -86,7 +93,7 @@ def run_reduction(
         prepared = []
         for sequence, folder in zip(sequences, folders, strict=True):
             if several:
-                run.claim_folder(folder, tuple(PRODUCTS), overwrite)
+                run.claim_folder(folder, tuple(PRODUCTS), overwrite or resume)
                 click.echo(f"\n{folder.name}, one of {len(sequences)} reductions:")
             _show(sequence)
             map_ = map_for(sequence, opd, opd_date)
@@ -100,15 +107,28 @@ def run_reduction(
             return
         summaries = {}
         for preparation, folder in zip(prepared, folders, strict=True):
-            with numbered_stages(dict(steps_of(preparation.sequence, preparation.options))):
-                reduction = preparation.run(progress=run.progress)
-                with stage("products"):
-                    written = reduction.write(
-                        folder, overwrite=overwrite, derivatives=derivatives, figures=figures
-                    )
+            if resume and _is_finished(folder):
+                click.echo(f"{folder}: this reduction has finished")
+            else:
+                products = ProductFolder(
+                    folder,
+                    derivatives=derivatives,
+                    figures=figures,
+                    overwrite=overwrite,
+                    resume=resume,
+                )
+                try:
+                    with numbered_stages(dict(steps_of(preparation.sequence, preparation.options))):
+                        reduction = preparation.run(progress=run.progress, products=products)
+                        with stage("products"):
+                            written = products.finish(reduction)
+                except KeyboardInterrupt:
+                    if (folder / UNFINISHED).exists():
+                        click.echo("to go on, repeat the command with --resume", err=True)
+                    raise
+                click.echo(f"wrote {folder / 'report.html'} and {len(written) - 1} more files")
             summary = loads(read_text(folder / "summary.json"))
             summaries[folder.name] = summary
-            click.echo(f"wrote {folder / 'report.html'} and {len(written) - 1} more files")
             status = summary["status"]
             click.echo(f"\n{summary['sentence']}\n{status['name']}: {status['message']}.")
             click.echo(with_options(status["advice"]))
@@ -122,6 +142,11 @@ def run_reduction(
             click.echo(f"\nwrote {page}, which compares them")
     if json:
         click.echo(dumps(summary, indent=2))
+
+
+def _is_finished(folder: Path) -> bool:
+    """Whether a folder has the products of a reduction that was not interrupted."""
+    return (folder / "summary.json").exists() and not (folder / UNFINISHED).exists()
 
 
 def _with_flux(options: ReduceOptions, star_sed: str | None, name: str | None) -> ReduceOptions:

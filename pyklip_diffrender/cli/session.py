@@ -25,7 +25,8 @@ _log = logging.getLogger(__name__)
 
 _ARGUMENTS = "|".join([
     "completeness", "contrast", "disk", "filter", "hours", "injections", "mask", "memory",
-    "monochromatic", "offset", "opd", "overwrite", "program", "references", "separation", "size",
+    "monochromatic", "offset", "opd", "overwrite", "program", "references", "resume", "separation",
+    "size",
     "star_flux", "star_flux_error", "systematics", "target", "threshold", "wide",
 ])  # fmt: skip
 """Arguments that have the names of options of the command line."""

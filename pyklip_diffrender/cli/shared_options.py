@@ -306,8 +306,13 @@ search = _all(
            show_default=True, section="Fit and search",
            help="What the frames of reference stars are for: one likelihood with the target's, the "
            "flat-field pattern, or nothing."),
+    option("--quick", is_flag=True, section="Fit and search",
+           help="A first look with a coarser model, in about two thirds of the time."),
     option("--memory", metavar="SIZE", section="Fit and search",
            help='Memory that the process may take, such as "2 GB"; default: as much as it needs.'),
+    option("--resume", is_flag=True, section="Output",
+           help="Go on with a reduction that was interrupted: its fit and search are kept in the "
+                "folder of the products."),
     option("--dry-run", is_flag=True, section="Output",
            help="Make all checks, show frames, wavefront map, steps, time and memory, and stop."),
     option("--derivatives", is_flag=True, section="Output",

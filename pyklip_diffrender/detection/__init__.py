@@ -14,7 +14,7 @@ from pyklip_diffrender.detection.combination import combine_frames
 from pyklip_diffrender.detection.detection_file import image_hdu
 from pyklip_diffrender.detection.disk import Disk
 from pyklip_diffrender.detection.disk_fit import fit_disk
-from pyklip_diffrender.detection.figure import draw_curve, draw_search
+from pyklip_diffrender.detection.figure import draw_curve
 from pyklip_diffrender.detection.recovery import measured_planet, recover_planets, with_planets
 from pyklip_diffrender.detection.reference_stars import sources_of_references
 from pyklip_diffrender.detection.search import contrast_curve, detect, measure
@@ -34,7 +34,6 @@ __all__ = [
     "contrast_of_completeness",
     "detect",
     "draw_curve",
-    "draw_search",
     "fit_disk",
     "image_hdu",
     "measure",

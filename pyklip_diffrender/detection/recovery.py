@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.io.geometry import full_circle
+from pyklip_diffrender.io.progress import progressed
 from pyklip_diffrender.refinement import FrameFit
 from pyklip_diffrender.scene.objects import Planet
 from pyklip_diffrender.scene.observation import Observation
@@ -133,6 +134,7 @@ def recover_planets(
             angle = full_circle(planet.position_angle + detection.north)
             measured = measured_planet(again, planet.offset, frames[0].flux)
             planets.add_row((planet.separation, angle, planet.contrast, *measured))
+        progressed((start + rings) / count)
     for name, unit in _UNITS.items():
         planets[name] = planets[name] * unit
     for name, form in _COLUMNS.items():

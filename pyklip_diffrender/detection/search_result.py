@@ -8,11 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.io.fits import Header
+from astropy.nddata import CCDData
 from astropy.table import QTable
+from astropy.wcs import WCS
 from numpy.typing import ArrayLike, NDArray
 
 from pyklip_diffrender import drawing
@@ -28,7 +32,7 @@ from pyklip_diffrender.detection.detection_file import (
     write_detection,
 )
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image
+from pyklip_diffrender.detection.field import Image, pixels_of
 from pyklip_diffrender.detection.figure import draw_search
 from pyklip_diffrender.detection.groups import Group
 from pyklip_diffrender.detection.measurement import (
@@ -38,9 +42,11 @@ from pyklip_diffrender.detection.measurement import (
 )
 from pyklip_diffrender.detection.orbits import write_astrometry
 from pyklip_diffrender.detection.sky import Sky
+from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.observation import Observation
+from pyklip_diffrender.scene.product_headers import ccd_data, world_coordinates
 
 __all__ = ["Detection"]
 
@@ -210,6 +216,83 @@ class Detection:
         table["false_alarm_probability"].info.description = "of a peak anywhere; NaN if not known"
         table.meta = dict(self.provenance)
         return table
+
+    @property
+    def coordinates(self) -> SkyCoord:
+        """Right ascension and declination of the candidates, in the order of the table.
+
+        By the world coordinate system of the products, in which the star is where the header of
+        the first frame has it (CRVAL).
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If the header does not say where the frame is on the sky.
+        """
+        wcs = WCS(world_coordinates(self.grid, self.observation))
+        if not wcs.has_celestial:
+            raise IncompatibleSetupError(
+                f"{self.observation.name}: the header does not say where the frame is on the sky, "
+                "expected CRVAL1, CRVAL2 and the orientation. Use the columns x and y"
+            )
+        table = self.candidates
+        places = np.stack([table["x"].value, table["y"].value], axis=1)
+        return wcs.pixel_to_world(*pixels_of(self.grid, places).T)
+
+    def to_ccddata(
+        self, image: Literal["contrast", "snr", "subtracted"] = "contrast", frame: int = 0
+    ) -> CCDData:
+        """An image as astropy's `CCDData`, with its world coordinates, mask and uncertainty.
+
+        Parameters
+        ----------
+        image : "contrast", "snr" or "subtracted"
+            The map of contrasts or of S/N, or a frame without its star, see `subtracted`. That of
+            S/N has no uncertainty.
+        frame : int
+            Which of the frames, for "subtracted".
+
+        Raises
+        ------
+        IncompatibleSetupError
+            For the name of another image, for a frame that there is not, and for a frame other
+            than the first of a detection that was read without its fits.
+
+        Examples
+        --------
+        With a folder of products, which the package does not contain:
+
+        >>> import pyklip_diffrender as dr
+        >>> ccd = dr.Detection.read("products").to_ccddata("subtracted")  # doctest: +SKIP
+        >>> ccd.write("subtracted.fits")  # doctest: +SKIP
+        """
+        wcs = world_coordinates(self.grid, self.observation)
+        one = u.dimensionless_unscaled
+        if image == "contrast":
+            return ccd_data(self.contrast, self.error, one, wcs, image=image)
+        if image == "snr":
+            return ccd_data(self.snr, None, one, wcs, image=image)
+        if image != "subtracted" or not 0 <= frame < len(self.subtracted):
+            raise IncompatibleSetupError(
+                f"to_ccddata: got {image!r} and frame {frame}, expected 'contrast', 'snr', or "
+                f"'subtracted' with a frame below {len(self.subtracted)}"
+            )
+        shown = [each.observation for fit in self.fits for each in fit.frames]
+        if not shown and frame:
+            raise IncompatibleSetupError(
+                f"to_ccddata: got frame {frame} of a detection that was read without its fits, "
+                "which has the errors of the first one only. Pass fit to Detection.read"
+            )
+        observation = (shown[frame] if shown else self.observation).combined()
+        return ccd_data(
+            self.subtracted[frame],
+            observation.error[0],
+            observation.unit,
+            self._wcs[frame],
+            observation.valid[0],
+            image=image,
+            frame=observation.name,
+        )
 
     @cached_property
     def _calibration_errors(self) -> Image:

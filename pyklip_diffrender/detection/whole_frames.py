@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 from astropy.stats import SigmaClip
 from astropy.table import QTable
+from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 from scipy.ndimage import convolve, map_coordinates
 from scipy.signal import fftconvolve
@@ -25,7 +27,12 @@ from pyklip_diffrender.scene.observation import Observation
 if TYPE_CHECKING:
     from photutils.psf import ImagePSF
 
-__all__ = ["WholeFrame"]
+__all__ = ["EDGE", "REACH", "WholeFrame"]
+
+EDGE = 16
+"""Pixels within the last valid rows and columns that are not searched: templates are cut off there,
+and light scattered by the edge of the occulters' substrate appears in the first rows of every
+frame."""
 
 _FAR = 4.0
 """Separation of the source whose image is taken for all sources far from the star, arcsec. The
@@ -34,7 +41,7 @@ occulter takes less than a percent of its light."""
 _KERNEL = 15
 """Side of that image in the matched filter, pixels."""
 
-_REACH = 81
+REACH = 81
 """Side of the image that is subtracted for a source: it has side lobes far from its middle."""
 
 _FINE = 4
@@ -48,6 +55,9 @@ _CORE = 2.0
 
 _OUTLIER = 5.0
 """Standard deviations by which a pixel is brighter than its neighbours allow if it is masked."""
+
+_NOT_CONVERGED = 8
+"""Flag of photutils for a fit that has not converged."""
 
 _FITTED = 9
 """Side of the square in which a source is fitted, pixels."""
@@ -84,6 +94,24 @@ class WholeFrame:
     def _center(self) -> tuple[float, float]:
         x, y = self.observation.center[0]
         return float(x), float(y)
+
+    @cached_property
+    def _bounds(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """First and last column, and row, of which at least half of the pixels are valid."""
+        valid = self.observation.combined().valid[0]
+        lines = [np.flatnonzero(valid.mean(axis=axis) >= 0.5) for axis in (0, 1)]
+        columns, rows = ((int(k[0]), int(k[-1])) if len(k) else (0, -1) for k in lines)
+        return columns, rows
+
+    def searches(self, offsets: Image) -> NDArray[np.bool_]:
+        """Whether positions x, y from the star in the first frame, (..., 2), are searched."""
+        pixels = self.pixels_of(np.asarray(offsets, dtype=float))
+        # Half a pixel further, their centres are still nearest to a searched pixel.
+        inside = [
+            (pixels[..., k] >= first + EDGE - 0.5) & (pixels[..., k] <= last - EDGE + 0.5)
+            for k, (first, last) in enumerate(self._bounds)
+        ]
+        return np.asarray(inside[0] & inside[1])
 
     @cached_property
     def stars(self) -> Image:
@@ -154,18 +182,23 @@ class WholeFrame:
         return self._source(_KERNEL)
 
     @cached_property
-    def fine_image(self) -> ImagePSF:
-        """The kernel as a model for photutils, larger and sampled more finely than the pixels."""
-        from photutils.psf import ImagePSF
-
-        fine = np.empty((_FINE * _REACH, _FINE * _REACH))
+    def _fine(self) -> Image:
+        """The kernel, larger and sampled more finely than the pixels."""
+        fine = np.empty((_FINE * REACH, _FINE * REACH))
         middle = (_FINE - 1) / 2
         for row in range(_FINE):
             for column in range(_FINE):
                 # A pixel right of the source's middle sees what a source to its left shows.
-                moved = self._source(_REACH, (middle - column) / _FINE, (middle - row) / _FINE)
+                moved = self._source(REACH, (middle - column) / _FINE, (middle - row) / _FINE)
                 fine[row::_FINE, column::_FINE] = moved
-        return ImagePSF(fine, oversampling=_FINE)
+        return fine
+
+    @cached_property
+    def fine_image(self) -> ImagePSF:
+        """The fine image as a model for photutils."""
+        from photutils.psf import ImagePSF
+
+        return ImagePSF(self._fine, oversampling=_FINE)
 
     @cached_property
     def correlation(self) -> Image:
@@ -218,6 +251,53 @@ class WholeFrame:
     def _turn(self) -> NDArray[np.float64]:
         return rotation_matrix(self.roll)
 
+    def window_about(self, offset: Image, size: int) -> tuple[slice, slice]:
+        """Rows and columns of a square of pixels about x, y from the star in the first frame."""
+        middle = np.rint(self.pixels_of(offset)).astype(int)[::-1]
+        begin, end = np.maximum(middle - size // 2, 0), np.maximum(middle + size // 2 + 1, 0)
+        return slice(begin[0], end[0]), slice(begin[1], end[1])
+
+    def gaussian(self, window: tuple[slice, slice]) -> Callable[[Image, Image], Image]:
+        """Images of sources of contrast 1 with the shape of a Gaussian.
+
+        Parameters
+        ----------
+        window : (slice, slice)
+            Rows and columns of the images, see `window_about`.
+
+        Returns
+        -------
+        callable
+            Takes x, y from the star in the first frame, (2,), arcsec, and the covariance of the
+            Gaussian, (2, 2), arcsec^2 along the axes of the first frame; 0 for a point source.
+        """
+        ny, nx = self.observation.shape
+        rows, columns = np.arange(ny)[window[0]], np.arange(nx)[window[1]]
+        # Twice as wide as the window, so that its copies on all sides are not seen.
+        beyond = max(0, REACH - 2 * max(len(rows), len(columns)) - 1) // 2 * _FINE
+        fine = self._fine[beyond:-beyond, beyond:-beyond] if beyond else self._fine
+        side = len(fine)
+        # Cycles per pixel, along rows and columns.
+        ky, kx = np.fft.fftfreq(side, 1 / _FINE)[:, None], np.fft.rfftfreq(side, 1 / _FINE)
+        # The middle is between two samples.
+        middle = (side - 1) / 2 / _FINE
+        transform = np.fft.rfft2(fine) * np.exp(2j * np.pi * middle * (kx + ky))
+        origin = self.pixels_of(np.zeros(2))
+        to_pixels = (self.pixels_of(np.eye(2)) - origin).T
+
+        def image(offset: Image, covariance: Image) -> Image:
+            x, y = self.pixels_of(offset)
+            (xx, xy), (_, yy) = 2 * np.pi**2 * to_pixels @ covariance @ to_pixels.T
+            smoothed = np.exp(-(xx * kx**2 + yy * ky**2 + 2 * xy * kx * ky))
+            along_x, along_y = (
+                np.exp(-2j * np.pi * k * (place - round(place))) for k, place in ((kx, x), (ky, y))
+            )
+            moved = np.fft.irfft2(transform * smoothed * along_x * along_y, s=fine.shape)
+            samples = [_FINE * (p - round(q)) % side for p, q in ((rows, y), (columns, x))]
+            return np.asarray(moved[np.ix_(*samples)])
+
+        return image
+
     def on_first(self, grid: Image, images: Sequence[Image]) -> list[Image]:
         """Images of this frame at the positions of the first frame's pixels; 0 outside it.
 
@@ -234,7 +314,7 @@ class WholeFrame:
         total = np.zeros(self.observation.shape)
         ny, nx = total.shape
         for (x, y), contrast in zip(self.pixels_of(offsets), contrasts, strict=True):
-            half = _REACH // 2
+            half = REACH // 2
             rows = slice(max(round(y) - half, 0), min(round(y) + half + 1, ny))
             columns = slice(max(round(x) - half, 0), min(round(x) + half + 1, nx))
             if rows.start < rows.stop and columns.start < columns.stop:
@@ -254,21 +334,24 @@ class WholeFrame:
         chi2 : float
             Reduced chi-squared.
         None
-            If the source is not in this frame.
+            If the source is not where this frame is searched, before or after the fit, or if that
+            fails.
         """
         from photutils.psf import PSFPhotometry
 
         x, y = self.pixels_of(offset)
-        ny, nx = image.shape
-        if not (0 <= round(x) < nx and 0 <= round(y) < ny) or np.isinf(
-            self.sigma[round(y), round(x)]
-        ):
+        if not self.searches(offset) or np.isinf(self.sigma[round(y), round(x)]):
             return None
         start = QTable({"x": [x], "y": [y], "flux": [contrast]})
         unused = np.isinf(self.sigma)
-        fitted = PSFPhotometry(self.fine_image, (_FITTED, _FITTED))(
-            image, error=np.where(unused, 1.0, self.sigma), mask=unused, init_params=start
-        )[0]
+        with warnings.catch_warnings():
+            # Of a fit that has not converged, which its flags say as well.
+            warnings.simplefilter("ignore", AstropyUserWarning)
+            fitted = PSFPhotometry(self.fine_image, (_FITTED, _FITTED))(
+                image, error=np.where(unused, 1.0, self.sigma), mask=unused, init_params=start
+            )[0]
+        if fitted["flags"] & _NOT_CONVERGED:
+            return None
         place = self.offsets_of(np.array([fitted["x_fit"], fitted["y_fit"]], dtype=float))
         values = np.array([fitted["flux_fit"], *place], dtype=float)
         scale = self.fit.model.detector.pixelscale
@@ -276,5 +359,5 @@ class WholeFrame:
         # Along the axes of the first frame, from which this one may be rolled.
         turned = self._turn.T**2 @ (variances * np.square(scale))
         errors = np.array([fitted["flux_err"], *np.sqrt(turned)], dtype=float)
-        usable = np.isfinite(values).all() and (errors > 0).all()
+        usable = np.isfinite(values).all() and (errors > 0).all() and self.searches(place)
         return (values, errors, float(fitted["reduced_chi2"])) if usable else None

@@ -12,15 +12,17 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import QTable
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from pyklip_diffrender import drawing
 from pyklip_diffrender.detection.candidate_tables import in_words
 from pyklip_diffrender.detection.detection_file import image_hdu
 from pyklip_diffrender.detection.error_factor import ErrorFactor
-from pyklip_diffrender.detection.field import Image
-from pyklip_diffrender.detection.figure import draw_search
+from pyklip_diffrender.detection.field import Image, pixel_width, pixels_of
+from pyklip_diffrender.detection.figure import draw_curve
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.io.files import require_new, write_fits, write_table
+from pyklip_diffrender.io.geometry import rotation_matrix
 from pyklip_diffrender.io.html_repr import html_summary
 from pyklip_diffrender.scene.observation import Observation
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
@@ -30,7 +32,7 @@ __all__ = ["WideField"]
 
 @dataclass(frozen=True, eq=False)
 class WideField:
-    """Point sources in whole frames.
+    """Sources in whole frames.
 
     About the star the maps are those of the `Detection`, with the star marginalised. Elsewhere
     they are those of a matched filter on the frames without the star, extrapolated from its fit,
@@ -50,7 +52,9 @@ class WideField:
         Factor by which errors outside the fitted pixels were multiplied.
     candidates : QTable
         Candidates, highest S/N first, those of the detection included; columns as in
-        `Detection.candidates`, and fit_chi2.
+        `Detection.candidates`, and fit_chi2, shape, fwhm_major, fwhm_minor and axis_angle. An
+        extended source, or several that are blended, are one row with the contrast of all of its
+        light.
     contrast_curve : QTable
         See `contrast.contrast_table`.
     light : tuple of ndarray, (ny, nx)
@@ -88,7 +92,7 @@ class WideField:
         ny, nx = self.snr.shape
         facts = {"Star": self.observation.target, "Pixels": f"{nx} x {ny}"}
         title = f"WideField: {len(self.candidates)} candidates above {self.threshold:g} sigma"
-        columns = ("separation", "position_angle", "contrast", "contrast_error", "snr", "fit_chi2")
+        columns = ("separation", "position_angle", "contrast", "contrast_error", "snr", "shape")
         return html_summary(title, facts, self.candidates, columns)
 
     @property
@@ -128,10 +132,44 @@ class WideField:
         return tuple(cleaned) if seen > self.threshold else None
 
     def plot(self, ax: Any = None) -> NDArray[Any]:
-        """Draw the S/N map with the candidates, and the contrast curve; see `Detection.plot`."""
+        """Draw the S/N map with the candidates, and the contrast curve.
+
+        North is up, or +y of the first frame where its orientation is not known. The candidates are
+        numbered as in the table.
+
+        Parameters
+        ----------
+        ax : two Axes, optional
+            Default those of a new figure.
+
+        Returns
+        -------
+        ndarray of Axes, (2,)
+        """
         axes = drawing.axes_for(ax, 2)
-        draw_search(axes, self)
+        grid, to_sky = self._sky_grid()
+        columns, rows = np.moveaxis(pixels_of(self.grid, grid @ to_sky), -1, 0)
+        snr = map_coordinates(self.snr, [rows, columns], order=1, cval=np.nan)
+        table = self.candidates
+        count = len(table)
+        drawing.snr_map(
+            axes[0], snr, grid,
+            np.stack([table["x"].value, table["y"].value], axis=1) @ to_sky.T,
+            None if self.observation.position_angles is None else 0.0,
+            title=f"{count} candidate{'' if count == 1 else 's'} above S/N {self.threshold:g}",
+            labels=[str(k) for k in range(1, count + 1)],
+        )  # fmt: skip
+        draw_curve(axes[1], self)
         return np.array(axes)
+
+    def _sky_grid(self) -> tuple[Image, Image]:
+        """x, y of pixels from the star with north up, (n, m, 2), and the rotation to them."""
+        to_sky = rotation_matrix(self.north)
+        edges = self.grid[[0, 0, -1, -1], [0, -1, 0, -1]] @ to_sky.T
+        step = pixel_width(self.grid)
+        low, high = np.floor(edges.min(axis=0) / step), np.ceil(edges.max(axis=0) / step)
+        x, y = (step * np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
+        return np.stack(np.meshgrid(x, y), axis=-1), to_sky
 
     def write(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> list[Path]:
         """Write wide_field.fits (maps), and candidates and contrast curve as ECSV tables.

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from astropy import units as u
 from astropy.table import QTable, vstack
 from numpy.typing import NDArray
+from scipy.ndimage import label, map_coordinates
+from scipy.optimize import least_squares
+from scipy.sparse.csgraph import connected_components
 
 from pyklip_diffrender.detection.candidate_tables import candidate_table
 from pyklip_diffrender.detection.candidates import Candidates
@@ -19,7 +25,7 @@ from pyklip_diffrender.detection.field import Image, far_from, ring_pixels, sepa
 from pyklip_diffrender.detection.position_errors import with_position_of_star
 from pyklip_diffrender.detection.search_result import Detection
 from pyklip_diffrender.detection.significance import Significance
-from pyklip_diffrender.detection.whole_frames import WholeFrame
+from pyklip_diffrender.detection.whole_frames import EDGE, REACH, WholeFrame
 from pyklip_diffrender.detection.wide_result import WideField
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.refinement import star_flux_error
@@ -29,10 +35,6 @@ __all__ = ["require_outer_pixels", "wide_field"]
 
 _log = logging.getLogger(__name__)
 
-_EDGE = 16
-"""Pixels at the edge of the frame that are not searched: templates are cut off there, and light
-scattered by the edge of the occulters' substrate appears in the first rows of every frame."""
-
 _MOST = 50
 """Largest number of sources."""
 
@@ -41,6 +43,31 @@ _LOBES = 1.5
 
 _LEFT = 0.1
 """Largest part of a source's S/N that it may leave."""
+
+_SADDLE = 0.5
+"""Part of the fainter peak's S/N that the map has everywhere between two sources that are blended:
+of two point sources, those less than about two lambda/D apart."""
+
+_POINT = 2.0
+"""Reduced chi-squared, over the squared error factor, up to which a source is not fitted with
+another shape than that of a point source."""
+
+_GAIN = 25.0
+"""Decrease of chi-squared, over the squared error factor, by the shape of an extended source."""
+
+_WIDTH = 0.5
+"""Smallest full width at half maximum of an extended source, lambda/D. Errors of the image of a
+point source make bright ones slightly narrower or wider."""
+
+_COVERED_SIGMAS = 3.0
+"""Standard deviations of an extended source, with the width of a point source, within which peaks
+are parts of it."""
+
+_FWHM = math.sqrt(8 * math.log(2))
+"""Full width at half maximum of a Gaussian, in standard deviations."""
+
+_BESIDE = 4
+"""Pixels about a source that are fitted with it."""
 
 _STEP = 0.1
 """Distance between the separations of the contrast curve, arcsec."""
@@ -60,6 +87,47 @@ class _Measurement:
     @property
     def snr(self) -> float:
         return float(self.values[0] / np.sqrt(self.variance[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """Covariance of a Gaussian, arcsec^2 along x and y of the first frame."""
+
+    covariance: Image
+
+    @property
+    def major(self) -> float:
+        """Full width at half maximum along the long axis, arcsec."""
+        return float(_FWHM * np.sqrt(np.linalg.eigvalsh(self.covariance)[1]))
+
+    @property
+    def minor(self) -> float:
+        """Full width at half maximum along the short axis, arcsec."""
+        return float(_FWHM * np.sqrt(max(np.linalg.eigvalsh(self.covariance)[0], 0.0)))
+
+    @property
+    def angle(self) -> float:
+        """Angle of the long axis, counter-clockwise from +y, degrees."""
+        x, y = np.linalg.eigh(self.covariance)[1][:, 1]
+        return float(np.degrees(np.arctan2(-x, y)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """A source with the reduced chi-squared of a point source, and its shape if it is none."""
+
+    measurement: _Measurement
+    chi2: float
+    shape: _Shape | None = None
+
+    def covers(self, places: Image, resolution: float) -> NDArray[np.bool_]:
+        """Whether places (k, 2) are within three standard deviations of an extended source."""
+        if self.shape is None:
+            return np.zeros(len(places), dtype=bool)
+        seen = self.shape.covariance + (resolution / _FWHM) ** 2 * np.eye(2)
+        away = places - self.measurement.values[1:]
+        squared = np.einsum("ki,ij,kj->k", away, np.linalg.inv(seen), away)
+        return np.asarray(squared < _COVERED_SIGMAS**2)
 
 
 def wide_field(
@@ -99,18 +167,17 @@ def wide_field(
     grid = frames[0].grid
     window = _window(detection, frames[0])
     rows, columns = window
-    outer = np.zeros(grid.shape[:2], dtype=bool)
-    outer[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
+    outer = frames[0].searches(grid)
     outer[rows, columns] = False
     if not outer.any():
         require_outer_pixels(observations[0], len(detection.grid))
-    information, measured, factor = _search(frames, outer, grid, threshold, detection)
+    information, measured, factor, snr = _search(frames, outer, grid, threshold, detection)
+    rows_of = _sources(frames, measured, snr, factor, detection)
     # The star's displacement is that of a source at half the height of the fitted frame.
     halfway = torch.tensor([0.0, float(np.abs(detection.grid[..., 1]).max()) / 2])
-    sources = with_position_of_star(detection.groups, _candidates(measured), halfway.double())
-    numerator = np.sum(
-        [each.on_first(grid, each.products(each.residual))[0] for each in frames], axis=0
-    )
+    found = [each.measurement for each in rows_of]
+    sources = with_position_of_star(detection.groups, _candidates(found), halfway.double())
+    numerator, _ = _products(frames, [each.residual for each in frames], grid)
     error = factor.of(grid) / np.sqrt(information)
     contrast = numerator / information
     for ours, theirs in ((contrast, detection.contrast), (error, detection.error)):
@@ -123,15 +190,17 @@ def wide_field(
     # As in the table, the highest S/N first.
     order = np.argsort(-sources.snr(factor))
     inner = detection.candidates.copy()
-    chi2 = np.array([each.chi2 for each in measured]) / factor.of(sources.offsets) ** 2
-    inner["fit_chi2"], table["fit_chi2"] = np.nan, chi2[order]
     table["false_alarm_probability"] = np.nan
+    scale = factor.of(sources.offsets) ** 2
+    _add_shapes(inner, [None] * len(inner), np.full(len(inner), np.nan), detection)
+    _add_shapes(
+        table,
+        [rows_of[k] for k in order],
+        (np.array([each.chi2 for each in rows_of]) / scale)[order],
+        detection,
+    )
     tables = [each for each in (inner, table) if len(each)]
     joined = vstack(tables, metadata_conflicts="silent") if tables else table
-    joined["fit_chi2"].info.description = (
-        "reduced chi-squared of the source's image, over the squared error factor; much above 1 "
-        "for extended and blended sources"
-    )
     joined.meta = dict(detection.candidates.meta)
     return WideField(
         detection,
@@ -161,11 +230,11 @@ def require_outer_pixels(observation: Observation, size: int) -> None:
     IncompatibleSetupError
     """
     ny, nx = observation.shape
-    if max(ny, nx) <= size + 2 * _EDGE or min(ny, nx) <= 2 * _EDGE:
+    if max(ny, nx) <= size + 2 * EDGE or min(ny, nx) <= 2 * EDGE:
         raise IncompatibleSetupError(
             f"wide: got {ny} x {nx} pixels in {observation.name}, expected more than "
-            f"{size + 2 * _EDGE} along an axis and {2 * _EDGE} along the other: beyond the {size} "
-            f"fitted ones, {_EDGE} at every edge are not searched. Choose a smaller size, or leave "
+            f"{size + 2 * EDGE} along an axis and {2 * EDGE} along the other: beyond the {size} "
+            f"fitted ones, {EDGE} at every edge are not searched. Choose a smaller size, or leave "
             "out wide"
         )
 
@@ -209,8 +278,8 @@ def _search(
     grid: Image,
     threshold: float,
     detection: Detection,
-) -> tuple[Image, list[_Measurement], ErrorFactor]:
-    """Information of contrasts, the sources, and the error factor.
+) -> tuple[Image, list[_Measurement], ErrorFactor, Image]:
+    """Information of contrasts, the sources, the error factor, and the S/N with all sources.
 
     The highest peak is fitted and subtracted, until none is left: sources have side lobes.
     """
@@ -224,14 +293,13 @@ def _search(
         resolution,
     )
     sources: list[_Measurement] = []
+    whole: Image | None = None
     while True:
         images = [frame.residual - frame.light(*_light_of(sources)) for frame in frames]
-        products = [
-            f.on_first(grid, f.products(image)) for f, image in zip(frames, images, strict=True)
-        ]
-        numerator, information = (np.sum(each, axis=0) for each in zip(*products, strict=True))
+        numerator, information = _products(frames, images, grid)
         information = np.where(outer & (information > 0), information, np.nan)
         snr = numerator / np.sqrt(information)
+        whole = snr if whole is None else whole
         places = np.concatenate([known, _light_of(sources)[0]])
         factor = significance.factor(snr, places)
         allowed = np.isfinite(snr) & far_from(grid, places, resolution)
@@ -251,7 +319,18 @@ def _search(
         sources.append(fitted)
     if len(sources) >= _MOST:
         _log.warning("more than %d sources in the whole field; the fainter are left out", _MOST)
-    return information, _significant(frames, _refined(frames, sources), factor, threshold), factor
+    kept = _significant(frames, _refined(frames, sources), factor, threshold)
+    return information, kept, factor, np.nan_to_num(whole)
+
+
+def _products(
+    frames: Sequence[WholeFrame], images: Sequence[Image], grid: Image
+) -> tuple[Image, Image]:
+    """Matched filter of images at the first frame's pixels, from where each frame is searched."""
+    total = np.zeros((2, *grid.shape[:2]))
+    for frame, image in zip(frames, images, strict=True):
+        total += frame.searches(grid) * np.array(frame.on_first(grid, frame.products(image)))
+    return total[0], total[1]
 
 
 def _light_of(sources: Sequence[_Measurement]) -> tuple[Image, Image]:
@@ -305,6 +384,184 @@ def _measured(
         weights.sum(axis=0) ** -1.0,
         float(np.mean([chi2 for _, _, chi2 in usable])),
     )
+
+
+def _sources(
+    frames: Sequence[WholeFrame],
+    parts: list[_Measurement],
+    snr: Image,
+    factor: ErrorFactor,
+    detection: Detection,
+) -> list[_Source]:
+    """The sources of which the point sources that were found are parts, each with its shape.
+
+    Those whose middle is not where the first frame is searched are left out.
+    """
+    resolution = detection.contrast_curve.meta["resolution_arcsec"]
+    labels = _blends(frames[0], parts, snr)
+
+    def source(number: int) -> _Source:
+        own = [each for each, k in zip(parts, labels, strict=True) if k == number]
+        others = [each for each, k in zip(parts, labels, strict=True) if k != number]
+        scale = float(factor.at(separation_of(_light_of(own)[0])).mean()) ** 2
+        if len(own) == 1 and own[0].chi2 <= _POINT * scale:
+            return _Source(own[0], own[0].chi2)
+        images = [frame.residual - frame.light(*_light_of(others)) for frame in frames]
+        return _shaped(frames, images, own, scale, resolution)
+
+    places = _light_of(parts)[0]
+    sources = {int(number): source(number) for number in np.unique(labels)}
+    # The faint outskirts of an extended source may be a peak of their own.
+    merged = True
+    while merged:
+        merged = False
+        for number, each in sorted(sources.items(), key=lambda pair: -pair[1].measurement.snr):
+            inside = each.covers(places, resolution) & (labels != number)
+            if inside.any():
+                swallowed = {int(k) for k in labels[inside]}
+                labels[np.isin(labels, list(swallowed))] = number
+                sources = {k: v for k, v in sources.items() if k not in swallowed}
+                sources[number] = source(number)
+                merged = True
+                break
+    kept = []
+    for each in sources.values():
+        place = each.measurement.values[1:]
+        if frames[0].searches(place) and not _is_cut_off(frames[0], each.measurement):
+            kept.append(each)
+        else:
+            _log.info("light at x, y = %.2f, %.2f arcsec is of a source at the edge", *place)
+    return kept
+
+
+def _is_cut_off(first: WholeFrame, source: _Measurement) -> bool:
+    """Whether a source is blended with a brighter one outside the searched pixels, or its lobe."""
+    column, row = np.rint(first.pixels_of(source.values[1:])).astype(int)
+    numerator, information = first.products(first.residual)
+    # Where all pixels about one are masked, the numerator is no number to divide.
+    snr = np.divide(
+        numerator, np.sqrt(information), out=np.zeros_like(numerator), where=information > 0
+    )
+    about = np.s_[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+    height = float(snr[about].max())
+    outside = ~first.searches(first.grid)
+    near = separation_of(first.grid - source.values[1:]) < _LOBES
+    # The light of sources outside is not subtracted, and neither are their lobes.
+    if (outside & near & (_SADDLE * snr > height)).any():
+        return True
+    labels, _ = label(snr >= _SADDLE * height)
+    own = np.unique(labels[about])
+    return bool((np.isin(labels, own[own > 0]) & outside & (snr > height)).any())
+
+
+def _blends(first: WholeFrame, parts: Sequence[_Measurement], snr: Image) -> NDArray[np.intp]:
+    """Label of the source to which each of the parts belongs, (parts,)."""
+    places = first.pixels_of(_light_of(parts)[0])[:, ::-1]
+    heights = map_coordinates(snr, places.T, order=1)
+    linked = np.eye(len(parts), dtype=bool)
+    for i, k in itertools.combinations(range(len(parts)), 2):
+        steps = np.linspace(0, 1, 2 + int(2 * np.hypot(*(places[i] - places[k]))))
+        path = places[i][:, None] * (1 - steps) + places[k][:, None] * steps
+        between = map_coordinates(snr, path, order=1).min()
+        linked[i, k] = between >= _SADDLE * min(heights[i], heights[k])
+    return np.asarray(connected_components(linked, directed=False)[1])
+
+
+def _shaped(
+    frames: Sequence[WholeFrame],
+    images: Sequence[Image],
+    parts: Sequence[_Measurement],
+    scale: float,
+    resolution: float,
+) -> _Source:
+    """Fit the image of a point source and of a Gaussian, and choose by chi-squared and width.
+
+    Parameters
+    ----------
+    frames, images
+        Frames, and their data without other sources.
+    parts : sequence of _Measurement
+        Point sources that make up the source.
+    scale : float
+        Squared error factor.
+    resolution : float
+        lambda/D, arcsec.
+    """
+    places, contrasts = _light_of(parts)
+    total = contrasts.sum()
+    middle = contrasts @ places / total
+    extent = float(separation_of(places - middle).max())
+    pixel = float(np.mean(frames[0].observation.pixelscale))
+    size = 2 * min(_BESIDE + math.ceil(extent / pixel), REACH // 2) + 1
+    used = [(f, i) for f, i in zip(frames, images, strict=True) if f.searches(middle)]
+    windows = [frame.window_about(middle, size) for frame, _ in used]
+    renders = [frame.gaussian(window) for (frame, _), window in zip(used, windows, strict=True)]
+    weights = [
+        np.where(np.isinf(frame.sigma), 0.0, 1 / frame.sigma)[window]
+        for (frame, _), window in zip(used, windows, strict=True)
+    ]
+
+    def residuals(values: Image) -> Image:
+        root = np.zeros((2, 2))
+        root[[0, 1, 1], [0, 0, 1]] = [*values[3:], 0, 0, 0][:3]
+        left = [
+            weight * (image[window] - values[0] * total * render(values[1:3], root @ root.T))
+            for (_, image), window, weight, render in zip(
+                used, windows, weights, renders, strict=True
+            )
+        ]
+        return np.concatenate([each.ravel() for each in left])
+
+    # Starting from the brightest part and from all of them.
+    brightest = places[np.argmax(contrasts)]
+    width = max(extent / 2, pixel / 2)
+    point = least_squares(residuals, [1.0, *brightest], method="lm")
+    wide = least_squares(residuals, [1.0, *middle, width, 0.0, width], method="lm")
+    freedom = max(sum(int((weight > 0).sum()) for weight in weights) - 3, 1)
+    root = np.array([[wide.x[3], 0.0], wide.x[4:6]])
+    shape = _Shape(root @ root.T)
+    gain = 2 * (point.cost - wide.cost)
+    is_wide = gain > _GAIN * scale and shape.major > _WIDTH * resolution
+    best = wide if is_wide else point
+    unit = np.array([total, 1.0, 1.0])
+    covariance = np.linalg.pinv(best.jac.T @ best.jac)[:3, :3]
+    measurement = _Measurement(
+        best.x[:3] * unit, covariance.diagonal() * unit**2, 2 * best.cost / freedom
+    )
+    return _Source(measurement, 2 * point.cost / freedom, shape if is_wide else None)
+
+
+def _add_shapes(
+    table: QTable, sources: Sequence[_Source | None], chi2: Image, detection: Detection
+) -> None:
+    """Add chi-squared of the point source and the shape to a table of sources.
+
+    Those in the fitted pixels, None, are not judged.
+    """
+    table["fit_chi2"] = chi2
+    table["fit_chi2"].info.format = ".1f"
+    table["fit_chi2"].info.description = (
+        "reduced chi-squared of the image of a point source, over the squared error factor; much "
+        "above 1 for extended and blended sources"
+    )
+    table["shape"] = np.array(
+        ["" if s is None else "extended" if s.shape else "point" for s in sources], dtype="U8"
+    )
+    table["shape"].info.description = (
+        "point, or extended for a source that is no point source, or several that are blended; "
+        "empty in the fitted pixels, where shapes are not judged"
+    )
+    shapes = [None if each is None else each.shape for each in sources]
+    about = "full width at half maximum along the {} axis of an extended source, a Gaussian"
+    for name, axis in (("major", "long"), ("minor", "short")):
+        values = [np.nan if each is None else getattr(each, name) for each in shapes]
+        table[f"fwhm_{name}"] = np.array(values, dtype=float) * u.arcsec
+        table[f"fwhm_{name}"].info.format = ".2f"
+        table[f"fwhm_{name}"].info.description = about.format(axis)
+    angles = [np.nan if each is None else each.angle + detection.north for each in shapes]
+    table["axis_angle"] = np.array(angles, dtype=float) % 180 * u.deg
+    table["axis_angle"].info.format = ".0f"
+    table["axis_angle"].info.description = "position angle of the long axis, like position_angle"
 
 
 def _candidates(sources: Sequence[_Measurement]) -> Candidates:

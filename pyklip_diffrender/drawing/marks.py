@@ -20,7 +20,7 @@ ACCENT = "#0b6e4f"
 """A dark green, distinct from both ends of the red and blue maps."""
 
 _LABELLED = 4
-"""Largest number of circles that are labelled."""
+"""Largest number of circles with labels of more than two characters."""
 
 _COMPASS = 30.0
 """From the tail of an arrow to its letter, points."""
@@ -41,12 +41,13 @@ def label_sky(ax: Axes) -> None:
 
 
 def circles(ax: Axes, places: ArrayLike, labels: Sequence[str] = ()) -> None:
-    """Draw circles around positions (k, 2), with labels unless so many would overlap."""
+    """Draw circles around positions (k, 2), with labels unless so many long ones would overlap."""
     x, y = np.reshape(places, (-1, 2)).T
     ax.plot(
         x, y, "o", mfc="none", mec=INK, ms=15, mew=1.6, label="companions", path_effects=halo()
     )  # fmt: skip
-    shown = labels if len(x) <= _LABELLED else ()
+    is_short = all(len(label) <= 2 for label in labels)
+    shown = labels if is_short or len(x) <= _LABELLED else ()
     for label, place in zip(shown, zip(x, y, strict=True), strict=False):
         ax.annotate(
             label, place, (0, 11), textcoords="offset points", color=INK, ha="center", va="bottom",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -13,7 +14,15 @@ from typing import Self
 
 from tqdm import tqdm
 
-__all__ = ["ProgressBar", "duration", "heard_by", "numbered_stages", "stage"]
+__all__ = [
+    "ProgressBar",
+    "duration",
+    "heard_by",
+    "heartbeat",
+    "numbered_stages",
+    "progressed",
+    "stage",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -59,11 +68,14 @@ class _Schedule:
     _began: float = field(default_factory=time.monotonic)
     _done: float = 0.0
     _spent: float = 0.0
+    _part: float = 0.0
+    _part_spent: float = 0.0
 
     def begin(self, name: str) -> str:
         """Begin a stage; its name with its number."""
         self.count += 1
         self._own, self._began = self.expected.pop(name, 0.0), time.monotonic()
+        self._part = 0.0
         return f"{self.count}. {name}"
 
     def end(self) -> None:
@@ -73,6 +85,10 @@ class _Schedule:
             self._spent += time.monotonic() - self._began
         self._own = 0.0
 
+    def progressed(self, part: float) -> None:
+        """Note that a part of the stage is done: the next estimates are by its speed as well."""
+        self._part, self._part_spent = part, time.monotonic() - self._began
+
     @property
     def left(self) -> str:
         """Time that this stage and the next ones take, as far as they were expected."""
@@ -80,6 +96,11 @@ class _Schedule:
             return ""
         spent, later = time.monotonic() - self._began, sum(self.expected.values())
         pace = self._spent / self._done if self._done else 1.0
+        if self._part > 0:
+            # By the speed of what is done of this stage, which is a large one.
+            pace = self._part_spent / (self._own * self._part) if self._own else pace
+            rest = (self._own * (1 - self._part) + later) * pace - (spent - self._part_spent)
+            return f", about {duration(max(rest, later * pace))} left"
         if spent <= self._own * pace:
             return f", about {duration((self._own + later) * pace - spent)} left"
         if not later:
@@ -107,6 +128,31 @@ def numbered_stages(expected: Mapping[str, float] | None = None) -> Iterator[Non
     finally:
         if token is not None:
             _SCHEDULE.reset(token)
+
+
+def progressed(part: float) -> None:
+    """Note that a part of the current stage, from 0 to 1, is done, for estimates of the time."""
+    schedule = _SCHEDULE.get()
+    if schedule is not None:
+        schedule.progressed(part)
+
+
+@contextmanager
+def heartbeat(say: Callable[[], str]) -> Iterator[None]:
+    """Write a line to the log every minute, whatever else is done or waited for inside."""
+    ended = threading.Event()
+
+    def beat() -> None:
+        while not ended.wait(_INTERVAL):
+            _log.info("%s", say())
+
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def _left() -> str:

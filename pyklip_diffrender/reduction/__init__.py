@@ -4,6 +4,8 @@ from pyklip_diffrender.reduction.options import ReduceOptions
 from pyklip_diffrender.reduction.pipeline import Preparation, prepare, reduce
 from pyklip_diffrender.reduction.products import (
     PRODUCTS,
+    UNFINISHED,
+    ProductFolder,
     existing_products,
     write_products,
     write_report,
@@ -20,8 +22,10 @@ from pyklip_diffrender.reduction.visit import Contribution, Visit
 __all__ = [
     "COMPARISON",
     "PRODUCTS",
+    "UNFINISHED",
     "Contribution",
     "Preparation",
+    "ProductFolder",
     "ReduceOptions",
     "Reduction",
     "Visit",

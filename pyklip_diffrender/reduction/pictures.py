@@ -11,7 +11,7 @@ from astropy.table import QTable
 from numpy.typing import NDArray
 
 from pyklip_diffrender import drawing
-from pyklip_diffrender.detection import Detection, Disk, WideField, draw_curve, draw_search
+from pyklip_diffrender.detection import Detection, Disk, WideField, draw_curve
 from pyklip_diffrender.reduction.overview import Overview
 from pyklip_diffrender.reduction.pages import Picture
 from pyklip_diffrender.reduction.reduction_result import Reduction
@@ -57,7 +57,7 @@ class ReportPictures:
         """Draw all that a reduction has."""
         detection = reduction.detection
         klip = overview.klip and overview.klip.curve
-        frames = range(min(len(reduction.fit.frames), MOST_FRAMES))
+        frames = list(detection.groups[0][1].frames)[:MOST_FRAMES]
         shown = range(min(len(detection.candidates), MOST_FRAMES))
         planets, fractions = reduction.injections, reduction.completeness
         return cls(
@@ -233,8 +233,8 @@ def _stamps(detection: Detection, place: int) -> list[drawing.Stamp]:
     offset = sources.offsets[index : index + 1]
     light, together = templates.at(offset), sources.light(templates)
     stamps = []
-    frames = list(zip(templates.frames.items(), detection.subtracted, strict=False))
-    for (k, frame), subtracted in frames[:MOST_FRAMES]:
+    for k, frame in list(templates.frames.items())[:MOST_FRAMES]:
+        subtracted = detection.subtracted[k]
         observation = frame.observation.combined()
         own = float(sources.contrasts[index]) * light[k][0].numpy()
         row, column = np.rint(templates.pixels_of(k, offset)[:, 0]).astype(int)
@@ -300,17 +300,20 @@ def _scaled(detection: Detection) -> str:
 def _wide(wide: WideField) -> list[Picture]:
     """The S/N map of the whole frames, and the contrast curve to their edge."""
     figures, axes = _panels(2)
-    draw_search(axes, wide)
+    wide.plot(axes)
     count = len(wide.candidates)
     some = f"{count or 'no'} candidate{'' if count == 1 else 's'} above S/N {wide.threshold:g}"
+    oriented = wide.observation.position_angles is not None
+    up = "north up" if oriented else "oriented like the first frame"
     return _pictures(
         figures,
         ["whole_frames_snr", "whole_frames_contrast_curve"],
         (
             f"Map of the signal-to-noise ratio of a point source in the whole frames, {some}.",
-            "S/N of a point source in the whole frames. About the star it is that of the search "
-            "above; elsewhere the star, extrapolated from its fit, and the background were "
-            "subtracted. Errors follow the scatter of the S/N at every separation.",
+            f"S/N of a point source in the whole frames, {up}. Circles have the numbers of the "
+            "table. About the star it is that of the search above; elsewhere the star, "
+            "extrapolated from its fit, and the background were subtracted. Errors follow the "
+            "scatter of the S/N at every separation.",
         ),
         (
             "Curve of the contrast limit against separation in arcsec, to the edge of the frames.",

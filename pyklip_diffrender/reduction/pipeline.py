@@ -13,6 +13,7 @@ from astropy.table import QTable
 from pyklip_diffrender.detection import (
     Detection,
     Disk,
+    WideField,
     completeness,
     detect,
     fit_disk,
@@ -24,13 +25,21 @@ from pyklip_diffrender.errors import DiffrenderError
 from pyklip_diffrender.io.progress import numbered_stages, stage
 from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.optics.system import OpticalSystem
-from pyklip_diffrender.pattern import PatternChoice, fit_with_pattern
+from pyklip_diffrender.pattern import (
+    PatternChoice,
+    as_request,
+    choose_systematics,
+    fit_with_pattern,
+)
 from pyklip_diffrender.reduction.options import ReduceOptions
+from pyklip_diffrender.reduction.products import Checkpoint, ProductFolder
 from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.verdict import require_plausible
 from pyklip_diffrender.reduction.visit import Joined, rough_settings, with_references
 from pyklip_diffrender.refinement import (
+    GaussNewton,
     Refinement,
+    quick_settings,
     refine,
     refine_again,
     require_calibrated,
@@ -39,7 +48,7 @@ from pyklip_diffrender.refinement import (
     with_star_flux,
 )
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.real_frames import model_for
+from pyklip_diffrender.scene.real_frames import coarse_arguments, model_for
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.wavefront.map_choice import wavefront_for
 from pyklip_diffrender.wavefront.opd import OPDMap
@@ -57,6 +66,9 @@ def reduce(
     filter: str | None = None,
     progress: bool = False,
     options: ReduceOptions | None = None,
+    output: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
     **keywords: Any,
 ) -> Reduction:
     """Search a sequence of real frames for planets.
@@ -79,10 +91,20 @@ def reduce(
         Show progress bars.
     options : ReduceOptions, optional
         Options of the reduction, in place of `keywords`.
+    output : path, optional
+        Folder for the products, as those of `Reduction.write`. They are written as they come: those
+        of the fit and the search before wide, disk, injections and completeness begin.
+    overwrite : bool
+        Replace the products of an earlier reduction in `output`.
+    resume : bool
+        Go on with a reduction that was interrupted after its products in `output` were written
+        for the first time. Frames, map and options must be the same, but for injections and
+        completeness. What the frames of reference stars contributed (`Reduction.visit`) is kept;
+        fits of reference stars by themselves, for a pattern (`Reduction.references`), are not.
     **keywords
         Fields of `ReduceOptions`: ``size``, ``systematics``, ``settings``, ``threshold``,
         ``wide``, ``disk``, ``injections``, ``completeness``, ``star_flux``, ``star_flux_error``,
-        ``device`` and ``memory``.
+        ``accuracy``, ``device`` and ``memory``.
 
     Returns
     -------
@@ -95,6 +117,9 @@ def reduce(
         calibrated.
     TypeError
         For a keyword that is no option, or keywords together with `options`.
+    ExistingFileError
+        If there are products in `output`, and neither `overwrite` nor `resume` allows it; it is
+        also an `OSError`.
     DiffrenderError
         If the target cannot be fitted. A reference star that cannot be is left out.
 
@@ -114,7 +139,14 @@ def reduce(
         )
     if not isinstance(sequence, Sequence):
         sequence = Sequence.from_files(sequence, target=target, filter=filter)
-    return prepare(sequence, opd, options).run(progress=progress)
+    if output is None:
+        if overwrite or resume:
+            raise TypeError("reduce() got overwrite or resume without output, a folder")
+        return prepare(sequence, opd, options).run(progress=progress)
+    products = ProductFolder(output, overwrite=overwrite, resume=resume)
+    reduction = prepare(sequence, opd, options).run(progress=progress, products=products)
+    products.finish(reduction)
+    return reduction
 
 
 def prepare(
@@ -156,12 +188,16 @@ def prepare(
         )
     if options.wide:
         require_outer_pixels(sequence.science[0], options.size)
+    first, settings, coarser = sequence.science[0], options.settings, {}
+    if options.accuracy == "quick":
+        settings = quick_settings(first.cutout(options.size))
+        coarser = coarse_arguments(first, max(first.shape) if options.wide else options.size)
     if model is None:
-        model = model_for(sequence.science[0], options.size, device=options.device)
+        model = model_for(first, options.size, device=options.device, **coarser)
         cut = sequence.cutout(options.size)
     else:
         cut = sequence.cutout(model.detector.shape, beyond_edges=True)
-    return Preparation(sequence, cut, model, wavefront, options)
+    return Preparation(sequence, cut, model, wavefront, options, settings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +212,8 @@ class Preparation:
     wavefront : OPDMap
         The wavefront to start from.
     options : ReduceOptions
+    settings : GaussNewton or None
+        Settings of the fits; None for those of `refine`.
     """
 
     whole: Sequence
@@ -183,11 +221,21 @@ class Preparation:
     model: OpticalSystem
     wavefront: OPDMap
     options: ReduceOptions
+    settings: GaussNewton | None = None
 
-    def run(self, *, progress: bool = False) -> Reduction:
-        """Fit the star, search the frames, and do what else the options ask for; see `reduce`."""
+    def run(self, *, progress: bool = False, products: ProductFolder | None = None) -> Reduction:
+        """Fit the star, search the frames, and do what else the options ask for; see `reduce`.
+
+        Parameters
+        ----------
+        progress : bool
+            Show progress bars.
+        products : ProductFolder, optional
+            Where to write the products as they come. It may have what an interrupted reduction has
+            done.
+        """
         with numbered_stages():
-            return _Run(self, progress).result()
+            return _Run(self, progress, products).result()
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,61 +244,137 @@ class _Run:
 
     preparation: Preparation
     progress: bool
+    products: ProductFolder | None = None
 
     def result(self) -> Reduction:
         options, whole = self.preparation.options, self.preparation.whole.science
-        for_pattern = options.references == "pattern" or options.systematics == "references"
-        for_pattern = for_pattern or (options.disk and options.references == "joint")
-        choice, fit = fit_with_pattern(
-            self.preparation.sequence.science,
-            self.preparation.sequence.references if for_pattern else (),
-            self.preparation.model,
-            self.preparation.wavefront,
-            self._first_fit,
-            systematics=options.systematics,
-            settings=options.settings,
-            memory=options.memory,
-            progress=self.progress,
-        )
-        fit, visit, detection = self._with_references(fit, choice)
+        saved: Checkpoint | None = None
+        detection: Detection | None = None
+        disk: Disk | None = None
+        wide: WideField | None = None
+        injections: QTable | None = None
+        fractions: QTable | None = None
+        done: frozenset[str] = frozenset()
+        if self.products is not None:
+            saved = self.products.begin(
+                self.preparation.sequence, self.preparation.wavefront, options
+            )
+        if saved is None:
+            for_pattern = options.references == "pattern" or options.systematics == "references"
+            for_pattern = for_pattern or (options.disk and options.references == "joint")
+            choice, fit = fit_with_pattern(
+                self.preparation.sequence.science,
+                self.preparation.sequence.references if for_pattern else (),
+                self.preparation.model,
+                self.preparation.wavefront,
+                self._first_fit,
+                systematics=options.systematics,
+                settings=self.preparation.settings,
+                memory=options.memory,
+                progress=self.progress,
+            )
+            label = choice.label
+            fit, visit, detection = self._with_references(fit, choice)
+        else:
+            choice, label, done = self._choice(saved), saved.pattern, saved.done
+            fit, visit, detection = saved.fit, saved.visit, saved.detection
+            disk, injections, fractions = saved.disk, saved.injections, saved.completeness
         sequence = replace(self.preparation.sequence, science=choice.science)
-        disk = wide = injections = fractions = None
-        if options.disk:
+
+        def reduction() -> Reduction:
+            assert detection is not None
+            return Reduction(
+                sequence,
+                detection.fits[0],
+                detection,
+                choice.references,
+                choice.systematics,
+                choice.failed,
+                label,
+                visit,
+                wide,
+                disk,
+                injections,
+                fractions,
+                options.accuracy,
+            )
+
+        def keep(name: str) -> None:
+            if self.products is not None and self._has_more_after(name):
+                with stage(f"products after the stage {name}"):
+                    self.products.keep(name, reduction(), choice)
+
+        if saved is None and (self.products is not None or not options.disk):
+            with stage("search"):
+                # Where limits with and without the reference stars were compared, it was searched.
+                detection = detection or self._search(fit)
+            keep("search")
+        if options.disk and "disk" not in done:
             with stage("extended light, and wavefront without it"):
                 disk = fit_disk(fit, progress=self.progress)
                 fit = disk.fit
-        with stage("search"):
-            if detection is None or disk is not None:
+            with stage("search without extended light"):
                 detection = self._search(fit, disk)
-            if options.wide:
+            keep("disk")
+        assert detection is not None
+        if options.wide:
+            with stage("whole frames"):
                 wide = wide_field(detection, whole)
-        cleaned = None if wide is None else wide.subtracted(whole, sequence.science)
-        if cleaned is not None:
-            with stage("star and search without the light of sources beyond the fitted pixels"):
-                fit, visit, searched = self._with_references(self._fit(cleaned, choice), choice)
-                detection = searched or self._search(fit)
-                wide = wide_field(detection, whole)
-        if options.injections and len(detection.contrast_curve):
+            cleaned = None if "wide" in done else wide.subtracted(whole, sequence.science)
+            if cleaned is not None:
+                with stage("star and search without the light of sources beyond the fitted pixels"):
+                    fit, visit, again = self._with_references(self._fit(cleaned, choice), choice)
+                    detection = again or self._search(fit)
+                    wide = wide_field(detection, whole)
+            if "wide" not in done:
+                keep("wide")
+        has_limits = bool(len(detection.contrast_curve))
+        if options.injections and has_limits and not self._has(injections, options.injections):
             with stage(f"{options.injections} injected planets"):
                 injections = self._inject(detection, choice, disk)
-        if options.completeness and len(detection.contrast_curve):
+            if injections is not None:
+                keep("injections")
+        if options.completeness and has_limits and fractions is None:
             with stage("completeness"):
                 fractions = completeness(detection, progress=self.progress)
+            keep("completeness")
         self._require_plausible(detection.fits[0])  # It may have been fitted with companions.
-        return Reduction(
-            sequence,
-            detection.fits[0],
-            detection,
-            choice.references,
-            choice.systematics,
-            choice.failed,
-            choice.label,
-            visit,
-            wide,
-            disk,
-            injections,
-            fractions,
+        return reduction()
+
+    @staticmethod
+    def _has(injections: QTable | None, count: int) -> bool:
+        return injections is not None and len(injections) == count
+
+    def _has_more_after(self, name: str) -> bool:
+        """Whether the options ask for stages after one."""
+        options = self.preparation.options
+        stages = {
+            "search": True,
+            "disk": options.disk,
+            "wide": options.wide,
+            "injections": bool(options.injections),
+            "completeness": options.completeness,
+        }
+        later = list(stages)[list(stages).index(name) + 1 :]
+        return any(stages[each] for each in later)
+
+    def _choice(self, saved: Checkpoint) -> PatternChoice:
+        """The choice of the pattern of an interrupted reduction, without fits of other stars."""
+        options = self.preparation.options
+        known = as_request(options.systematics)
+        if saved.origin != "library":
+            known = saved.systematics or "off"
+        choice = choose_systematics(
+            self.preparation.sequence.science,
+            (),
+            self.preparation.model,
+            self.preparation.wavefront,
+            systematics=known,
+            settings=self.preparation.settings,
+            memory=None if options.memory is None else to_bytes(options.memory, "memory"),
+            progress=self.progress,
         )
+        return replace(choice, settings=saved.settings, failed=saved.failed, origin=saved.origin)
 
     def _first_fit(self, choice: PatternChoice, again: bool) -> Refinement:
         without = ", without the library's flat-field pattern" if again else ""

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
+import os
 import re
 from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from astropy.table import QTable
+
 from pyklip_diffrender import drawing
-from pyklip_diffrender.errors import IncompatibleSetupError
-from pyklip_diffrender.io.files import replacing, write_table
+from pyklip_diffrender._version import __version__
+from pyklip_diffrender.detection import Detection, Disk
+from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
+from pyklip_diffrender.io.files import replacing, require_new, write_table
+from pyklip_diffrender.pattern import PatternChoice
 from pyklip_diffrender.reduction.overview import Klip, Overview
 from pyklip_diffrender.reduction.pages import FIGURE_FORMATS, write_figures
 from pyklip_diffrender.reduction.pictures import ReportPictures
@@ -18,8 +28,30 @@ from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.report import page
 from pyklip_diffrender.reduction.sky_images import SkyImages
 from pyklip_diffrender.reduction.summary import summarise
+from pyklip_diffrender.reduction.visit import Contribution, Visit
+from pyklip_diffrender.refinement import GaussNewton, Refinement
+from pyklip_diffrender.refinement.fit_file import decoded, encoded
+from pyklip_diffrender.scene.sequence import Sequence
+from pyklip_diffrender.scene.systematics import Systematics
+from pyklip_diffrender.wavefront.opd import OPDMap
 
-__all__ = ["PRODUCTS", "existing_products", "write_products", "write_report"]
+_log = logging.getLogger(__name__)
+
+__all__ = [
+    "PRODUCTS",
+    "UNFINISHED",
+    "Checkpoint",
+    "ProductFolder",
+    "existing_products",
+    "write_products",
+    "write_report",
+]
+
+UNFINISHED = "unfinished.json"
+"""File that is in the folder of products until all stages of a reduction are done."""
+
+_LATER = ("injections", "completeness", "device", "memory")
+"""Options that may differ when a reduction is resumed: the fit and the search are the same."""
 
 PRODUCTS = {
     "report.html": "this page",
@@ -38,6 +70,7 @@ PRODUCTS = {
     "completeness.ecsv": "fraction of planets that the search finds, by contrast and separation",
     "fit.fits": "the fit, for Refinement.read",
     "systematics.fits": "the flat-field pattern, for other reductions",
+    UNFINISHED: "stages that are done, for a reduction that is resumed",
 }
 """Every file that a reduction may write, with its content."""
 
@@ -126,6 +159,193 @@ def write_products(
     for path in set(existing_products(folder)) - set(written):
         path.unlink()
     return written
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """What a reduction that is resumed has done before.
+
+    Attributes
+    ----------
+    done : frozenset of str
+        Names of the stages: search, disk, wide, injections, completeness.
+    fit : Refinement
+        Frames of reference stars that were fitted with the target's come after them.
+    detection : Detection
+    visit : Visit
+        What the frames of reference stars have contributed.
+    settings : GaussNewton or None
+        Settings of the fits of the target alone.
+    systematics : Systematics or None
+        The flat-field pattern of the target's own fit.
+    origin : str
+        Where the pattern comes from, see `PatternChoice`.
+    pattern : str
+        The same with the names of its stars.
+    failed : tuple of (str, str)
+        Reference stars that could not be fitted.
+    disk : Disk or None
+    injections, completeness : QTable or None
+    """
+
+    done: frozenset[str]
+    fit: Refinement
+    detection: Detection
+    visit: Visit
+    settings: GaussNewton | None
+    systematics: Systematics | None
+    origin: Any
+    pattern: str
+    failed: tuple[tuple[str, str], ...]
+    disk: Disk | None
+    injections: QTable | None
+    completeness: QTable | None
+
+
+class ProductFolder:
+    """A folder into which a reduction writes its products as its stages end.
+
+    Until it has finished, the folder also has the file unfinished.json, and ``fit.fits`` has the
+    derivatives, from which the reduction can go on.
+
+    Parameters
+    ----------
+    folder : path
+    derivatives : bool
+        Keep the derivatives in ``fit.fits`` at the end.
+    figures : {"pdf", "png", "svg"}, optional
+        Write every figure of the report to a file of this format at the end.
+    overwrite : bool
+        Replace the products of an earlier reduction.
+    resume : bool
+        Go on with a reduction that was interrupted, if there is one in the folder.
+
+    Raises
+    ------
+    ExistingFileError
+        If there are products in the folder, and neither `overwrite` nor `resume` allows it; it is
+        also an `OSError`.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        derivatives: bool = False,
+        figures: Literal["pdf", "png", "svg"] | None = None,
+        overwrite: bool = False,
+        resume: bool = False,
+    ) -> None:
+        self.folder, self._derivatives, self._figures = Path(folder), derivatives, figures
+        self._resumes = resume and (self.folder / UNFINISHED).exists()
+        if not self._resumes:
+            require_new(existing_products(self.folder), overwrite)
+        self._facts: dict[str, Any] = {}
+
+    def begin(self, sequence: Sequence, opd: OPDMap, options: Any) -> Checkpoint | None:
+        """Return what an interrupted reduction of the same frames has done; else None.
+
+        Raises
+        ------
+        IncompatibleSetupError
+            If the folder has an interrupted reduction of other frames, or with other options.
+        CorruptFileError
+            If one of its files is damaged.
+        """
+        fingerprint = _fingerprint(sequence, opd, options)
+        self._facts = {"version": __version__, "fingerprint": fingerprint, "done": []}
+        if not self._resumes:
+            return None
+        path = self.folder / UNFINISHED
+        try:
+            facts = json.loads(path.read_text(encoding="utf-8"))
+            same = (facts["version"], facts["fingerprint"]) == (__version__, fingerprint)
+            done, choice = frozenset(facts["done"]), facts["choice"]
+            failed = tuple((str(name), str(why)) for name, why in choice["failed"])
+            settings, origin = decoded(choice["settings"]), choice["origin"]
+            pattern, visit = str(choice["pattern"]), _visit_of(facts["visit"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise CorruptFileError(
+                f"{path} is damaged ({error!r}). Start the reduction anew, with overwrite=True "
+                "(--overwrite)"
+            ) from error
+        if not same:
+            raise IncompatibleSetupError(
+                f"resume: {self.folder} has an interrupted reduction of other frames, with other "
+                "options or by another version of the package. Repeat its options, or start anew "
+                "with overwrite=True (--overwrite)"
+            )
+        self._facts["done"] = sorted(done)
+        fit = Refinement.read(self.folder / "fit.fits")
+        known = self.folder / "systematics.fits"
+        tables = {
+            name: QTable.read(self.folder / f"{name}.ecsv")
+            for name in ("injections", "completeness")
+            if name in done and (self.folder / f"{name}.ecsv").exists()
+        }
+        _log.info("resumed after: %s", ", ".join(sorted(done)))
+        return Checkpoint(
+            done,
+            fit,
+            Detection.read(self.folder, fit=fit),
+            visit,
+            settings,
+            Systematics.read(known) if known.exists() else None,
+            origin,
+            pattern,
+            failed,
+            Disk.read(self.folder, fit) if "disk" in done else None,
+            tables.get("injections"),
+            tables.get("completeness"),
+        )
+
+    def keep(self, stage_name: str, reduction: Reduction, choice: PatternChoice) -> None:
+        """Write the products so far, after a stage."""
+        self._facts["done"] = sorted({*self._facts["done"], stage_name})
+        self._facts["choice"] = {
+            "settings": encoded(choice.settings),
+            "origin": choice.origin,
+            "pattern": reduction.pattern,
+            "failed": choice.failed,
+        }
+        self._facts["visit"] = encoded(asdict(reduction.visit))
+        table = getattr(reduction, stage_name, None)
+        path = self.folder / UNFINISHED
+        if isinstance(table, QTable):
+            # The rest is as it was, and the report follows at the end.
+            write_table(table, self.folder / f"{stage_name}.ecsv")
+        else:
+            # Until all files are of the same stage, there is nothing to resume.
+            path.unlink(missing_ok=True)
+            write_products(reduction, self.folder, derivatives=True)
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps(self._facts, indent=2) + "\n", encoding="utf-8")
+
+    def finish(self, reduction: Reduction) -> list[Path]:
+        """Write all products; the reduction has finished."""
+        return reduction.write(
+            self.folder, overwrite=True, derivatives=self._derivatives, figures=self._figures
+        )
+
+
+def _visit_of(facts: Any) -> Visit:
+    """The visit that was written to the file of what is done."""
+    known = decoded(facts)
+    return Visit(tuple(Contribution(**each) for each in known["contributions"]), known["gain"])
+
+
+def _fingerprint(sequence: Sequence, opd: OPDMap, options: Any) -> str:
+    """Hash of frames, wavefront map and options that decide the fit and the search."""
+    total = hashlib.sha256()
+    for frame in (*sequence.science, *sequence.references):
+        for array in (frame.data, frame.error, frame.valid):
+            total.update(np.ascontiguousarray(array).tobytes())
+    total.update(np.ascontiguousarray(opd.data).tobytes())
+    named = {each.name: getattr(options, each.name) for each in fields(options)}
+    named["settings"] = encoded(named["settings"])
+    chosen = {name: value for name, value in named.items() if name not in _LATER}
+    total.update(json.dumps(chosen, sort_keys=True, default=repr).encode())
+    return total.hexdigest()
 
 
 def write_report(reduction: Reduction, folder: Path, files: Iterable[Path] = ()) -> list[Path]:

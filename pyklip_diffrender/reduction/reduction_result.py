@@ -59,6 +59,8 @@ class Reduction:
         Measurements of injected planets, see `recover_planets`, if they were asked for.
     completeness : QTable or None
         Fraction of planets that the search finds, see `completeness`, if it was asked for.
+    accuracy : str
+        "full", or "quick" for a first look, see `ReduceOptions`.
 
     Examples
     --------
@@ -82,6 +84,7 @@ class Reduction:
     disk: Disk | None = None
     injections: QTable | None = None
     completeness: QTable | None = None
+    accuracy: str = "full"
 
     @property
     def reference_frames(self) -> int:
@@ -119,6 +122,12 @@ class Reduction:
         edge = float(curve["separation"][-1].to_value("arcsec"))
         return looks_extended(self.detection.candidates, resolution, edge)
 
+    @property
+    def _status(self) -> str:
+        """How the fit ended, and whether it was a first look."""
+        quick = " (quick: a first look with a coarser model)" if self.accuracy == "quick" else ""
+        return f"{self.fit.status}{quick}"
+
     def __repr__(self) -> str:
         return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"
 
@@ -126,7 +135,7 @@ class Reduction:
         known = "none" if self.systematics is None else f"from {self.systematics.name}"
         search = self.detection if self.wide is None else self.wide
         return (
-            f"{self.sequence!r}\n{self.fit.status}\n"
+            f"{self.sequence!r}\n{self._status}\n"
             f"flat-field pattern: {known}\n{self._references}{search}\n{self.remark}"
         ).rstrip()
 
@@ -142,7 +151,7 @@ class Reduction:
 
     def _repr_html_(self) -> str:
         facts = {
-            "Status": str(self.fit.status),
+            "Status": self._status,
             "Frames": f"{len(self.sequence.science)} of the target, "
             f"{len(self.sequence.references)} of reference stars",
             "Filter": self.sequence.filter,

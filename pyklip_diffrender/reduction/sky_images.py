@@ -58,8 +58,9 @@ class SkyImages:
         lights: Sequence[Any] = [0.0] * len(self._templates.frames)
         if self._disk is not None:
             lights = self._disk.light
-        left = zip(self._templates.frames.items(), self.detection.subtracted, lights, strict=True)
-        for (k, frame), subtracted, light in left:
+        # Frames of reference stars may be among those that were fitted.
+        for (k, frame), light in zip(self._templates.frames.items(), lights, strict=True):
+            subtracted = self.detection.subtracted[k]
             filled = interpolate_replace_nans(subtracted, Gaussian2DKernel(1.0))
             images[k] = np.nan_to_num(filled) + light
             error = frame.observation.combined().error[0]

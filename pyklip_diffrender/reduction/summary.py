@@ -60,6 +60,7 @@ def summarise(reduction: Reduction, klip: QTable | None = None) -> dict[str, Any
         "last_date": max(dates).isot if dates else None,
         "epoch_mjd": detection.sky.mjd,
         "star": _star(detection),
+        "accuracy": reduction.accuracy,
         "threshold_snr": detection.threshold,
         "oriented": first.position_angles is not None,
         "status": {

@@ -83,18 +83,26 @@ def sentence(summary: Mapping[str, Any]) -> str:
         parts.insert(0, _extended(summary))
     if summary["wide_field"] is not None:
         parts.append(_outside(summary))
+    if summary["accuracy"] == "quick":
+        parts.append(
+            "This is a first look with a coarser model, whose limits are not those of a full "
+            "reduction."
+        )
     return " ".join(parts)
 
 
 def _outside(summary: Mapping[str, Any]) -> str:
-    """How many candidates there are beyond the fitted pixels."""
-    more = len(summary["wide_field"]["candidates"]) - len(summary["candidates"])
-    if more < 1:
+    """How many sources there are beyond the fitted pixels."""
+    shapes = [each["shape"] for each in summary["wide_field"]["candidates"]]
+    kinds = {
+        "more candidate": shapes.count("point"),
+        "extended or blended source": shapes.count("extended"),
+    }
+    counts = [f"{n} {kind}{'' if n == 1 else 's'}" for kind, n in kinds.items() if n]
+    if not counts:
         return "Nothing was found farther from the star, in the whole frames."
-    return (
-        f"Farther from the star, in the whole frames, there {'is' if more == 1 else 'are'} {more} "
-        f"more candidate{'' if more == 1 else 's'}."
-    )
+    verb = "is" if next(filter(None, kinds.values())) == 1 else "are"
+    return f"Farther from the star, in the whole frames, there {verb} {' and '.join(counts)}."
 
 
 def _extended(summary: Mapping[str, Any]) -> str:

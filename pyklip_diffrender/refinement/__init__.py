@@ -13,7 +13,12 @@ from pyklip_diffrender.refinement.flux_scale import (
     with_star_flux,
 )
 from pyklip_diffrender.refinement.frame_fit import FrameFit
-from pyklip_diffrender.refinement.settings import GaussNewton, nircam_settings, settings_for
+from pyklip_diffrender.refinement.settings import (
+    GaussNewton,
+    nircam_settings,
+    quick_settings,
+    settings_for,
+)
 from pyklip_diffrender.refinement.status import Status
 
 __all__ = [
@@ -25,6 +30,7 @@ __all__ = [
     "jansky_per_unit",
     "join_frames",
     "nircam_settings",
+    "quick_settings",
     "refine",
     "refine_again",
     "require_calibrated",

@@ -35,6 +35,7 @@ from pyklip_diffrender.wavefront.priors import WavefrontPrior
 
 __all__ = [
     "decoded",
+    "encoded",
     "image",
     "linear_hdus",
     "linear_of",

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from astropy.io import fits
+from astropy.nddata import CCDData
 from astropy.table import QTable
 from numpy.typing import NDArray
 from torch import Tensor
@@ -19,7 +20,7 @@ from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import LEVELS, parameter
 from pyklip_diffrender.refinement.fit_file import image, observation_hdus, observation_of
 from pyklip_diffrender.scene.observation import Observation
-from pyklip_diffrender.scene.product_headers import world_coordinates
+from pyklip_diffrender.scene.product_headers import ccd_data, world_coordinates
 
 __all__ = ["FrameFit", "parameter_table", "pixel_grid"]
 
@@ -106,6 +107,17 @@ class FrameFit:
     def wcs(self) -> fits.Header:
         """World coordinates of the pixels, see `world_coordinates`."""
         return world_coordinates(self.grid, self.observation)
+
+    def to_ccddata(self) -> CCDData:
+        """The frame without its star as astropy's `CCDData`; integrations are averaged.
+
+        It has the world coordinates, the mask and the errors of the frame; see `residual`.
+        """
+        frame = self.observation.combined()
+        data = frame.data[0] - self.star
+        return ccd_data(
+            data, frame.error[0], frame.unit, self.wcs, frame.valid[0], frame=frame.name
+        )
 
     def render(
         self,

@@ -344,6 +344,11 @@ class Observation:
         return np.asarray(np.average(self.center, axis=0, weights=self.counts))
 
     @property
+    def mask(self) -> NDArray[np.bool_]:
+        """Pixels that are not valid, (frames, ny, nx): True where astropy's masks are."""
+        return ~self.valid
+
+    @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of a frame."""
         return self.data.shape[1], self.data.shape[2]

@@ -7,14 +7,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from astropy import units as u
 from astropy.io import fits
+from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.keywords import set_keyword
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["primary_hdu", "world_coordinates"]
+__all__ = ["ccd_data", "primary_hdu", "world_coordinates"]
 
 _OBSERVED = (
     "TELESCOP", "INSTRUME", "DETECTOR", "CHANNEL", "FILTER", "PUPIL", "CORONMSK", "SUBARRAY",
@@ -114,3 +117,38 @@ def world_coordinates(grid: NDArray[np.float64], observation: Observation) -> fi
     if unit == "deg":
         header["RADESYS"] = str(observation.header.get("RADESYS", "ICRS"))
     return header
+
+
+def ccd_data(
+    image: NDArray[np.float64],
+    error: NDArray[np.float64] | None,
+    unit: u.UnitBase,
+    wcs: fits.Header,
+    valid: NDArray[np.bool_] | None = None,
+    /,
+    **meta: Any,
+) -> CCDData:
+    """Make astropy's `CCDData` of an image, (ny, nx), masked where it is not valid or not finite.
+
+    Parameters
+    ----------
+    image : ndarray, (ny, nx)
+    error : ndarray, (ny, nx), or None
+        Standard deviations.
+    unit : Unit
+    wcs : Header
+        See `world_coordinates`.
+    valid : ndarray of bool, (ny, nx), optional
+    **meta
+        Entries of the attribute `meta`.
+    """
+    mask = ~np.isfinite(image)
+    uncertainty = None
+    if error is not None:
+        mask |= ~np.isfinite(error)
+        uncertainty = StdDevUncertainty(np.array(error))
+    if valid is not None:
+        mask |= ~valid
+    return CCDData(
+        np.array(image), unit=unit, mask=mask, uncertainty=uncertainty, wcs=WCS(wcs), meta=meta
+    )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
+
 from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.instrument.masks import MASKS, detector_place, stop_is_measured
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
@@ -16,7 +18,7 @@ from pyklip_diffrender.scene.archive_names import detector_of
 from pyklip_diffrender.scene.exposure import bar_place, image_mask, module_of
 from pyklip_diffrender.scene.observation import Observation
 
-__all__ = ["model_for"]
+__all__ = ["coarse_arguments", "faintness", "model_for"]
 
 Items = tuple[tuple[str, Any], ...]
 
@@ -28,6 +30,46 @@ _CELLS = 1.2
 """Cells of the occulter per lambda/D. The round masks have no structure finer than several
 lambda/D, so that this changes images by 3e-7 of their peak or less, and one cell per pixel is
 enough in all filters of both channels; two cells per pixel take four times as long."""
+
+
+_RING = (5.0, 16.0)
+_REFERENCE = 1800.0
+"""Median of the squared S/N of pixels at these distances from the star, pixels, in one roll of
+G 7-34 in F444W, for which `benchmarks.scene_fidelity` measured what a coarser model costs."""
+
+_VERY_FAINT = 100.0
+
+
+def faintness(observation: Observation) -> float:
+    """By what factor a star is fainter, compared with its noise, than G 7-34 in one roll."""
+    frame = observation.combined()
+    y, x = np.indices(frame.shape)
+    column, row = frame.center[0]
+    away = np.hypot(x - column, y - row)
+    ring = frame.valid[0] & (away > _RING[0]) & (away < _RING[1])
+    if not ring.any():
+        return 1.0
+    squares = (frame.data[0][ring] / frame.error[0][ring]) ** 2
+    return _REFERENCE / max(float(np.median(squares)), 1e-6)
+
+
+def coarse_arguments(observation: Observation, size: int) -> dict[str, Any]:
+    """Arguments of `model_for` for a first look, by the noise of the frames.
+
+    Parameters
+    ----------
+    observation : Observation
+    size : int
+        Side of the pixels on which the model is evaluated.
+    """
+    nlambda = 3 if faintness(observation) >= _VERY_FAINT else 5
+    if observation.filter is None:
+        return {}
+    shortest = float(filter_throughput(observation.filter)[0][0])
+    npix = _NPIX // 2
+    while npix < samples_for_field(size * max(observation.pixelscale), shortest):
+        npix *= 2
+    return {"nlambda": nlambda, "npix": npix}
 
 
 def model_for(observation: Observation, size: int | None = None, **overrides: Any) -> OpticalSystem:

@@ -15,6 +15,7 @@ from astropy.table import Table
 from tqdm import tqdm
 
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.progress import duration, heartbeat
 from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.surveys.config import Config, read_config
 from pyklip_diffrender.surveys.execution import in_this_process, with_dask
@@ -121,7 +122,10 @@ def run_survey(
     missing = [job for job in todo if not board.has(job)]
     _log.info("%d of %d jobs are finished", len(todo) - len(missing), len(todo))
     try:
-        with tqdm(total=len(missing), desc="survey", disable=not progress) as bar:
+        with (
+            tqdm(total=len(missing), desc="survey", disable=not progress) as bar,
+            heartbeat(board.words),
+        ):
             for job, record in _execute(missing, jobs, read, scheduler, work):
                 board.add(job, record)
                 bar.set_postfix(failed=board.failures)
@@ -159,7 +163,7 @@ class _Board:
             record = read_record(output / "jobs" / job.folder)
             if record is not None:
                 self.records[job.key] = record
-        self.next = 0.0
+        self.next, self.began = 0.0, time.monotonic()
 
     def has(self, job: Job) -> bool:
         """Whether a job is finished; failed ones are tried again."""
@@ -167,7 +171,15 @@ class _Board:
 
     @property
     def failures(self) -> int:
-        return sum(each["status"] == "failed" for each in self.records.values())
+        return sum(each["status"] == "failed" for each in tuple(self.records.values()))
+
+    def words(self) -> str:
+        """How far the survey is, in a line."""
+        finished = sum(self.has(job) for job in self.todo)
+        return (
+            f"survey: {finished} of {len(self.todo)} jobs finished, {self.failures} failed, "
+            f"after {duration(time.monotonic() - self.began)}"
+        )
 
     @property
     def rows(self) -> list[dict[str, Any]]:
