@@ -253,7 +253,7 @@ def _write(
     path.unlink(missing_ok=True)
     calints(
         path, star, observation=k, roll=roll, cards=cards, light=light, change=spoil,
-        date=f"2022-10-03T0{k}:{minute:02}:{repeat:02}",
+        date=f"2022-10-03T{k:02}:{minute:02}:{repeat:02}",
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import os
 import re
+import sys
 from pathlib import Path
 
 import click
@@ -14,6 +15,9 @@ from numpydoc.xref import DEFAULT_LINKS
 import pyklip_diffrender
 from pyklip_diffrender import cli, errors
 from pyklip_diffrender.parameters import LEVELS, OPTICAL_PARAMETERS
+
+sys.path.insert(0, str(Path(__file__).parent))
+import generate
 
 project = "pyklip_diffrender"
 author = "pyklip_diffrender developers"
@@ -107,6 +111,7 @@ def _write_tables(app):
     """Write what the pages take from the code: the free parameters and the commands' options."""
     folder = Path(app.srcdir) / "generated"
     folder.mkdir(exist_ok=True)
+    generate.write_tables(folder)
     with open(folder / "parameters.csv", "w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
         for each in (*OPTICAL_PARAMETERS, *LEVELS):

@@ -78,7 +78,7 @@ def main() -> None:
     keep = away_from_companions(fit)
     (fitted,) = fit.frames
     data = fitted.observation.data
-    print(f"\n{fit.status.message}; chi2/pixel {fit.chi2_per_pixel:.2f}")
+    print(f"\n{fit.status}; chi2/pixel {fit.chi2_per_pixel:.2f}")
     print(f"reduction {seconds:.0f} s, of which the fit {fit.seconds:.0f} s")
     for name, frame in (*((f"integration {k}", f) for k, f in enumerate(data)),
                         ("their mean", data.mean(axis=0))):  # fmt: skip

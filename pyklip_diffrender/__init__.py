@@ -139,10 +139,31 @@ _NAMES = {
 }
 """Public names by the module they are in."""
 
+_SUBMODULES = (
+    "bridges",
+    "detection",
+    "drawing",
+    "errors",
+    "instrument",
+    "io",
+    "linear",
+    "optics",
+    "parameters",
+    "pattern",
+    "reduction",
+    "refinement",
+    "scene",
+    "spaceklip",
+    "wavefront",
+)
+"""Packages and modules with further public names, such as ``dr.drawing.snr_map``."""
+
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:
+    if name in _SUBMODULES:
+        return import_module(f"{__name__}.{name}")
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
@@ -159,7 +180,7 @@ def _watch_in_spawned_process() -> None:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted([*__all__, *_SUBMODULES])
 
 
 _watch_in_spawned_process()

@@ -79,7 +79,7 @@ def render(observation: Any, opd: OPDMap, settings: DiffrenderSettings) -> Subtr
         weights, *_ = np.linalg.lstsq(a.T, b / observation.error[i][good], rcond=None)
         star[i] = np.tensordot(weights, terms, 1)
         chi2 += float(np.mean(((star[i] - observation.data[i]) / observation.error[i])[good] ** 2))
-    fit = Fit(tuple(range(len(star))), "converged", chi2 / len(star), observation)
+    fit = Fit(tuple(range(len(star))), "CONVERGED", chi2 / len(star), observation)
     return Subtraction(star, (fit,))
 
 

@@ -111,6 +111,27 @@ def test_what_is_no_frame_of_this_setup_is_excluded(
     assert uses(sequence)[name] == "excluded"
 
 
+@pytest.mark.parametrize("extension", ["PRIMARY", "RESULT_PHASE"])
+def test_a_wavefront_map_is_no_frame(tmp_path: Path, extension: str) -> None:
+    """In the wrong place on the command line, and in the folder of the frames."""
+    maps, frames = tmp_path / "maps", tmp_path / "frames"
+    maps.mkdir()
+    data = np.zeros((16, 16))
+    if extension == "PRIMARY":
+        header = fits.Header({"BUNIT": "um"})
+        hdus = fits.HDUList([fits.PrimaryHDU(data, header)])
+    else:
+        hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(data, name=extension)])
+    hdus.writeto(maps / "opd_2022-10-02.fits")
+    words = "it is a wavefront map, no frame of a star; wavefront maps are chosen with opd"
+    with pytest.raises(NoValidPixelsError, match=words):
+        dr.Sequence.from_files(maps)
+    frames.mkdir()
+    calints(frames / "a.fits")
+    hdus.writeto(frames / "map.fits")
+    assert reasons(dr.Sequence.from_files(frames))["map.fits"].startswith("it is a wavefront map")
+
+
 def test_cards_that_say_the_same_or_nothing_change_nothing(tmp_path: Path) -> None:
     cards = {"BUNIT": "MJy sr-1", "EXPMID": 0.0, "INSTRUME": None, "PA_APER": 430.05}
     calints(tmp_path / "a.fits", cards=cards)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -288,7 +289,17 @@ def test_public_name_resolves(name: str) -> None:
 
 def test_the_directory_of_the_package_is_its_public_names() -> None:
     _ = dr.Scene
-    assert dir(dr) == sorted(dr.__all__)
+    assert dir(dr) == sorted({*dr.__all__, *dr._SUBMODULES})
+
+
+def test_documented_names_of_submodules_load_in_a_fresh_interpreter() -> None:
+    page = (ROOT / "docs/reference/api.md").read_text(encoding="utf-8")
+    names = re.findall(r"^   ((?:[a-z]\w*\.)+\w+)$", page, re.MULTILINE)
+    assert {name.split(".")[0] for name in names} >= {"bridges", "drawing", "spaceklip"}
+    # Each in the state of a fresh interpreter, where no other name has loaded its package.
+    forget = f"for m in [m for m in sys.modules if m.startswith('{PACKAGE}')]: del sys.modules[m]"
+    lines = [f"{forget}\nimport {PACKAGE} as dr\ndr.{name}" for name in names]
+    loaded_by("\n".join(["import sys", *lines]))
 
 
 def test_unknown_name_is_an_attribute_error() -> None:
@@ -310,5 +321,6 @@ def test_type_checkers_see_the_names_that_are_loaded_lazily() -> None:
     ]
     assert len(guarded) == 1
     typed = {name.removeprefix(f"{PACKAGE}.") for _, name in imported_names(guarded[0], PACKAGE)}
-    assert typed == {f"{module}.{name}" for name, module in dr._MODULE_OF.items()}
+    lazy = {f"{module}.{name}" for name, module in dr._MODULE_OF.items()}
+    assert typed == lazy
     assert set(dr.__all__) == {*dr._MODULE_OF, "__version__"}

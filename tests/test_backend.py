@@ -275,6 +275,13 @@ def test_both_algorithms_in_one_call(
     np.testing.assert_array_equal(dataset.output, alone["diffrender"][0].output)
     np.testing.assert_array_equal(dataset.input, alone["diffrender"][0].input)
     assert len(dataset.diffrender_results) == 1
+    (record,) = dataset.diffrender_results
+    for each in (record, record.frames, record.frames.pointings[0], record.subtraction):
+        # No arrays, which are pages long.
+        assert repr(each).startswith("<")
+        assert "\n" not in repr(each)
+        assert len(repr(each)) < 400
+    assert "CONVERGED, chi2/pixel" in repr(dataset.diffrender_results)
 
 
 @pytest.mark.usefixtures("registered")
@@ -338,7 +345,7 @@ def test_a_single_frame_without_header(mode: str, imgs: np.ndarray, tmp_path: Pa
     image, header = files["x-KLmodes-all.fits"]
     assert image.shape == (1, *SHAPE)
     assert np.nanmax(image) == pytest.approx(1.85, rel=0.1)
-    assert header["DRSTAT"] == "converged"
+    assert header["DRSTAT"] == "CONVERGED"
 
 
 @pytest.mark.usefixtures("registered")
@@ -515,7 +522,7 @@ def test_the_kinds_of_opd_and_their_provenance(kind: str, imgs: np.ndarray, tmp_
     assert header["DROPD"] == ("array" if kind in ("array", "quantity") else path.name)
     assert len(header["DRSHA256"]) == 64
     assert header["DRFILT"] == "F444W"
-    assert header["DRSTAT"] == "converged"
+    assert header["DRSTAT"] == "CONVERGED"
     assert header["DRCHI2"] > 0
     assert header["DRVERS"]
     history = "".join(header["HISTORY"])

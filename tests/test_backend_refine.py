@@ -155,7 +155,7 @@ def test_star_goes_companion_stays(
 
     # The fit saw 32 x 32 pixels, the product covers all that the frames hold.
     assert np.isfinite(image).sum() > 1.0 * frames[0].size
-    assert header["DRSTAT"] == "converged"
+    assert header["DRSTAT"] == "CONVERGED"
     # Both rolls share a fit.
     assert header["DRNFIT"] == 1
     (fit,) = refined.diffrender_results[0].subtraction.fits
@@ -411,7 +411,9 @@ def test_a_fit_that_diverges_stops_the_reduction(
     made = dataset(-frames[:1], small)
     with (
         backend(opd=OLD, fit=ALIGNED),
-        pytest.raises(RefinementError, match="roll0: failed") as caught,
+        pytest.raises(
+            RefinementError, match="roll0: the fit ended as DIVERGED: the fitted star has no"
+        ) as caught,
     ):
         reduce(made, tmp_path)
     assert caught.value.result.frames[0].star.shape == (32, 32)
@@ -463,7 +465,7 @@ def test_start_and_systematics_reach_the_fit(
         chosen = replace(settings, systematics=known)
         with contextlib.nullcontext() if known else pytest.warns(DiffrenderWarning):
             found = subtract_by_refinement(observation, OLD, chosen)
-        assert found.systematics == ("given (systematics)" if known else "none")
+        assert found.systematics == ("systematics" if known else "none")
         (fit,) = found.fits
         assert fit.result.frames[0].values["star_offset"].tolist() == [0.02, 0.0]
         away = ((found.star[0] - star * (1 + measured) - SKY) / noise)[:, :-3]

@@ -106,8 +106,8 @@ def test_help_of_a_command_has_sections_and_examples(
         (["detect", "x", "-o", "y", "--opd", "z", "--systematics", "no.fits"], "--systematics"),
         (["detect", "x", "-o", "y", "--opd", "z", "--opd-folder", "x"], "--opd-folder"),
         (["detect", "x", "-o", "y", "--opd", "z", "--dry-run", "--json"], "--dry-run has no"),
-        (["psf", "x.fits", "--threads", "0"], "--threads"),
-        (["psf", "x.fits", "--size", "0"], "--size"),
+        (["psf", "-o", "x.fits", "--threads", "0"], "--threads"),
+        (["psf", "-o", "x.fits", "--size", "0"], "--size"),
         (["demo", "--hours", "-1"], "--hours"),
         (["demo", "--contrast", "-1"], "--contrast"),
         (["demo", "--separation", "9"], "--separation"),
@@ -151,7 +151,7 @@ def test_psf_writes_the_image_of_the_model(
 ) -> None:
     path = tmp_path / "star.fits"
     opd = opd_file(tmp_path / "opd.fits")
-    arguments = ["psf", str(path), *WAVELENGTH, "--size", "20", "--opd", str(opd)]
+    arguments = ["psf", "-o", str(path), *WAVELENGTH, "--size", "20", "--opd", str(opd)]
     assert main([*arguments, "--offset", "0.02", "-0.3"]) == 0
     assert str(path) in capsys.readouterr().out
     with open_fits(path) as hdus:
@@ -193,7 +193,7 @@ def test_errors_go_to_stderr_and_nothing_is_written(
     words: list[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["psf", "star.fits", *extra]) == 1
+    assert main(["psf", "-o", "star.fits", *extra]) == 1
     shown = capsys.readouterr()
     assert shown.out == ""
     assert shown.err.startswith("pyklip-diffrender: ")
@@ -209,7 +209,7 @@ def test_a_map_without_a_unit_is_an_error(
 ) -> None:
     opd = opd_file(tmp_path / "opd.fits", unit=None)
     product = tmp_path / "star.fits"
-    assert main(["psf", str(product), *WAVELENGTH, "--opd", str(opd)]) == 1
+    assert main(["psf", "-o", str(product), *WAVELENGTH, "--opd", str(opd)]) == 1
     assert "opd.fits: the header has no BUNIT" in capsys.readouterr().err
     assert not product.exists()
 
@@ -244,7 +244,7 @@ def test_an_image_is_replaced_only_when_told_to(
 ) -> None:
     path = tmp_path / "star.fits"
     path.write_text("mine")
-    arguments = ["psf", str(path), *WAVELENGTH, "--size", "8"]
+    arguments = ["psf", "-o", str(path), *WAVELENGTH, "--size", "8"]
     assert main(arguments) == 1
     shown = capsys.readouterr().err
     assert str(path) in shown
@@ -490,7 +490,12 @@ def test_an_estimate_counts_the_fits_that_are_made(frames: Path) -> None:
 # -- a reduction, with a stub in the place of the fit --------------------------------------------
 
 
-SUMMARY = {"sentence": "One companion.", "status": {"advice": "Use disk=True (--disk)."}}
+SUMMARY = {
+    "sentence": "One companion.",
+    "status": {
+        "name": "MODEL_MISMATCH", "message": "converged, but", "advice": "Use disk=True (--disk).",
+    },
+}  # fmt: skip
 
 
 @dataclass
@@ -550,7 +555,7 @@ def test_reduce_passes_its_options_on_and_names_the_products(
     assert main(arguments) == 0
     shown = capsys.readouterr()
     # Names of the command line, and the page to open.
-    assert "One companion.\nUse --disk.\n" in shown.out
+    assert "One companion.\nMODEL_MISMATCH: converged, but.\nUse --disk.\n" in shown.out
     assert f"wrote {products / 'report.html'} and 1 more files\n" in shown.out
     (call,) = reduced
     assert call.given.wavefront.name == "opd_2022-07-20.fits"
@@ -753,7 +758,7 @@ def test_mast_is_asked_for_the_map_of_the_date(
 def test_an_image_goes_into_a_folder_that_exists(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], path: str, words: str
 ) -> None:
-    assert main(["psf", str(tmp_path / path)]) == 1
+    assert main(["psf", "-o", str(tmp_path / path)]) == 1
     assert words in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -770,7 +775,7 @@ def test_a_device_that_is_not_there_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "star.fits"
-    assert main(["psf", str(path), "--device", "abacus"]) == 1
+    assert main(["psf", "-o", str(path), "--device", "abacus"]) == 1
     assert "--device: PyTorch" in capsys.readouterr().err
     assert not path.exists()
 
@@ -813,7 +818,7 @@ def test_a_written_configuration_gives_the_same_run(
         ("[psf]\nsise = 20\n", "[psf] has 'sise'"),
         ("sise = 20\n", "has 'sise'"),
         ("[psf\n", "run.toml: Expected"),
-        ("[psf]\nsize = 'large'\n", "'large' is not a valid int"),
+        ("[psf]\nsize = 'large'\n", "'size' in {config}: 'large' is not a valid int"),
         (None, "No such file"),
     ],
 )
@@ -823,9 +828,46 @@ def test_a_wrong_configuration_is_a_usage_error(
     config, star = tmp_path / "run.toml", tmp_path / "star.fits"
     if content is not None:
         config.write_text(content)
-    assert main(["psf", str(star), "--config", str(config)]) == 2
-    assert words in capsys.readouterr().err
+    assert main(["psf", "-o", str(star), "--config", str(config)]) == 2
+    assert words.format(config=config) in capsys.readouterr().err
     assert not star.exists()
+
+
+def test_checks_of_options_name_the_configuration_that_they_may_come_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "run.toml"
+    config.write_text("[detect]\nthreshold = -3.0\n")
+    arguments = ["detect", "x", "-o", "y", "--opd", "z"]
+    assert main([*arguments, "--config", str(config)]) == 2
+    assert f"options are also taken from {config}" in capsys.readouterr().err
+    assert main([*arguments, "--threshold", "-3"]) == 2
+    assert "taken from" not in capsys.readouterr().err
+
+
+def test_mistakes_of_a_survey_are_in_the_words_of_its_configuration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "survey.toml"
+    config.write_text("[options]\nsize = 2\n[[sequence]]\nfiles = '.'\nopd = 'flat'\n")
+    assert main(["survey", str(config), "-o", str(tmp_path / "out")]) == 1
+    shown = capsys.readouterr().err
+    assert "options: size: got 2" in shown
+    assert "--size" not in shown
+
+
+def test_a_missing_map_is_answered_with_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (
+        ["detect", "x", "-o", "y"],
+        ["reduce", "x", "-o", "y"],
+        ["learn", "x", "-o", "y"],
+    ):
+        assert main(command) == 2
+        shown = capsys.readouterr().err
+        assert "'--opd'" in shown
+        assert "a folder of maps" in shown
+        assert "mast to fetch" in shown
+        assert "flat to start without one" in shown
 
 
 def test_tables_of_a_configuration_are_commands(
@@ -833,7 +875,7 @@ def test_tables_of_a_configuration_are_commands(
 ) -> None:
     config = tmp_path / "run.toml"
     config.write_text("quiet = true\n[fit]\nsize = 20\n")
-    assert main(["--config", str(config), "psf", str(tmp_path / "star.fits")]) == 2
+    assert main(["--config", str(config), "psf", "-o", str(tmp_path / "star.fits")]) == 2
     assert "[fit] is no command" in capsys.readouterr().err
 
 

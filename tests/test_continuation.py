@@ -141,7 +141,7 @@ def test_a_fit_that_fails_is_not_searched() -> None:
     dark = replace(shot(), data=-shot().data)
     fit = dr.refine(model(), dark, before(), settings=settings())
     assert fit.status is Status.DIVERGED
-    with pytest.raises(IncompatibleSetupError, match="the fit failed"):
+    with pytest.raises(IncompatibleSetupError, match="the fit ended as DIVERGED"):
         dr.detect(fit)
 
 

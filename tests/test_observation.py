@@ -388,6 +388,13 @@ def test_frames_of_another_instrument_are_refused_before_a_fit() -> None:
         dr.model_for(frame)
 
 
+def test_a_model_larger_than_the_frames_is_refused_in_terms_of_pixels() -> None:
+    ones = np.ones((32, 40))
+    frame = Observation.from_arrays(ones, ones, pixelscale=0.063, filter="F444W")
+    with pytest.raises(ShapeError, match=r"600 x 600 pixels do not fit into 40 x 32\. Choose a"):
+        dr.model_for(frame, 600)
+
+
 @pytest.mark.parametrize(
     ("name", "mask"),
     [("F250M", "MASKA335R"), ("F356W", "MASKA335R"), ("F444W", "MASKA335R"),

@@ -178,6 +178,8 @@ def test_a_target_that_cannot_be_decided_is_an_error(folder: Path, tmp_path: Pat
         Sequence.from_files(folder, target="VEGA")
     with pytest.raises(IncompatibleSetupError, match=r"Did you mean 'AU MIC'\?"):
         Sequence.from_files(folder, target="AU Microscopii")
+    with pytest.raises(IncompatibleSetupError, match=r"expected one of 'AU MIC', 'HIP1'$"):
+        Sequence.from_files(folder, target="HIP 17695")
     with pytest.raises(IncompatibleSetupError, match=r"filter: got 'F445W'.* mean 'F444W'\?"):
         Sequence.from_files(folder, filter="F445W")
     calints(folder / "g.fits", "HIP2", 20.0, "2022-10-03T08:00:00")

@@ -256,7 +256,9 @@ def test_a_stars_flux_density_is_that_of_its_unocculted_image(tmp_path: Path) ->
     # The posterior's 5 %, doubled, and the 10 % that it does not know of, unless there is a prior.
     for known, share in ((None, math.hypot(0.1, 0.1)), (0.05, math.hypot(0.1, 0.05))):
         opd = dr.random_opd(1, npix=128)
-        fit = SimpleNamespace(frames=[frame], catalogue_error=known, initial=opd)
+        fit = SimpleNamespace(
+            frames=[frame], catalogue_error=known, catalogue_flux=None, initial=opd
+        )
         value, error = cast("tuple[float, float]", Sky.of(cast("Any", [fit]), scatter=2.0).star)
         assert value == pytest.approx(2e7 * scale)
         assert error == pytest.approx(share * value)
@@ -292,7 +294,8 @@ def test_the_epoch_is_the_middle_of_the_exposures(tmp_path: Path) -> None:
     assert first.mid_date is not None
     assert first.mid_date.mjd == REAL["EXPMID"]
     frames = [fitted(first), fitted(later)]
-    fit = SimpleNamespace(frames=frames, catalogue_error=None, initial=dr.random_opd(1, npix=128))
+    opd = dr.random_opd(1, npix=128)
+    fit = SimpleNamespace(frames=frames, catalogue_error=None, catalogue_flux=None, initial=opd)
     fits_ = cast("Any", [fit])
     sky = Sky.of(fits_)
     assert sky.mjd == pytest.approx((REAL["EXPMID"] + 59855 + 16 / 24) / 2, abs=1e-8)

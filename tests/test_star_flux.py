@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from astropy import units as u
@@ -13,7 +14,12 @@ import pyklip_diffrender as dr
 from pyklip_diffrender.detection import measured_planet
 from pyklip_diffrender.errors import IncompatibleSetupError, UnitError
 from pyklip_diffrender.reduction import ReduceOptions, prepare
-from pyklip_diffrender.refinement import Refinement, star_flux_error, with_star_flux
+from pyklip_diffrender.refinement import (
+    Refinement,
+    jansky_per_unit,
+    star_flux_error,
+    with_star_flux,
+)
 from pyklip_diffrender.wavefront import as_opd_map
 
 TRUTH = 3e-5
@@ -108,6 +114,28 @@ def test_a_prior_that_agrees_changes_nothing_but_the_error(fit: Refinement) -> N
     assert now["contrast"] == pytest.approx(TRUTH, rel=4 / now["snr"])
     assert now["contrast_error"] / now["contrast"] == pytest.approx(0.03, rel=0.02)
     assert then["contrast_error"] / then["contrast"] == pytest.approx(0.1, rel=0.02)
+
+
+@pytest.mark.slow
+def test_the_stars_flux_is_the_stated_one_wherever_it_is_shown(
+    fit: Refinement, tmp_path: Path
+) -> None:
+    """Frames that pull at the star, because they determine its flux better than it is held."""
+    before = dr.detect(fit)
+    assert before.sky.star is not None
+    stated = 1.04 * before.sky.star[0]
+    tied = with_star_flux(fit, stated, 0.05)
+    (frame,) = tied.frames
+    scale = jansky_per_unit(frame)
+    assert scale is not None
+    assert scale * frame.flux == pytest.approx(stated, rel=0.005)
+    detection = dr.detect(tied)
+    assert detection.sky.star is not None
+    assert detection.sky.star[0] == stated
+    detection.write(tmp_path)
+    assert fits.getheader(tmp_path / "detection.fits")["DRSTARJY"] == stated
+    again = dr.Refinement.read(tied.write(tmp_path / "fit.fits"))
+    assert (again.catalogue_flux, again.catalogue_error) == (stated, 0.05)
 
 
 def test_frames_without_calibration_are_refused_before_the_fit(fit: Refinement) -> None:

@@ -21,6 +21,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+from astropy import units as u
 from astropy.io import fits
 from astropy.table import QTable, Table
 from survey_stubs import HOSTILE, configuration, inputs, result, stub
@@ -279,6 +280,45 @@ def test_a_sequence_may_have_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 # -- names of jobs ---------------------------------------------------------------------------------
 
 
+def test_folders_say_what_their_jobs_are_and_follow_a_new_name(tmp_path: Path) -> None:
+    config, output = inputs(tmp_path / "a", 1), tmp_path / "out"
+    config["sequence"][0] |= {"name": "β Pic, F444W"}
+    config["injections"] = {"contrasts": [1e-5], "separations": [0.5]}
+    jobs = planned(config)
+    assert [job.folder for job in jobs] == [
+        f"Pic-F444W_{jobs[0].key[:12]}",
+        f"Pic-F444W-planet-of-1e-05-at-0.5-arcsec-0-deg_{jobs[1].key[:12]}",
+    ]
+    assert jobs[1].base_folder == jobs[0].folder
+    ran = []
+
+    def work(job: Job, folder: Path) -> dict[str, Any]:
+        ran.append(job.folder)
+        return stub(job, folder)
+
+    run_survey(config, output, work)
+    config["sequence"][0] |= {"name": "another"}
+    table = run_survey(config, output, work)
+    assert len(ran) == 2
+    names = sorted(path.name for path in (output / "jobs").iterdir())
+    assert names == sorted(table["folder"]) == sorted(job.folder for job in planned(config))
+    page = (output / "survey.html").read_text()
+    assert "<title>Survey of another</title>" in page
+    assert f'"jobs/{names[0]}/report.html"' in page
+
+
+def test_tables_have_units_and_descriptions(tmp_path: Path) -> None:
+    run_survey(inputs(tmp_path / "a", 1), tmp_path / "out", stub)
+    table = Table.read(tmp_path / "out/results.ecsv")
+    for name in ("separation_arcsec", "injected_separation_arcsec"):
+        assert table[name].unit == u.arcsec
+    assert table["position_angle_deg"].unit == table["injected_angle_deg"].unit == u.deg
+    assert (table["seconds"].unit, table["peak_memory_bytes"].unit) == (u.s, u.byte)
+    # Limits are contrasts.
+    assert all(table[name].unit is None for name in table.colnames if name.startswith("limit"))
+    assert "0.5 arcsec" in table["limit_0.5_arcsec"].description
+
+
 def test_the_name_of_a_job_follows_from_content_and_options_alone(tmp_path: Path) -> None:
     config = inputs(tmp_path / "a", 1)
     (job,) = planned(config)
@@ -317,7 +357,7 @@ def test_finished_jobs_are_not_run_again(tmp_path: Path) -> None:
     assert len(ran) == 3
     # One input has changed, one product is damaged: these two are missing.
     Path(config["sequence"][1]["files"]).write_bytes(b"new frames")
-    (output / "jobs" / table["key"][2] / "report.html").write_text("cut")
+    (output / "jobs" / table["folder"][2] / "report.html").write_text("cut")
     run_survey(config, output, work)
     assert ran[3:] == ["star1_calints", "star2_calints"]
     # The job of the old content stays.
@@ -344,7 +384,7 @@ def test_a_failure_is_a_row_and_is_tried_again(tmp_path: Path) -> None:
     # ECSV drops the blanks at the start of a line.
     read = Table.read(output / "results.ecsv")["traceback"]
     assert [read[k].split() for k in (2, 3)] == [table["traceback"][k].split() for k in (2, 3)]
-    folder = output / "jobs" / table["key"][2]
+    folder = output / "jobs" / table["folder"][2]
     assert [path.name for path in folder.iterdir()] == ["job.json"]
     assert json.loads((folder / "job.json").read_text())["status"] == "failed"
     assert "at the second star" in (output / "survey.html").read_text()
@@ -359,7 +399,7 @@ def test_an_injection_starts_from_the_finished_reduction(tmp_path: Path) -> None
 
     def work(job: Job, folder: Path) -> dict[str, Any]:
         if job.injection:
-            assert (folder.parent / str(job.base) / "report.html").exists()
+            assert (folder.parent / str(job.base_folder) / "report.html").exists()
         return stub(job, folder)
 
     table = run_survey(config, tmp_path / "out", work)
@@ -372,16 +412,18 @@ def test_an_injection_starts_from_the_finished_reduction(tmp_path: Path) -> None
 def test_what_another_survey_published_meanwhile_stays(tmp_path: Path) -> None:
     (job,) = planned(inputs(tmp_path / "data", 1))
     jobs = folders.prepare(tmp_path / "out")
+    # In a folder of the same name, because its inputs are the same.
+    rival = replace(job, opd="rival")
 
     def work(inner: Job, folder: Path) -> dict[str, Any]:
-        if inner.name != "rival":
-            assert runs.run_job(replace(job, name="rival"), jobs, work)["status"] == "finished"
+        if inner.opd != "rival":
+            assert runs.run_job(rival, jobs, work)["status"] == "finished"
         return stub(inner, folder)
 
     assert runs.run_job(job, jobs, work)["status"] == "finished"
-    record = folders.read_record(jobs / job.key)
+    record = folders.read_record(jobs / job.folder)
     assert record is not None
-    assert record["job"]["name"] == "rival"
+    assert record["job"]["opd"] == "rival"
     assert hidden(tmp_path / "out") == []
 
 
@@ -444,8 +486,8 @@ def test_a_message_in_another_encoding_stops_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"products": {}}', '{"products": 3}'])
 def test_a_damaged_record_is_a_missing_job(tmp_path: Path, damage: str) -> None:
     config, output = inputs(tmp_path / "data", 1), tmp_path / "out"
-    (key,) = run_survey(config, output, stub)["key"]
-    record = output / "jobs" / key / "job.json"
+    (name,) = run_survey(config, output, stub)["folder"]
+    record = output / "jobs" / name / "job.json"
     whole = json.loads(record.read_text())
     record.write_text(damage)
     assert list(run_survey(config, output, stub)["status"]) == ["finished"]
@@ -559,7 +601,7 @@ def test_a_survey_of_many_stars_has_one_picture(tmp_path: Path) -> None:
     (job,) = planned(inputs(tmp_path / "data", 1))
     record = {"status": "finished", "result": result(), "seconds": 1.0}
     rows = [(replace(job, name=f"star {k}"), record) for k in range(12)]
-    text = survey_page.page([*rows, (job, None)], "survey")
+    text = survey_page.page([*rows, (job, None)])
     assert "12 of 13 jobs finished, 1 not finished yet" in text
     assert "12 sequences reduced, 12 companion candidates in 12 of them." in text
 
@@ -862,7 +904,10 @@ def test_files_with_and_without_a_planet(tmp_path: Path) -> None:
     assert planet["recovered_snr"] > 10
     away = abs(planet["recovered_contrast"] - planet["injected_contrast"])
     assert away < 3 * planet["recovered_error"]
-    for key, has_fit in zip(table["key"], (True, False), strict=True):
-        products = {path.name for path in (tmp_path / "products" / "jobs" / key).iterdir()}
+    # The sequence has no name in the configuration.
+    assert list(table["name"]) == ["HD 1 F444W"] * 2
+    for name, has_fit in zip(table["folder"], (True, False), strict=True):
+        assert name.startswith("HD-1-F444W")
+        products = {path.name for path in (tmp_path / "products" / "jobs" / name).iterdir()}
         assert {"detection.fits", "candidates.ecsv", "report.html"} <= products
         assert ("fit.fits" in products) == has_fit

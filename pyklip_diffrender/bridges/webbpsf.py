@@ -24,6 +24,7 @@ from pyklip_diffrender.bridges.stpsf_instrument import (
     with_effects,
 )
 from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.io.keywords import set_keyword
 from pyklip_diffrender.io.units import to_metres, to_number
 from pyklip_diffrender.optics.bandpass import Bandpass
 from pyklip_diffrender.optics.grid import resample
@@ -142,7 +143,7 @@ class WebbSystem(PoppySystem):
             instrument._calc_psf_format_output(result, options)
         if system.si_wfe_flipped is not None:
             for hdu in result:
-                hdu.header["DRSIFLIP"] = (system.si_wfe_flipped, "SI WFE map flipped vertically")
+                set_keyword(hdu.header, "DRSIFLIP", system.si_wfe_flipped)
         save(result, outfile, overwrite)
         if return_intermediates:
             return result, intermediate_wavefronts(

@@ -82,7 +82,7 @@ def demo(
         "Throughput: fraction of the planet's light that is kept;\nit says nothing where much of "
         "the star remains, as with the initial map. Star error: rms\nresidual of the star in that "
         "annulus, in units of the noise.\n"
-        f"Refinement: {result.fit.status.message}.\n\n"
+        f"Refinement: {result.fit.status}.\n\n"
         "Point sources with the wavefront marginalised, which loses none of the planet:"
     )
     for row in result.detection.candidates:
@@ -222,11 +222,10 @@ def detect_in_file(
     cls=Command,
     epilog="""\b
 Examples:
-  pyklip-diffrender psf star.fits --filter F356W --offset 0.02 0
-  pyklip-diffrender psf star.fits --filter F460M --mask MASKLWB
-  pyklip-diffrender psf star.fits --monochromatic 4.5e-6 --opd map.fits""",
+  pyklip-diffrender psf --filter F356W --offset 0.02 0 -o star.fits
+  pyklip-diffrender psf --filter F460M --mask MASKLWB -o star.fits
+  pyklip-diffrender psf --monochromatic 4.5e-6 --opd map.fits -o star.fits""",
 )
-@click.argument("output", type=file_type())
 @option("--filter", default="F444W", show_default=True, metavar="NAME", help="Filter of NIRCam.")
 @option("--mask", default="MASK335R", show_default=True, metavar="NAME",
         help="Coronagraph mask of NIRCam.")  # fmt: skip
@@ -237,7 +236,7 @@ Examples:
         help="Side of the image, pixels.")  # fmt: skip
 @option("--offset", type=float, nargs=2, default=(0.0, 0.0), show_default=True,
         metavar="X Y", help="Star from the occulter's centre, arcsec.")  # fmt: skip
-@outputs(folder=False)
+@outputs(file="The FITS file to write.")
 @click.pass_obj
 def psf(
     run: Run,
@@ -250,10 +249,7 @@ def psf(
     offset: tuple[float, float],
     overwrite: bool,
 ) -> None:
-    """Write the image of a star behind the coronagraph.
-
-    OUTPUT is the FITS file to write.
-    """
+    """Write the image of a star behind the coronagraph."""
     run.claim_file(output, overwrite)
     import numpy as np
     from astropy.io import fits
@@ -310,6 +306,7 @@ def survey(run: Run, /, file: Path, output: Path, scheduler: str | None) -> int:
     """
     from pyklip_diffrender.cli.survey import run as run_survey
 
+    run.configured = True
     return run_survey(file, output, scheduler, progress=run.progress)
 
 

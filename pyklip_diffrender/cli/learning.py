@@ -64,16 +64,7 @@ Examples:
     section="Fit",
     help="Side of the fitted square about the star, pixels.",
 )
-@option(
-    "-o",
-    "--output",
-    type=file_type(),
-    metavar="FILE",
-    required=True,
-    section="Output",
-    help="FITS file for the library; finished fits are kept in a folder beside it.",
-)
-@outputs(folder=False)
+@outputs(file="FITS file for the library; finished fits are kept in a folder beside it.")
 @click.pass_obj
 def learn(
     run: Run,

@@ -15,6 +15,7 @@ import click
 
 from pyklip_diffrender.cli.estimate import describe_plan, size_of_products, steps_of
 from pyklip_diffrender.cli.session import Run, with_options
+from pyklip_diffrender.cli.shared_options import config_remark
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument.star_flux import star_flux_density
 from pyklip_diffrender.io.opd_map import OPDMap
@@ -73,7 +74,7 @@ def run_reduction(
         accuracy: Literal["full", "quick"] = "quick" if quick else "full"
         checked = ReduceOptions(device=run.device, accuracy=accuracy, **options)
     except DiffrenderError as error:
-        raise click.UsageError(with_options(str(error))) from error
+        raise click.UsageError(with_options(str(error)) + config_remark()) from error
     run.claim_folder(output, (*PRODUCTS, *COMPARISON), overwrite or resume)
     # Libraries may print, too.
     with redirect_stdout(sys.stderr) if json else nullcontext():
@@ -127,7 +128,9 @@ def run_reduction(
                 click.echo(f"wrote {folder / 'report.html'} and {len(written) - 1} more files")
             summary = loads((folder / "summary.json").read_text(encoding="utf-8"))
             summaries[folder.name] = summary
-            click.echo(f"\n{summary['sentence']}\n{with_options(summary['status']['advice'])}")
+            status = summary["status"]
+            click.echo(f"\n{summary['sentence']}\n{status['name']}: {status['message']}.")
+            click.echo(with_options(status["advice"]))
         if overwrite:
             _remove_others(output, folders)
         if several:

@@ -64,13 +64,19 @@ def with_options(message: str) -> str:
 class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
     """Messages on standard error that do not break a progress bar."""
 
+    def __init__(self, run: Run) -> None:
+        super().__init__()
+        self.run = run
+
     def emit(self, record: logging.LogRecord) -> None:
         from tqdm import tqdm
 
         tqdm.write(self.format(record), file=sys.stderr)
 
     def format(self, record: logging.LogRecord) -> str:
-        message = with_options(record.getMessage())
+        message = record.getMessage()
+        if not self.run.configured:
+            message = with_options(message)
         if record.levelno < logging.WARNING:
             return message
         warning = "warning: " if record.levelno == logging.WARNING else ""
@@ -79,10 +85,22 @@ class _OnTerminal(logging.StreamHandler):  # type: ignore[type-arg]
 
 @dataclass
 class Run:
-    """One run of a command."""
+    """One run of a command.
+
+    Attributes
+    ----------
+    progress : bool
+        Whether to show progress bars.
+    device : str
+        PyTorch device.
+    configured : bool
+        Whether names in messages are keys of a configuration file, as those of surveys, and no
+        options of the command line.
+    """
 
     progress: bool = False
     device: str = "cpu"
+    configured: bool = False
     _output: Path | None = None
     _before: dict[Path, int] = field(default_factory=dict)
     _handlers: list[logging.Handler] = field(default_factory=list)
@@ -113,7 +131,7 @@ class Run:
         self, *, verbose: bool, quiet: bool, log_file: Path | None, device: str, threads: int | None
     ) -> None:
         """Take what the options of all commands say."""
-        on_terminal = _OnTerminal()
+        on_terminal = _OnTerminal(self)
         # Away from a terminal a bar is noise: the stages and a line a minute take its place.
         is_terminal = sys.stderr.isatty()
         self.progress = is_terminal and not quiet
@@ -165,9 +183,11 @@ class Run:
         IncompatibleSetupError
         """
         if not path.absolute().parent.is_dir():
-            raise IncompatibleSetupError(f"OUTPUT: there is no folder {path.parent} to write into")
+            raise IncompatibleSetupError(
+                f"--output: there is no folder {path.parent} to write into"
+            )
         if path.is_dir():
-            raise IncompatibleSetupError(f"OUTPUT: {path} is a folder, expected a file")
+            raise IncompatibleSetupError(f"--output: {path} is a folder, expected a file")
         self._claim(path, path.absolute().parent, [path], overwrite)
 
     def _claim(self, output: Path, folder: Path, products: list[Path], overwrite: bool) -> None:

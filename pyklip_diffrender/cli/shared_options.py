@@ -17,6 +17,7 @@ __all__ = [
     "Command",
     "archive",
     "common",
+    "config_remark",
     "file_type",
     "option",
     "outputs",
@@ -58,8 +59,29 @@ def file_type(**settings: Any) -> click.Path:
     return click.Path(path_type=Path, **settings)
 
 
+_CONFIG = f"{__name__}.config"
+"""Key of the file of --config in the contexts of a run."""
+
+
+def config_remark() -> str:
+    """Sentence about the file that options may come from, to end a message about one of them."""
+    path = click.get_current_context().meta.get(_CONFIG)
+    return "" if path is None else f" (options are also taken from {path})"
+
+
+class _Wavefront(click.types.StringParamType):
+    """Name of a wavefront map, or a word in place of it; says what there is if it is missing."""
+
+    def get_missing_message(self, param: click.Parameter, ctx: click.Context | None) -> str:
+        return (
+            "Name the FITS file of a wavefront map or a folder of maps, say mast to fetch the map "
+            "of the date, or flat to start without one (contrasts are then uncertain by 40 %)."
+        )
+
+
 def _config_callback(ctx: click.Context, _: click.Parameter, path: Path | None) -> None:
     if path is not None:
+        ctx.meta[_CONFIG] = path
         ctx.default_map = {**(ctx.default_map or {}), **read_config(ctx.command, path)}
 
 
@@ -136,6 +158,16 @@ def _as_toml(value: Any) -> Any:
 class Command(click.Command):
     """A command with help by section, whose general options may also stand before it."""
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the options; messages about values of a configuration file name it."""
+        try:
+            return super().parse_args(ctx, args)
+        except click.BadParameter as error:
+            name = "" if error.param is None else error.param.name or ""
+            if ctx.get_parameter_source(name) is ParameterSource.DEFAULT_MAP:
+                error.param_hint = f"{name.replace('_', '-')!r} in {ctx.meta.get(_CONFIG)}"
+            raise
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections of the options."""
         sections: dict[str, list[tuple[str, str]]] = {}
@@ -196,16 +228,18 @@ _OVERWRITE = option(
 )  # fmt: skip
 
 
-def outputs(default: str | None = None, *, folder: bool = True) -> Decorator:
-    """Where to write, and what to do about what is there."""
+def outputs(default: str | None = None, *, file: str | None = None) -> Decorator:
+    """Where to write, a folder or the file that is described, and what to do if it is there."""
     needed: dict[str, Any] = {"required": True}
     if default is not None:
         needed = {"default": Path(default), "show_default": True}
+    kind, help_ = "FOLDER", "Folder for the products; made if it does not exist."
+    if file is not None:
+        kind, help_ = "FILE", file
     output = option(
-        "-o", "--output", type=file_type(), metavar="FOLDER", section="Output",
-        help="Folder for the products; made if it does not exist.", **needed,
-    )  # fmt: skip
-    return _all(*([output] if folder else []), _OVERWRITE, common, _WRITE_CONFIG)
+        "-o", "--output", type=file_type(), metavar=kind, section="Output", help=help_, **needed
+    )
+    return _all(output, _OVERWRITE, common, _WRITE_CONFIG)
 
 
 archive = _all(
@@ -225,7 +259,8 @@ def require_frames(frames: Sequence[Path], program: int | None) -> None:
 
 
 wavefront = _all(
-    option("--opd", required=True, metavar="FILE|FOLDER|flat|mast", section="Wavefront map",
+    option("--opd", required=True, type=_Wavefront(), metavar="FILE|FOLDER|flat|mast",
+           section="Wavefront map",
            help="Wavefront map to start from: a FITS file; a folder of maps, of which one is "
            "chosen by its date; mast for the maps of MAST, through stpsf; or flat, with which a "
            "fit takes longer and contrasts are uncertain by 40 % unless --star-flux is given."),

@@ -76,6 +76,9 @@ class DemoResult:
     table: Table
     detection: Detection
 
+    def __repr__(self) -> str:
+        return f"<DemoResult: {self.fit!r}, {self.detection!r}>"
+
 
 def simulate_references(model: OpticalSystem, opd: Image, *, seed: int) -> Image:
     """Nine dithered frames of the reference star, unscaled, (9, ny, nx) photons."""

@@ -8,6 +8,7 @@ is unbiased, and its error includes the uncertainty of the wavefront.
 
 from __future__ import annotations
 
+from pyklip_diffrender.detection import metrics
 from pyklip_diffrender.detection.candidates import Candidates
 from pyklip_diffrender.detection.combination import combine_frames
 from pyklip_diffrender.detection.detection_file import image_hdu
@@ -37,6 +38,7 @@ __all__ = [
     "image_hdu",
     "measure",
     "measured_planet",
+    "metrics",
     "recover_planets",
     "require_outer_pixels",
     "sources_of_references",

@@ -22,6 +22,7 @@ from pyklip_diffrender.detection.groups import Group, groups_of
 from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import require_new, write_fits, write_table
+from pyklip_diffrender.io.keywords import fits_unit
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.refinement.fit_file import (
     image,
@@ -72,7 +73,7 @@ def _wcs_of(hdus: fits.HDUList, name: str, frame: int) -> fits.Header:
 
 def _hdus_of(detection: Any) -> fits.HDUList:
     """The FITS extensions of a `Detection`, which it reads again."""
-    unit = detection.observation.unit.to_string("fits")
+    unit = fits_unit(detection.observation.unit)
     about, data = observation_hdus(detection.observation, 0)
     wcs = world_coordinates(detection.grid, detection.observation)
     for hdu in data:
@@ -214,7 +215,7 @@ def digest(fit: Refinement) -> str:
 def provenance_of(detection: Any) -> dict[str, object]:
     """Facts about the fits and the search of a `Detection`, by name."""
     return {
-        "software": f"pyklip_diffrender {__version__}",
+        "software": __version__,
         "observations": [f.observation.name for fit in detection.fits for f in fit.frames],
         **detection.fits[0].summary(),
         "scatter": detection.scatter,

@@ -20,6 +20,7 @@ from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.errors import CorruptFileError
 from pyklip_diffrender.io.files import open_fits, require_new, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
+from pyklip_diffrender.io.keywords import fits_unit
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
@@ -166,7 +167,7 @@ class Disk:
         path = Path(folder) / "disk.fits"
         require_new([path], overwrite)
         first = self.fit.frames[0].observation
-        unit, wcs = first.unit.to_string("fits"), world_coordinates(self.grid, first)
+        unit, wcs = fits_unit(first.unit), world_coordinates(self.grid, first)
         shown = [each for each in self.fit.frames if not each.observation.reference]
         frames = [each.wcs for each in shown]
         sources = fits.BinTableHDU(self.table, name="SOURCES")

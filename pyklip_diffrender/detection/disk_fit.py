@@ -103,7 +103,7 @@ def fit_disk(fit: Refinement, *, inner: float = 0.25, progress: bool = False) ->
     inner = float(to_arcsec(inner, "inner"))
     require_positive(inner=inner)
     if not fit.status.usable:
-        raise IncompatibleSetupError(f"fit_disk: the fit {fit.status.message}")
+        raise IncompatibleSetupError(f"fit_disk: the fit ended as {fit.status}")
     if has_only_reference_stars(fit):
         raise IncompatibleSetupError(
             "fit_disk: expected frames of the target, got a reference star"

@@ -386,7 +386,7 @@ def _checked(fits: Fits) -> list[Refinement]:
         raise IncompatibleSetupError("detect: got no fit, expected a Refinement")
     for fit in refinements:
         if not fit.status.usable:
-            raise IncompatibleSetupError(f"detect: the fit {fit.status.message}")
+            raise IncompatibleSetupError(f"detect: the fit ended as {fit.status}")
     return refinements
 
 

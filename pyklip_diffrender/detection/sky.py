@@ -27,9 +27,9 @@ class Sky:
     mjd : float or None
         Mean of the target's mid-exposures, UTC; None if no frame has a date.
     star : (float, float) or None
-        Flux density of the star and its standard deviation, Jy; None where the frames have no
-        photometric calibration. The error is that of the diffracted light or of the catalogue,
-        without that of the calibration.
+        Flux density of the star, as a catalogue states it or else as fitted, and its standard
+        deviation, Jy; None where the frames have no photometric calibration. The error is that of
+        the diffracted light or of the catalogue, without that of the calibration.
     """
 
     north: float | None = None
@@ -54,7 +54,10 @@ class Sky:
             flux = np.mean(scales * [frame.flux for frame in frames])
             error = scatter * np.mean(scales * [frame.errors["flux"][0] for frame in frames])
             untied = np.mean([star_flux_error(fit) for fit in fits])
-            star = (float(flux), float(np.hypot(error, untied * flux)))
+            # As the catalogue states it, because the star follows within a fraction of its error.
+            stated = [each for fit in fits if (each := fit.catalogue_flux) is not None]
+            value = np.mean(stated) if len(stated) == len(fits) else flux
+            star = (float(value), float(np.hypot(error, untied * flux)))
         return cls(
             first.north,
             float(np.mean(known)) if known else None,

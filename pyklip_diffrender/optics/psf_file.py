@@ -18,6 +18,7 @@ from torch import Tensor
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import IncompatibleSetupError
 from pyklip_diffrender.io.files import require_new, write_fits
+from pyklip_diffrender.io.keywords import set_keyword
 from pyklip_diffrender.optics.propagation import Propagation
 
 __all__ = ["instrument_psf", "poppy_psf", "save"]
@@ -107,9 +108,9 @@ def _header(system: Propagation, normalize: str, header: fits.Header) -> None:
         header[f"WGHT{k}"] = (weight, f"Wavelength weight {k}")
     header["FFTTYPE"] = ("matrix Fourier", "Algorithm for FFTs: numpy or fftw")
     header["NORMALIZ"] = (normalize, "PSF normalization method")
-    header["DRVERS"] = (__version__, "pyklip_diffrender version")
-    header["DRPROP"] = (_propagations(system), "Propagation through image planes")
-    header["DRPREC"] = (str(entrance.dtype).removeprefix("torch."), "Floating point precision")
+    set_keyword(header, "DRVERS", __version__)
+    set_keyword(header, "DRPROP", _propagations(system))
+    set_keyword(header, "DRPREC", str(entrance.dtype).removeprefix("torch."))
     header.add_history(f"Created by pyklip_diffrender {__version__}")
 
 

@@ -275,7 +275,7 @@ def _attempt(epoch: _Epoch, known: Systematics | None, fitter: _Fitter) -> _Fit 
         _log.warning("%s is left out: %s", epoch, error)
         return None
     if not fit[0].status.usable:
-        _log.warning("%s is left out: %s", epoch, fit[0].status.message)
+        _log.warning("%s is left out: %s", epoch, fit[0].status)
         return None
     return fit
 

@@ -83,6 +83,9 @@ class Frames:
     references: tuple[Observation, ...] = ()
     factor: NDArray[np.float64] = field(default_factory=lambda: np.ones(1))
 
+    def __repr__(self) -> str:
+        return f"<Frames: {self.observation!r}, {len(self.pointings)} pointings>"
+
 
 def observation_from_dataset(dataset: Any, wavelength: float | None = None) -> Observation:
     """Make an `Observation` of the frames of a pyKLIP dataset.

@@ -50,6 +50,9 @@ class FittedPointing:
     window: Window
     away: Image
 
+    def __repr__(self) -> str:
+        return f"<FittedPointing: {self.pointing!r}, {self.result!r}>"
+
     @property
     def frame(self) -> FrameFit:
         """The star in the frames of the pointing."""

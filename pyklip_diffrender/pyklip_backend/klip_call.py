@@ -27,6 +27,7 @@ from pyklip_diffrender.errors import (
     ShapeError,
 )
 from pyklip_diffrender.io.headers import fits_text
+from pyklip_diffrender.io.keywords import set_keyword
 from pyklip_diffrender.pyklip_backend.admitted import library_files
 from pyklip_diffrender.pyklip_backend.backend_settings import (
     DiffrenderSettings,
@@ -288,13 +289,14 @@ class DatasetReduction:
         if not linear or len(results) != len(self.records):
             return
         self._tell("throughput of faint sources")
-        cards["DRTHRU"] = write_throughput(
+        median = write_throughput(
             stage / f"{prefix}-throughput.fits",
             self.dataset,
             list(map(self._throughput, self.records, results)),
             [result.frames[0].observation for result in results],
             is_turned=not self.arguments["skip_derot"],
         )
+        set_keyword(cards, "DRTHRU", median)
 
     def _throughput(self, record: ReductionRecord, result: Any) -> NDArray[np.float64]:
         """Fraction of a faint source's peak that the products have, on the first frame's pixels."""

@@ -18,6 +18,7 @@ from astropy.time import Time
 
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.io.headers import fits_text
+from pyklip_diffrender.io.keywords import set_keyword
 from pyklip_diffrender.pyklip_backend.dataset_frames import Frames
 from pyklip_diffrender.pyklip_backend.product_images import ProductImages
 from pyklip_diffrender.pyklip_backend.subtract import Subtraction
@@ -49,6 +50,13 @@ class ReductionRecord:
     subtraction: Subtraction
     filled: int
     image: str = "subtracted"
+
+    def __repr__(self) -> str:
+        filter_ = self.frames.observation.filter or "given model"
+        return (
+            f"<ReductionRecord: {filter_}, {self.subtraction!r}, image {self.image!r}, map "
+            f"{self.opd.name}>"
+        )
 
     @cached_property
     def images(self) -> ProductImages:
@@ -118,49 +126,32 @@ def provenance(records: Sequence[ReductionRecord]) -> fits.Header:
     first = records[0]
     companions = max(record.subtraction.kept for record in records)
     header = fits.Header()
-    values: list[tuple[str, Any, str]] = [
-        ("DRALGO", "diffrender", "star subtraction algorithm"),
-        ("DRVERS", __version__, "pyklip_diffrender version"),
-        ("DROPD", first.opd.name, "wavefront map at the start"),
-        # 64 digits leave no room for a comment on the card.
-        ("DRSHA256", first.opd.sha256, ""),
-        (
-            "DRFILT",
-            _shared(r.frames.observation.filter or "" for r in records),
-            "filter of the model",
-        ),
-        ("DRSTAT", worst.status, "how the refinement ended"),
-        ("DRCHI2", _number(worst.chi2), "chi2 per fitted pixel"),
-        ("DRNFIT", len(fits_of_all), "number of refinements"),
-        ("DRKEPT", companions, "companions whose light is not in the star"),
-        (
-            "DRSYST",
-            _shared(r.subtraction.systematics for r in records),
-            "flat-field pattern",
-        ),
-        (
-            "DRREFS",
-            sum(r.subtraction.references for r in records),
-            "reference frames that were used",
-        ),
-        ("DRPIXELS", _shared(r.frames.pixels for r in records), "pixels that were fitted"),
-        ("DRFILLED", sum(r.filled for r in records), "flagged pixels replaced by neighbours"),
-        ("DRIMAGE", _shared(r.image for r in records), "image in the products"),
-        ("DRNOISE", _shared(r.frames.noise for r in records), "where the errors came from"),
-    ]
+    values: dict[str, Any] = {
+        "DRALGO": "diffrender",
+        "DRVERS": __version__,
+        "DROPD": first.opd.name,
+        "DRSHA256": first.opd.sha256,
+        "DRFILT": _shared(r.frames.observation.filter or "" for r in records),
+        "DRSTAT": worst.status,
+        "DRCHI2": worst.chi2,
+        "DRNFIT": len(fits_of_all),
+        "DRKEPT": companions,
+        "DRSYST": _shared(r.subtraction.systematics for r in records),
+        "DRREFS": sum(r.subtraction.references for r in records),
+        "DRPIXELS": _shared(r.frames.pixels for r in records),
+        "DRFILLED": sum(r.filled for r in records),
+        "DRIMAGE": _shared(r.image for r in records),
+        "DRNOISE": _shared(r.frames.noise for r in records),
+    }
     dates = [pointing.observation.date for pointing in first.frames.pointings]
     known = [date for date in dates if date is not None]
     days = first.opd.days_after(Time(known).mean()) if known else None
     if first.opd.date is not None:
-        values += [
-            ("DROPDNAM", first.opd.name, "wavefront map"),
-            ("DROPDDAT", first.opd.date.isot, "date of the wavefront map"),
-        ]
+        values["DROPDDAT"] = first.opd.date.isot
     if days is not None:
-        values.append(("DROPDHRS", 24 * days, "[h] from the frames to the map"))
-    for key, value, comment in values:
-        value = fits_text(value) if isinstance(value, str) else value
-        header[key] = (value, comment) if comment else value
+        values["DROPDHRS"] = 24 * days
+    for key, value in values.items():
+        set_keyword(header, key, value)
     header.add_history(
         f"Star rendered and subtracted by pyklip_diffrender {__version__}; the "
         "KL modes are all the same image"
@@ -209,8 +200,3 @@ def stamp(folder: Path, cards: fits.Header) -> None:
 
 def _shared(values: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(values))
-
-
-def _number(value: float) -> float | str:
-    """FITS has no NaN in headers."""
-    return value if abs(value) < float("inf") else str(value)

@@ -14,6 +14,7 @@ import numpy as np
 from astropy.io import fits
 
 from pyklip_diffrender.io.geometry import rotation_matrix
+from pyklip_diffrender.io.keywords import set_keyword
 from pyklip_diffrender.pyklip_backend.fitted_pointing import FittedPointing
 
 if TYPE_CHECKING:
@@ -92,15 +93,11 @@ def planet_cards(
     place = turn @ (planet.offset + pixels @ moved)
     jacobian = turn @ pixels
     deviations = factor * np.sqrt(np.diag(jacobian @ covariance[1:, 1:] @ jacobian.T))
-    cards["DRFMFLUX"] = (flux, "fitted flux over that of the forward model")
-    cards["DRFMFERR"] = (
-        float(np.hypot(error / planet.contrast, flux * calibration)),
-        "standard deviation of DRFMFLUX",
-    )
-    cards["DRFMFACT"] = (factor, "included factor for errors that are too small")
-    for axis, name, value, deviation in zip(
-        ("RA", "DE"), ("east", "north"), place, deviations, strict=True
-    ):
-        cards[f"DRFM{axis}"] = (float(value), f"[pixel] fitted position {name} of the star")
-        cards[f"DRFM{axis}ER"] = (float(deviation), f"[pixel] standard deviation of DRFM{axis}")
+    set_keyword(cards, "DRFMFLUX", flux)
+    flux_error = float(np.hypot(error / planet.contrast, flux * calibration))
+    set_keyword(cards, "DRFMFERR", flux_error)
+    set_keyword(cards, "DRFMFACT", factor)
+    for axis, value, deviation in zip(("RA", "DE"), place, deviations, strict=True):
+        set_keyword(cards, f"DRFM{axis}", float(value))
+        set_keyword(cards, f"DRFM{axis}ER", float(deviation))
     return cards

@@ -47,6 +47,9 @@ class Pointing:
     frames: NDArray[np.intp]
     observation: Observation
 
+    def __repr__(self) -> str:
+        return f"<Pointing: frames {', '.join(map(str, self.frames))} of {self.observation.name!r}>"
+
 
 def part_of(observation: Observation, which: NDArray[np.intp] | NDArray[np.bool_]) -> Observation:
     """Some frames of an observation, chosen by an index array or a mask."""

@@ -70,7 +70,7 @@ class Subtraction:
     fits : tuple of Fit
         At least one; together they cover all frames.
     systematics : str
-        Origin of the flat-field pattern that was used, see `PatternChoice.label`.
+        Name of the flat-field pattern that was used.
     references : int
         Number of frames of reference stars that were used.
     pointings : tuple of FittedPointing
@@ -88,6 +88,13 @@ class Subtraction:
     pointings: tuple[FittedPointing, ...] = ()
     reduction: Reduction | None = None
     kept: int = 0
+
+    def __repr__(self) -> str:
+        fits = "; ".join(f"{fit.status}, chi2/pixel {fit.chi2:.3g}" for fit in self.fits)
+        return (
+            f"<Subtraction: {_counted(len(self.star), 'frame')}, {fits}, flat-field pattern "
+            f"{self.systematics}>"
+        )
 
     @property
     def worst(self) -> Fit:
@@ -200,8 +207,8 @@ def subtract_by_refinement(
     frames = np.sort(np.concatenate([group.frames for group in groups]))
     return Subtraction(
         star,
-        (Fit(tuple(map(int, frames)), fit.status.name.lower(), float(fit.chi2_per_pixel), fit),),
-        reduction.pattern,
+        (Fit(tuple(map(int, frames)), fit.status.name, float(fit.chi2_per_pixel), fit),),
+        "none" if reduction.systematics is None else reduction.systematics.name,
         reduction.reference_frames,
         fitted,
         reduction,
@@ -277,7 +284,7 @@ def _requested_pattern(
 
 def _described(result: Refinement) -> str:
     """How a fit ended, in a few words."""
-    return f"{result.status.name.lower()}, chi2 per pixel {result.chi2_per_pixel:.3g}"
+    return f"{result.status.name}, chi2 per pixel {result.chi2_per_pixel:.3g}"
 
 
 def _counted(number: int, noun: str) -> str:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
 
+from pyklip_diffrender.io.keywords import set_keyword
 from pyklip_diffrender.scene.observation import Observation
 
 if TYPE_CHECKING:
@@ -167,7 +168,7 @@ def write_throughput(
     frames: Sequence[Observation],
     *,
     is_turned: bool,
-) -> tuple[float, str]:
+) -> float:
     """Write maps of the throughput, on the pixels of the products, to a FITS file.
 
     Parameters
@@ -185,8 +186,7 @@ def write_throughput(
     Returns
     -------
     median : float
-    comment : str
-        For the headers of all products.
+        Over the fitted pixels.
     """
     turned = []
     center = np.asarray(dataset.output_centers[0], dtype=float)
@@ -204,7 +204,7 @@ def write_throughput(
     hdu.header["BUNIT"] = ("", "fraction of a faint point source's peak")
     hdu.header["PSFCENTX"], hdu.header["PSFCENTY"] = center
     hdu.header["STARCENX"], hdu.header["STARCENY"] = center[0] + 1, center[1] + 1
-    hdu.header["DRTHSTEP"] = (SPACING, "pixels between computed positions")
+    set_keyword(hdu.header, "DRTHSTEP", SPACING)
     hdu.header.add_comment(
         "Fraction of a faint point source's peak that the subtraction leaves, to first order in "
         "its light, before any high-pass filter. Computed at every DRTHSTEP pixels and next to "
@@ -212,4 +212,4 @@ def write_throughput(
         "Detected companions that are in the model (DRKEPT) keep their light."
     )
     hdu.writeto(path)
-    return median, "median throughput of faint sources"
+    return median

@@ -36,9 +36,9 @@ class ReduceOptions:
         search besides the package's, its file, or a folder of such files. "auto" takes the pattern
         of the package's library (see `known_systematics`), and fits the reference stars only where
         there is none for these pixels; "references" fits them in any case and uses both. A fit that
-        shows less than half of a library's pattern is repeated without libraries. Where nothing is
-        known, rolls of the same pixels share a pattern of which only the size is known. With "off"
-        there is no pattern.
+        shows less than half of a library's pattern is repeated without libraries. If neither has
+        the pattern, rolls on the same pixels are assumed to have one of the usual strength in
+        common. With "off" there is no pattern.
     references : {"joint", "pattern", "off"}
         What the frames of reference stars are for. With "joint" they are fitted together with the
         target's, in one likelihood, if that makes the limits deeper; with "pattern" they teach the

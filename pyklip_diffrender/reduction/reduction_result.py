@@ -126,7 +126,7 @@ class Reduction:
     def _status(self) -> str:
         """How the fit ended, and whether it was a first look."""
         quick = " (quick: a first look with a coarser model)" if self.accuracy == "quick" else ""
-        return f"{self.fit.status.message}{quick}"
+        return f"{self.fit.status}{quick}"
 
     def __repr__(self) -> str:
         return f"<Reduction of {self.sequence.target}: {self.fit!r}, {self.detection!r}>"

@@ -112,7 +112,7 @@ def _key_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     flux = []
     if star is not None:
         value = plus_minus(star["flux_density_Jy"], star["flux_density_error_Jy"])
-        source = "as assumed" if star["source"] == "star_flux" else "from its diffracted light"
+        source = "as stated" if star["source"] == "star_flux" else "from its diffracted light"
         flux = [("Flux density of the star", f"{value} Jy, {source}")]
     return [
         ("Reduced chi-squared without model error", number(fit["reduced_chi2"])),

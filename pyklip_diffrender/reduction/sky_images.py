@@ -18,6 +18,7 @@ from pyklip_diffrender.detection import Detection, combine_frames, image_hdu
 from pyklip_diffrender.imaging import SkyModel
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.io.geometry import rotation_matrix
+from pyklip_diffrender.io.keywords import fits_unit
 from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
 
@@ -105,7 +106,7 @@ class SkyImages:
     def write(self, path: Path) -> Path:
         """Write all images to a FITS file with a world coordinate system."""
         detection = self.detection
-        unit = detection.observation.unit.to_string("fits")
+        unit = fits_unit(detection.observation.unit)
         mean, error = self.combined
         sky, sky_error = self.posterior_mean
         images = {

@@ -173,7 +173,7 @@ def _star(detection: Detection) -> dict[str, Any] | None:
     if detection.sky.star is None:
         return None
     value, error = detection.sky.star
-    known = "flux" in detection.fits[0].settings.deviations
+    known = detection.fits[0].catalogue_flux is not None
     return {
         "flux_density_Jy": value,
         "flux_density_error_Jy": error,

@@ -44,7 +44,7 @@ def require_plausible(name: str, result: Refinement, limit: float) -> None:
     from pyklip_diffrender.refinement.status import WHAT_TO_CHECK
 
     if not result.status.usable:
-        raise RefinementError(f"{name}: {result.status.message}", result)
+        raise RefinementError(f"{name}: the fit ended as {result.status}", result)
     chi2 = reduced_chi2(result)
     if chi2 > limit:
         raise RefinementError(
@@ -72,8 +72,8 @@ def warn_of_status(name: str, result: Refinement) -> None:
     advice = _ADVICE.get(result.status.name)
     if advice is not None:
         warnings.warn(
-            f"{name}: the fit ended as {result.status.name} (chi-squared per pixel "
-            f"{result.chi2_per_pixel:.3g}): {result.status.message}. What to do: {advice}. See "
+            f"{name}: the fit ended as {result.status} (chi-squared per pixel "
+            f"{result.chi2_per_pixel:.3g}). What to do: {advice}. See "
             "'Reading a status' in the documentation",
             DiffrenderWarning,
             stacklevel=2,

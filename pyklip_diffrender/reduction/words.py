@@ -33,10 +33,11 @@ _TINY = 1e-9
 _ADVICE = {
     Status.CONVERGED: "The stated errors and limits can be used as they are.",
     Status.MODEL_MISMATCH: (
-        "Real frames often end so, above all where the flat-field pattern is not known or light is "
-        "extended. The errors have been scaled to the scatter in the S/N map, but faint candidates "
-        "deserve a second look: see whether they are in every roll and whether they look like a "
-        "point source. Check the filter, the masks and the date of the wavefront map."
+        "Fits of real frames often end with this status, mostly because the flat-field pattern is "
+        "not known or light is extended. The errors have been scaled to the scatter in the S/N "
+        "map, but faint candidates deserve a second look: see whether they are in every roll and "
+        "whether they look like a point source. Check the filter, the masks and the date of the "
+        "wavefront map."
     ),
     Status.PRIOR_MISMATCH: (
         "The errors have been scaled to the scatter in the S/N map. Repeat the fit with "

@@ -141,7 +141,7 @@ def refine_again(fit: Refinement, *, progress: bool = False, **changes: Any) -> 
     ]
     with breakdown_explained(problems[0].observation.name):
         again = fit_in_stages(problems, settings, warm, progress=progress)
-    return replace(again, catalogue_error=fit.catalogue_error)
+    return replace(again, catalogue_error=fit.catalogue_error, catalogue_flux=fit.catalogue_flux)
 
 
 def join_frames(
@@ -209,7 +209,7 @@ def join_frames(
         problems.append(Problem(fit.model, aligned.observation, fit.initial, start, systematics))
     with breakdown_explained(problems[0].observation.name):
         joined = fit_in_stages(problems, settings, warm, progress=progress)
-    return replace(joined, catalogue_error=fit.catalogue_error)
+    return replace(joined, catalogue_error=fit.catalogue_error, catalogue_flux=fit.catalogue_flux)
 
 
 def _aligned(

@@ -22,6 +22,7 @@ from torch import Tensor
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.instrument.nircam import nircam_coronagraph
 from pyklip_diffrender.io.files import open_fits
+from pyklip_diffrender.io.keywords import fits_unit
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.linear.frames import LinearFrame, Unknown
 from pyklip_diffrender.linear.model import LinearModel
@@ -213,7 +214,7 @@ def observation_hdus(observation: Observation, frame: int) -> tuple[dict[str, An
     }
     hdus = [fits.ImageHDU(a, name=name, ver=frame + 1) for name, a in arrays.items()]
     for hdu in hdus[:2]:
-        hdu.header["BUNIT"] = combined.unit.to_string("fits")
+        hdu.header["BUNIT"] = fits_unit(combined.unit)
     return facts, hdus
 
 

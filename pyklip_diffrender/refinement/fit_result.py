@@ -51,6 +51,7 @@ _ARRAYS = ("companions", "companion_errors")
 _PLAIN = (
     "settings", "basis", "chi2_per_pixel", "model_error", *_ARRAYS, "scales", "prior_ratios",
     "effective_parameters", "log_evidence", "history", "seconds", "catalogue_error",
+    "catalogue_flux",
 )  # fmt: skip
 """Attributes of a refinement that are written as text."""
 
@@ -97,6 +98,8 @@ class Refinement:
     seconds : float
     catalogue_error : float or None
         Relative error of the star's flux if a catalogue has stated it, see `star_flux_error`.
+    catalogue_flux : float or None
+        That flux density, Jy, which the star has within 0.5 %.
 
     Examples
     --------
@@ -134,6 +137,7 @@ class Refinement:
     history: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = math.nan
     catalogue_error: float | None = None
+    catalogue_flux: float | None = None
 
     def __repr__(self) -> str:
         count = len(self.frames)
@@ -150,7 +154,7 @@ class Refinement:
         return html_summary(
             "Refinement",
             {
-                "Status": self.status.message,
+                "Status": str(self.status),
                 "Frames": ", ".join(frame.observation.name for frame in self.frames),
                 "Chi-squared per pixel": f"{self.chi2_per_pixel:.3g}",
                 "Model error": f"{100 * self.model_error:.2g} % of the star",

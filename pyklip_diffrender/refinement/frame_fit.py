@@ -14,6 +14,7 @@ from astropy.table import QTable
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pyklip_diffrender.io.keywords import fits_unit
 from pyklip_diffrender.io.units import ARCSEC
 from pyklip_diffrender.optics.system import OpticalSystem
 from pyklip_diffrender.parameters import LEVELS, parameter
@@ -174,7 +175,7 @@ class FrameFit:
     def to_hdus(self, k: int) -> tuple[dict[str, Any], list[Any]]:
         """Return metadata and FITS extensions of the frame, with EXTVER k + 1."""
         observation, hdus = observation_hdus(self.observation, k)
-        unit, wcs = self.observation.unit.to_string("fits"), self.wcs
+        unit, wcs = fits_unit(self.observation.unit), self.wcs
         arrays = {
             "STAR": (self.star, unit),
             "COMPANIONS": (self.companion_image, unit),

@@ -21,8 +21,10 @@ class Status(Enum):
     >>> from pyklip_diffrender import Status
     >>> [status.name for status in Status if not status.usable]
     ['DIVERGED']
-    >>> Status.CONVERGED.calibrated
-    True
+    >>> [status.name for status in Status if status.calibrated]
+    ['CONVERGED']
+    >>> print(Status.ITERATION_LIMIT)
+    ITERATION_LIMIT: stopped at the limit of iterations before it converged
     """
 
     CONVERGED = "converged, and the model explains the data within their noise"
@@ -34,7 +36,10 @@ class Status(Enum):
         "errors are too small; let the prior's scales be fitted (fit_scales=True), or widen them"
     )
     ITERATION_LIMIT = "stopped at the limit of iterations before it converged"
-    DIVERGED = "failed: the fitted star has no light, or the loss is not a number"
+    DIVERGED = "the fitted star has no light, or the loss is not a number"
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.value}"
 
     @property
     def message(self) -> str:
@@ -48,8 +53,13 @@ class Status(Enum):
 
     @property
     def calibrated(self) -> bool:
-        """Whether the stated errors are reliable without a further factor."""
-        return self not in (Status.MODEL_MISMATCH, Status.PRIOR_MISMATCH, Status.DIVERGED)
+        """Whether the fit converged to a model that explains the data.
+
+        The errors of the fit then need no factor. `detect` still multiplies those of sources in
+        real frames by the scatter of the S/N, because neighbouring pixels share errors of the model
+        that chi-squared does not show.
+        """
+        return self is Status.CONVERGED
 
 
 WHAT_TO_CHECK = (

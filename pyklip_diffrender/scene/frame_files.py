@@ -6,8 +6,10 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from astropy import units as u
 from astropy.io import fits
 
 from pyklip_diffrender.errors import DiffrenderError, NoValidPixelsError
@@ -27,6 +29,11 @@ __all__ = [
 ]
 
 _SUFFIXES = (".fits", ".fits.gz")
+
+_SENSED = "RESULT_PHASE"
+"""Extension of wavefront-sensing files of MAST."""
+
+_MAP = "it is a wavefront map, no frame of a star; wavefront maps are chosen with opd (--opd)"
 
 _USABLE = ("calints", "crfints", "cal", "crf", "rateints", "rate")
 """Levels of frames that are still those of the detector, the best first."""
@@ -192,7 +199,9 @@ def _why_a_product(hdus: fits.HDUList) -> str:
     """
     first = hdus[0].header
     what = ""
-    if any(key in first for key in ("DRVERS", "DRMETH", "PATVERS")):
+    if "SCI" not in hdus and any(_is_map(hdu) for hdu in hdus):
+        return _MAP
+    if any(key in first for key in ("DRVERS", "PATVERS")):
         what = "a product of pyklip_diffrender"
     elif any(key in hdu.header for hdu in hdus[:2] for key in ("PYKLIPV", "PSFSUB")):
         what = "an image from which pyKLIP has subtracted the star"
@@ -200,8 +209,16 @@ def _why_a_product(hdus: fits.HDUList) -> str:
         names = ", ".join(hdu.name or "unnamed" for hdu in hdus)
         what = f"a file without an SCI extension ({names})"
         if any(key in first for key in ("OPD", "PUPILOPD", "PUPLSCAL", "WFSGUID", "TSTAMP")):
-            what = f"a wavefront map or an image of a model ({names}), without an SCI extension"
+            what = f"an image of a model ({names}), without an SCI extension"
     return f"it is {what}; expected frames of stage 2 (calints)" if what else ""
+
+
+def _is_map(hdu: Any) -> bool:
+    """Whether an HDU has a map of path differences, as wavefront sensing writes them."""
+    if hdu.name == _SENSED:
+        return True
+    unit = u.Unit(str(hdu.header.get("BUNIT", "")), parse_strict="silent")
+    return bool(hdu.is_image and unit.is_equivalent(u.m))
 
 
 def admissible(files: Iterable[FrameFile]) -> list[FrameFile]:

@@ -14,6 +14,7 @@ from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 from pyklip_diffrender.io.headers import fits_text
+from pyklip_diffrender.io.keywords import set_keyword
 from pyklip_diffrender.scene.observation import Observation
 
 __all__ = ["ccd_data", "primary_hdu", "world_coordinates"]
@@ -25,20 +26,20 @@ _OBSERVED = (
 """Cards of the first frame that hold for its products."""
 
 _REDUCED = {
-    "software": ("DRVERS", "version of the software"),
-    "status": ("DRSTAT", "how the refinement ended"),
-    "chi2_per_pixel": ("DRCHI2", "chi-squared per fitted pixel"),
-    "model_error": ("DRMODERR", "error of the model, fraction of the star"),
-    "frames": ("DRNFRAME", "number of fitted frames"),
-    "seconds": ("DRSECS", "duration of the refinement, s"),
-    "opd": ("DROPD", "wavefront map at the start"),
-    "opd_sha256": ("DRSHA256", ""),
-    "systematics": ("DRSYST", "flat-field pattern"),
-    "scatter": ("DRERRFAC", "median factor of the errors"),
-    "threshold": ("DRTHRESH", "smallest S/N of a candidate"),
-    "star_flux_density_jy": ("DRSTARJY", "flux density of the star, Jy"),
+    "software": "DRVERS",
+    "status": "DRSTAT",
+    "chi2_per_pixel": "DRCHI2",
+    "model_error": "DRMODERR",
+    "scatter": "DRERRFAC",
+    "threshold": "DRTHRESH",
+    "star_flux_density_jy": "DRSTARJY",
+    "frames": "DRNFRAME",
+    "seconds": "DRSECS",
+    "opd": "DROPD",
+    "opd_sha256": "DRSHA256",
+    "systematics": "DRSYST",
 }
-"""Keywords and comments of a reduction's provenance."""
+"""Keywords of a reduction's provenance."""
 
 
 def primary_hdu(
@@ -67,12 +68,9 @@ def primary_hdu(
         header["DATE-BEG"] = observation.date.isot
     if mjd is not None:
         header["MJD-AVG"] = (mjd, "mean mid-exposure, UTC")
-    for name, (key, comment) in _REDUCED.items():
-        value = provenance.get(name)
-        if value is not None:
-            # FITS has no NaN in headers.
-            is_text = isinstance(value, str) or not math.isfinite(value)
-            header[key] = (fits_text(str(value)) if is_text else value, comment)
+    for name, key in _REDUCED.items():
+        if provenance.get(name) is not None:
+            set_keyword(header, key, provenance[name])
     for name in provenance.get("observations", ()):
         header.add_history(fits_text(f"frame {name}"))
     return hdu

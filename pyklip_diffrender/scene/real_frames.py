@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.errors import IncompatibleSetupError, ShapeError
 from pyklip_diffrender.instrument.masks import MASKS, detector_place, stop_is_measured
 from pyklip_diffrender.instrument.nircam import FLIGHT_ALIGNMENT, nircam_coronagraph
 from pyklip_diffrender.instrument.spectrum import filter_throughput
@@ -95,6 +95,8 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
 
     Raises
     ------
+    ShapeError
+        If the frames are smaller than `size`.
     IncompatibleSetupError
         If the filter is not known, or the instrument or the coronagraph is not one that is
         modelled.
@@ -109,6 +111,12 @@ def model_for(observation: Observation, size: int | None = None, **overrides: An
     >>> tuple(model().shape)
     (24, 24)
     """
+    if size is not None and size > min(observation.shape):
+        ny, nx = observation.shape
+        raise ShapeError(
+            f"{observation.name}: {size} x {size} pixels do not fit into {nx} x {ny}. Choose a "
+            "smaller size (--size)"
+        )
     if observation.filter is None:
         raise IncompatibleSetupError(
             f"{observation.name}: the filter of these frames is not known. Give the observation a "

@@ -111,6 +111,8 @@ class SequenceConfig:
     ----------
     name : str
         For tables and messages; unique.
+    is_named : bool
+        Whether the configuration has given the name. Tables have target and filter otherwise.
     files : tuple of Path
         Files, or one folder.
     opd : Path
@@ -129,6 +131,7 @@ class SequenceConfig:
     filter: str | None = None
     options: Options = field(default_factory=Options)
     injections: Injections = field(default_factory=Injections)
+    is_named: bool = True
 
 
 @dataclass(frozen=True)
@@ -236,6 +239,7 @@ def _sequence(
     target = table.take("target", None, "text, the name of the star", as_text)
     filter_ = table.take("filter", None, 'text such as "F444W"', as_text)
     first = files[0] if files else Path("sequence")
+    is_named = "name" in table.content
     label = " ".join(filter(None, [target or first.name.split(".")[0], filter_]))
     name = table.take("name", label, "printable text", as_text)
     own = _options(table, options)
@@ -247,7 +251,7 @@ def _sequence(
     table.finish()
     if files is None or opd is None:
         return None
-    return SequenceConfig(name, files, opd, target, filter_, own, planets)
+    return SequenceConfig(name, files, opd, target, filter_, own, planets, is_named)
 
 
 def _options(table: CheckedTable, default: Options) -> Options:

@@ -19,7 +19,14 @@ from pyklip_diffrender.io.progress import duration, heartbeat
 from pyklip_diffrender.io.units import to_bytes
 from pyklip_diffrender.surveys.config import Config, read_config
 from pyklip_diffrender.surveys.execution import in_this_process, with_dask
-from pyklip_diffrender.surveys.folders import Record, clean, prepare, read_record, staging
+from pyklip_diffrender.surveys.folders import (
+    Record,
+    clean,
+    prepare,
+    read_record,
+    rename_to_jobs,
+    staging,
+)
 from pyklip_diffrender.surveys.jobs import Job, jobs_of
 from pyklip_diffrender.surveys.runs import Work
 from pyklip_diffrender.surveys.tables import row, table_of, write_tables
@@ -54,7 +61,7 @@ def survey(
     config : path or mapping
         TOML file, or its content; see :doc:`the guide </howto/survey>`.
     output : path
-        Folder for ``jobs/KEY/`` with the products of each job, ``results.ecsv``,
+        Folder for ``jobs/NAME_KEY/`` with the products of each job, ``results.ecsv``,
         ``results.parquet`` and ``survey.html``. Several surveys may use the same folder.
     scheduler : str, optional
         Address of a dask scheduler, such as ``tcp://host:8786``. Default processes on this
@@ -110,6 +117,7 @@ def run_survey(
     output = Path(output).absolute()
     jobs = prepare(output)
     clean(jobs)
+    rename_to_jobs(jobs, todo)
     board = _Board(todo, output)
     missing = [job for job in todo if not board.has(job)]
     _log.info("%d of %d jobs are finished", len(todo) - len(missing), len(todo))
@@ -152,7 +160,7 @@ class _Board:
         self.output, self.todo = output, todo
         self.records: dict[str, Record] = {}
         for job in todo:
-            record = read_record(output / "jobs" / job.key)
+            record = read_record(output / "jobs" / job.folder)
             if record is not None:
                 self.records[job.key] = record
         self.next, self.began = 0.0, time.monotonic()
@@ -205,7 +213,7 @@ class _Board:
         """
         from pyklip_diffrender.surveys.survey_page import page
 
-        text = page([(job, self.records.get(job.key)) for job in self.todo], self.output.name)
+        text = page([(job, self.records.get(job.key)) for job in self.todo])
         folder = None
         try:
             folder = staging(self.output / "jobs", "tables")

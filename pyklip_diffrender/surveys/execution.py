@@ -179,7 +179,7 @@ def _without_messages(name: str) -> Iterator[None]:
 
 def _record_of(future: Any, job: Job, jobs: Path, patience: int = _PATIENCE) -> Record:
     """Record of a job that dask has finished with."""
-    final = jobs / job.key
+    final = jobs / job.folder
     known = read_record(final)
     if known is not None and known["status"] == "finished":
         # The truth is on the disk: what dask has may have died with its worker.

@@ -9,7 +9,7 @@ import os
 import secrets
 import shutil
 import socket
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from functools import cache
@@ -27,6 +27,7 @@ __all__ = [
     "prepare",
     "publish",
     "read_record",
+    "rename_to_jobs",
     "staging",
     "write_record",
 ]
@@ -142,10 +143,22 @@ def read_record(final: Path) -> Record | None:
     try:
         record = json.loads((final / RECORD).read_text(encoding="utf-8"))
         sizes = {name: (final / name).stat().st_size for name in record["products"]}
-        whole = sizes == record["products"] and record["job"]["key"] == final.name
+        whole = sizes == record["products"]
+        whole &= record["job"]["key"].startswith(final.name.rpartition("_")[2])
         return record if whole and record["status"] in ("finished", "failed") else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
+
+
+def rename_to_jobs(jobs: Path, todo: Iterable[Job]) -> None:
+    """Rename folders of jobs whose sequences have another name in the configuration by now."""
+    names = {job.folder.rpartition("_")[2]: job.folder for job in todo}
+    for path in jobs.iterdir():
+        name = names.get(path.name.rpartition("_")[2], path.name)
+        if name != path.name and not (jobs / name).exists():
+            # Somebody else may be faster.
+            with suppress(FileNotFoundError):
+                os.rename(path, jobs / name)
 
 
 def finished(final: Path) -> bool:

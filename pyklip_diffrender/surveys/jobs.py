@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -13,6 +14,7 @@ from typing import Any
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.errors import CorruptFileError, DiffrenderError, IncompatibleSetupError
 from pyklip_diffrender.io.files import sha256
+from pyklip_diffrender.io.headers import fits_text
 from pyklip_diffrender.io.opd_map import FLAT
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.surveys.config import Config, Options, SequenceConfig
@@ -22,6 +24,9 @@ __all__ = ["Injection", "Job", "jobs_of"]
 
 _SWITCHES = ("wide", "disk", "completeness")
 """Options that are named in the key of a job where they are on."""
+
+_DIGITS = 12
+"""Digits of the key at the end of the name of a folder."""
 
 _SUFFIXES = (".fits", ".fits.gz")
 
@@ -53,7 +58,8 @@ class Job:
     key : str
         Hash of the package's version, the content of the input files, and the options.
     name : str
-        Name of the sequence, with the date of the epoch if it has several.
+        Name of the sequence, by default target and filter, with the date of the epoch if it has
+        several.
     files : tuple of str
         Frames.
     opd : str
@@ -84,6 +90,16 @@ class Job:
     base: str | None = None
     version: str = __version__
 
+    @property
+    def folder(self) -> str:
+        """Name of the folder with its products: what the job is, and the beginning of the key."""
+        return _folder(str(self), self.key)
+
+    @property
+    def base_folder(self) -> str | None:
+        """The same of the job whose fit an injection starts from."""
+        return None if self.base is None else _folder(self.name, self.base)
+
     def __str__(self) -> str:
         planet = self.injection
         if planet is None:
@@ -108,11 +124,16 @@ def jobs_of(config: Config) -> list[Job]:
     digest = cache(sha256)
     for sequence in config.sequences:
         try:
-            found = _jobs(sequence, digest)
+            planned = _jobs(sequence, digest)
         except (DiffrenderError, OSError) as error:
             problems.append(f"{sequence.name}: {error}")
             continue
-        for job in found:
+        if not sequence.is_named and {job.name for job in planned} & {
+            j.name for j in jobs.values()
+        }:
+            # Another sequence of the same target and filter.
+            planned = [replace(job, name=f"{job.name}, {sequence.name}") for job in planned]
+        for job in planned:
             if job.key in jobs:
                 problems.append(f"{job}: got the same inputs and options as {jobs[job.key]}")
             jobs[job.key] = job
@@ -125,8 +146,8 @@ def _jobs(sequence: SequenceConfig, digest: Callable[[Path], str]) -> list[Job]:
     files = _files(sequence.files)
     planets = sequence.injections
     jobs = []
-    for opd, epoch in _epochs(sequence, files):
-        plain = _job(sequence, files, opd, epoch, digest)
+    for opd, epoch, name in _epochs(sequence, files):
+        plain = _job(replace(sequence, name=name), files, opd, epoch, digest)
         injected = [
             _with_planet(plain, Injection(contrast, separation, angle))
             for contrast in planets.contrasts
@@ -137,21 +158,22 @@ def _jobs(sequence: SequenceConfig, digest: Callable[[Path], str]) -> list[Job]:
     return jobs
 
 
-def _epochs(sequence: SequenceConfig, files: list[Path]) -> list[tuple[Path, str | None]]:
-    """Wavefront map and date of every epoch; without a date if there is just one."""
+def _epochs(sequence: SequenceConfig, files: list[Path]) -> list[tuple[Path, str | None, str]]:
+    """Wavefront map, date and name of every epoch; without a date if there is just one."""
     of_folder = str(sequence.opd) != FLAT and sequence.opd.is_dir()
     try:
         epochs = Sequence.by_epoch(files, target=sequence.target, filter=sequence.filter)
     except DiffrenderError:
         if of_folder:
             raise
-        return [(sequence.opd, None)]  # The job will fail, and its row says why.
+        return [(sequence.opd, None, sequence.name)]  # The job will fail, and its row says why.
     opd = sequence.opd
     return [
         (
             # As `reduce` chooses it: the one nearest to the target's frames.
             opd / wavefront_for(opd, each.date).name if of_folder else opd,
             each.date.isot if len(epochs) > 1 and each.date is not None else None,
+            sequence.name if sequence.is_named else f"{each.target} {each.filter or ''}".rstrip(),
         )
         for each in epochs
     ]
@@ -201,6 +223,11 @@ def _job(
 def _with_planet(base: Job, planet: Injection) -> Job:
     key = _hash({"base": base.key, "planet": [planet.contrast, planet.separation, planet.angle]})
     return replace(base, key=key, injection=planet, base=base.key)
+
+
+def _folder(label: str, key: str) -> str:
+    readable = re.sub(r"[^A-Za-z0-9.+-]+", "-", fits_text(label)).strip("-.")[:80]
+    return f"{readable}_{key[:_DIGITS]}"
 
 
 def _hash(facts: Mapping[str, Any]) -> str:

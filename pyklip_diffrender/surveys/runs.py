@@ -39,7 +39,7 @@ def run_job(job: Job, jobs: Path, work: Work) -> Record:
     A job that is there already is not run again. No error of the job goes through: its record
     says that it failed, and why.
     """
-    final = jobs / job.key
+    final = jobs / job.folder
     known = read_record(final)
     if known is not None and known["status"] == "finished":
         return known
@@ -73,7 +73,7 @@ def failure(job: Job, jobs: Path, error: BaseException, **circumstances: Any) ->
     try:
         folder = staging(jobs, job.key)
         record = write_record(folder, job, record)
-        publish(folder, jobs / job.key)
+        publish(folder, jobs / job.folder)
     except OSError:
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)

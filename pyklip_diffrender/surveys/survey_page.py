@@ -22,16 +22,17 @@ Rows = Sequence[tuple[Job, Record | None]]
 
 _GIB = 2.0**30
 
+_NAMES = 3
+"""Most sequences that the title names."""
 
-def page(rows: Rows, name: str) -> str:
+
+def page(rows: Rows) -> str:
     """The page.
 
     Parameters
     ----------
     rows : sequence of (Job, dict or None)
         Jobs with their records; None for one that waits.
-    name : str
-        Of the survey.
     """
     states = [_status(record) for _, record in rows]
     done, failed, waiting = map(states.count, ("finished", "failed", "waiting"))
@@ -43,7 +44,7 @@ def page(rows: Rows, name: str) -> str:
     separations, limits = _limits(rows)
     return render(
         "survey.html",
-        name=name,
+        name=_title(rows),
         version=__version__,
         now=datetime.now(UTC).strftime("%Y-%m-%d %H:%M"),
         sentence=_sentence(rows),
@@ -78,6 +79,14 @@ def page(rows: Rows, name: str) -> str:
             if record is not None and record["status"] == "failed"
         ],
     )
+
+
+def _title(rows: Rows) -> str:
+    """What the survey is of: its sequences, or the first of them and their number."""
+    names = list(dict.fromkeys(job.name for job, _ in rows))
+    if len(names) > _NAMES:
+        return f"Survey of {names[0]} and {len(names) - 1} more sequences"
+    return f"Survey of {', '.join(names)}"
 
 
 def _finished(rows: Rows, *, injected: bool = False) -> list[tuple[Job, Record]]:
@@ -178,11 +187,11 @@ def _job(job: Job, record: Record | None) -> dict[str, Any]:
     result = known.get("result") or {}
     candidates = result.get("candidates")
     return {
-        "key": job.key,
+        "key": job.folder,
         "label": _label(job),
         "filter": result.get("filter") or job.filter or "",
         "status": _status(record),
-        "fit_status": (result.get("fit_status") or "").lower().replace("_", " "),
+        "fit_status": result.get("fit_status") or "",
         "reduced_chi2": number(result["reduced_chi2"]) if "reduced_chi2" in result else "",
         "candidates": "" if candidates is None else str(len(candidates)),
         "time": _time(known["seconds"]) if "seconds" in known else "",

@@ -47,9 +47,10 @@ COLUMNS: dict[str, type] = {
     "host": str,
     "message": str,
     "traceback": str,
+    "folder": str,
     "key": str,
 }
-"""Columns of the results and what they hold; all but name, status and key may be masked.
+"""Columns of the results and what they hold; all but name, status, folder and key may be masked.
 
 Contrasts come first, because a table that is too wide to print loses its middle."""
 
@@ -65,13 +66,35 @@ _UNITS = {
 
 _FORMATS = {"contrast": ".2e", "snr": ".1f"}
 
+_UNITS = {"arcsec": u.arcsec, "deg": u.deg, "seconds": u.s, "bytes": u.byte}
+"""Units by the last word of the name of a column; limits are contrasts at the separation there."""
+
+_DESCRIPTIONS = {
+    "name": "sequence: target and filter, unless the configuration names it",
+    "status": "of the job: finished, failed or waiting",
+    "contrast": "of the candidate with the highest S/N, relative to the star without coronagraph",
+    "snr": "of that candidate",
+    "fit_status": "how the fit of the star ended",
+    "error_factor": "median factor by which errors were multiplied",
+    "candidates": "number of candidates",
+    "separation_arcsec": "of that candidate from the star",
+    "position_angle_deg": "of that candidate, east of north",
+    "contrast_error": "standard deviation of contrast",
+    **{f"limit_{each:.1f}_arcsec": f"contrast limit at {each:g} arcsec" for each in _AT},
+    "recovered": "whether a candidate is within 0.1 arcsec of the injected planet",
+    "seconds": "duration of the job",
+    "peak_memory_bytes": "largest memory of the job",
+    "folder": "name of the folder with the products, in jobs",
+    "ended": "time at which the job ended, UTC",
+}
+
 
 def row(job: Job, record: Record | None) -> dict[str, Any]:
     """One row: what is known of a job, which waits if it has no record."""
     record = record or {"status": "waiting"}
     result: Mapping[str, Any] = record.get("result") or {}
     values = {key: record.get(key, result.get(key)) for key in COLUMNS}
-    values |= {"name": job.name, "key": job.key}
+    values |= {"name": job.name, "folder": job.folder, "key": job.key}
     candidates = result.get("candidates")
     values["candidates"] = None if candidates is None else len(candidates)
     if candidates:
@@ -105,7 +128,13 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
         table[name] = MaskedColumn(known, mask=[value is None for value in values], dtype=kind)
         table[name].unit = _UNITS.get(name)
         table[name].info.format = _FORMATS.get(name)
+        table[name].unit = _unit(name)
+        table[name].description = _DESCRIPTIONS.get(name, "")
     return table
+
+
+def _unit(name: str) -> u.UnitBase | None:
+    return None if name.startswith("limit_") else _UNITS.get(name.rpartition("_")[2])
 
 
 def write_tables(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:

@@ -28,8 +28,8 @@ __all__ = ["reduce_job"]
 def reduce_job(job: Job, folder: Path, memory: float | None = None) -> dict[str, Any]:
     """Reduce a sequence, perhaps with a planet in it, and write the products."""
     changes: dict[str, Any] = {"memory": memory}
-    if job.injection is not None and job.base is not None:
-        fit = Refinement.read(folder.parent / job.base / "fit.fits")
+    if job.injection is not None and job.base_folder is not None:
+        fit = Refinement.read(folder.parent / job.base_folder / "fit.fits")
         first = fit.frames[0].observation
         planet = _planet(job.injection, first.position_angle)
         frames: abc.Sequence[FrameFit] = [

@@ -1,0 +1,517 @@
+"""Error against time: images, gradients, whole fits, and the codes they are compared with.
+
+    python -m benchmarks.speed_error -o results
+
+One simulated scene, that of the paper (beta Pictoris for two hours behind MASK335R at 4.5 um), and
+a wavefront 40 hours from the known map. Every way of making an image, a gradient or a fit is a
+point; ways that differ in one setting, such as the samples across the pupil, are joined by a line:
+
+- images, at one wavelength against the converged image, and in the filter against 17 wavelengths;
+- gradients of the misfit by the wavefront's modes, against automatic differentiation of the finest
+  model;
+- whole fits of the frame with coarser models;
+- stpsf and the paper's recipe; and KLIP from the table of `examples/paper/klip_table.py`, whose
+  times are of another day;
+- with ``--frames FILES --opd MAP``, whole reductions of real frames with coarser models, whose
+  error is the median change of the limits.
+
+The error of images and fits is the rms error of the star in units of the noise (sigma). Takes about
+four minutes on two idle cores, of which stpsf takes one, and two more for one roll of real frames;
+without stpsf and its data (STPSF_PATH) its points are left out. ``--quick`` sees whether all runs.
+``--committed`` measures nothing, and takes the points from tables of earlier benchmarks. Writes
+speed_error.ecsv and speed_error.png, which the documentation shows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from astropy.table import Table
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+import pyklip_diffrender as dr
+from benchmarks.provenance import provenance
+from benchmarks.speed.rivals import paper_recipe
+from benchmarks.speed.setting import WAVELENGTH, Setting, coarse_steps
+from benchmarks.speed.timing import interleaved
+from pyklip_diffrender.drawing import save
+from pyklip_diffrender.io.files import write_table
+from pyklip_diffrender.linear.response import downsample
+from pyklip_diffrender.optics.grid import PupilGrid
+from pyklip_diffrender.optics.system import OpticalSystem
+from pyklip_diffrender.reduction import ReduceOptions, prepare
+from pyklip_diffrender.refinement import GaussNewton, Refinement, nircam_settings, refine
+from pyklip_diffrender.wavefront.bases import default_basis
+
+__all__ = ["Point", "draw", "main", "measure"]
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results"
+
+MODES_OF_GRADIENTS = 6.0
+"""Cycles across the pupil of the modes by which gradients are compared."""
+
+_ALIKE = "poppy, FFT, oversample 4"
+"""Way of `benchmarks.speed` whose error is like that of stpsf."""
+
+ADAM_STEPS, LEARNING_RATE = 1000, 1e-11
+
+TITLES = {
+    "image": "One image, 4.5 um",
+    "broad image": "One image in F444W",
+    "gradient": "Image and gradient, 4.5 um",
+    "step": "Image and gradient, 4.5 um",
+    "fit": "Fit of one frame, 4.5 um",
+    "reduction": "Reduction of real frames",
+}
+"""Titles of the panels by what they compare."""
+
+UNITS = {
+    "image": "rms error (sigma)",
+    "broad image": "rms error (sigma)",
+    "gradient": "relative error of the gradient",
+    "step": "rms error of the image (sigma)",
+    "fit": "rms error of the star (sigma)",
+    "reduction": "median change of the limits",
+}
+"""Meaning of the errors in each panel."""
+
+
+class Point(NamedTuple):
+    """One way of doing something, with how long it takes and how wrong it is.
+
+    Attributes
+    ----------
+    what : str
+        Key of `TITLES`.
+    way : str
+        Points of one way are joined by a line.
+    setting : str
+        What differs between them.
+    seconds : float
+    error : float
+        See `UNITS`.
+    status : str
+        How a fit ended.
+    note : str
+    """
+
+    what: str
+    way: str
+    setting: str
+    seconds: float
+    error: float
+    status: str = ""
+    note: str = ""
+
+
+def fidelities(setting: Setting) -> Iterator[tuple[str, str, OpticalSystem]]:
+    """Ways of making the monochromatic image: way, setting, model."""
+    fine = setting.model
+    for npix in (*setting.coarse, setting.npix):
+        model = fine if npix == setting.npix else fine.with_fidelity(npix=npix)
+        yield "fewer samples across the pupil", f"{npix} samples", model
+    for npix in setting.coarse:
+        yield (
+            "change of a fine image, on fewer samples",
+            f"{npix} samples",
+            coarse_steps(fine, setting.measured, npix),
+        )
+    single = fine.with_fidelity(dtype=torch.float32)
+    yield "single precision", f"{setting.npix} samples", single
+
+
+def image_points(setting: Setting, budget: float) -> list[Point]:
+    """Images at one wavelength, by this package and by the paper's recipe."""
+    ways = list(fidelities(setting))
+    works = [partial(rendered, model, setting.opd) for *_, model in ways]
+    recipe = paper_recipe(setting.arrays, setting.device)
+    works.append(partial(without_gradient, recipe, setting.opd))
+    names = [(way, label) for way, label, _ in ways] + [("the paper's recipe", "padded FFT")]
+    errors = [setting.judge(work()).sigma for work in works]
+    times = interleaved(works, budget, setting.device)
+    return [
+        Point("image", *name, seconds, error)
+        for name, seconds, error in zip(names, times, errors, strict=True)
+    ]
+
+
+def rendered(model: OpticalSystem, opd: Tensor) -> Tensor:
+    """The image of the star, for a wavefront on the fine grid."""
+    with torch.no_grad():
+        return model(downsample(opd, model.npix))
+
+
+def without_gradient(image: Callable[[Tensor], Tensor], opd: Tensor) -> Tensor:
+    """Value of a function of the wavefront."""
+    with torch.no_grad():
+        return image(opd)
+
+
+def broad_points(setting: Setting, budget: float) -> list[Point]:
+    """Images in the filter, for several numbers of wavelengths and samples."""
+    count = 5 if setting.quick else 17
+
+    def model(nlambda: int, npix: int) -> OpticalSystem:
+        broad = setting.model.with_fidelity(monochromatic=None, nlambda=nlambda)
+        return broad.with_fidelity(npix=npix)
+
+    truth = rendered(model(count, setting.npix), setting.opd).cpu().numpy()
+    photons = setting.scene.star.photons
+    noise = np.sqrt(photons * truth + setting.scene.read_noise**2)
+    numbers = (1, 3) if setting.quick else (1, 3, 5, 7, 9)
+    ways = [(f"{npix} samples", n, model(n, npix)) for npix in setting.coarse[-2:] for n in numbers]
+    works = [partial(rendered, each, setting.opd) for *_, each in ways]
+    errors = []
+    for work in works:
+        difference = photons * (work().cpu().numpy() - truth) / noise
+        errors.append(float(np.sqrt((difference**2).mean())))
+    times = interleaved(works, budget, setting.device)
+    return [
+        Point("broad image", way, f"{n} wavelength{'s' * (n > 1)}", seconds, error)
+        for (way, n, _), seconds, error in zip(ways, times, errors, strict=True)
+    ]
+
+
+def gradient_points(setting: Setting, budget: float) -> list[Point]:
+    """Image and gradient of the misfit; the error is that of the gradient by smooth modes."""
+    data = torch.from_numpy(setting.observation.data[0]).to(setting.device)
+    noise = torch.from_numpy(setting.noise).to(setting.device)
+    photons, start = setting.scene.star.photons, setting.measured
+    basis = default_basis(MODES_OF_GRADIENTS)
+
+    def gradient(image: Callable[[Tensor], Tensor], opd: Tensor) -> Tensor:
+        opd = opd.clone().requires_grad_()
+        misfit = (((photons * image(opd) - data) / noise) ** 2).sum() / 2
+        return torch.autograd.grad(misfit, opd)[0]
+
+    def by_modes(slope: Tensor) -> Tensor:
+        grid = PupilGrid.full(len(slope), setting.model.diameter)
+        modes = basis.modes(grid, 0, len(basis)).to(slope)
+        return torch.einsum("kyx,yx->k", modes, slope).cpu().double()
+
+    truth = by_modes(gradient(setting.converged, start.cpu()).to(setting.device))
+    ways: list[tuple[str, str, Callable[[Tensor], Tensor], int]] = [
+        (way, label, model, model.npix) for way, label, model in fidelities(setting)
+    ]
+    recipe = paper_recipe(setting.arrays, setting.device)
+    ways.append(("the paper's recipe", "padded FFT", recipe, setting.npix))
+    works = [partial(gradient, image, downsample(start, npix)) for *_, image, npix in ways]
+    errors = [float((by_modes(work()) - truth).norm() / truth.norm()) for work in works]
+    times = interleaved(works, budget, setting.device)
+    return [
+        Point("gradient", way, label, seconds, error)
+        for (way, label, *_), seconds, error in zip(ways, times, errors, strict=True)
+    ]
+
+
+def fit_points(setting: Setting) -> list[Point]:
+    """Whole fits of the frame with coarser models, and the paper's recipe."""
+    cycles = (4.0, 6.0) if setting.quick else (8.0, 12.0, 16.0, 20.0, 24.0)
+    quick = {"max_iterations": 10} if setting.quick else {}
+    points = []
+
+    def fit(model: OpticalSystem, highest: float) -> tuple[Refinement, float]:
+        began = time.perf_counter()
+        result = refine(
+            model,
+            setting.observation,
+            setting.measured.cpu().numpy(),
+            settings=GaussNewton(basis=default_basis(highest), **quick),
+        )
+        return result, time.perf_counter() - began
+
+    def point(way: str, label: str, model: OpticalSystem, highest: float) -> Point:
+        result, seconds = fit(model, highest)
+        difference = (result.frames[0].star - setting.star) / setting.noise
+        error = float(np.sqrt((difference**2).mean()))
+        return Point("fit", way, label, seconds, error, result.status.name)
+
+    # Once without a clock: PyTorch and the caches of the package warm up.
+    fit(setting.model.with_fidelity(npix=setting.coarse[0]), cycles[0])
+    for highest in cycles:
+        label = f"{highest:g} cycles"
+        points.append(point("fewer modes of the wavefront", label, setting.model, highest))
+    for npix in setting.coarse:
+        coarse = setting.model.with_fidelity(npix=npix)
+        label = f"{npix} samples"
+        points.append(point("fewer samples across the pupil", label, coarse, cycles[-1]))
+    return [*points, adam_point(setting)]
+
+
+def adam_point(setting: Setting) -> Point:
+    """The paper's recipe: Adam steps on the wavefront, of which a few are timed.
+
+    The error is that after all steps, taken with the change of a fine image on fewer samples.
+    """
+    data = torch.from_numpy(setting.observation.data[0]).to(setting.device)
+    photons = setting.scene.star.photons
+
+    def stepper(image: Callable[[Tensor], Tensor], start: Tensor) -> Callable[[], Tensor]:
+        opd = start.clone().requires_grad_()
+        optimiser = torch.optim.Adam([opd], lr=LEARNING_RATE)
+
+        def step() -> Tensor:
+            optimiser.zero_grad()
+            (photons * image(opd) - data).abs().mean().backward()
+            optimiser.step()
+            return opd
+
+        return step
+
+    slow = stepper(paper_recipe(setting.arrays, setting.device), setting.measured)
+    slow()
+    (seconds,) = interleaved([slow], 0.1 if setting.quick else 3.0, setting.device)
+    coarse = coarse_steps(setting.model, setting.measured, setting.coarse[1])
+    small = downsample(setting.measured, coarse.npix)
+    step = stepper(coarse, small)
+    for _ in range(10 if setting.quick else ADAM_STEPS):
+        opd = step()
+    factor = setting.npix // coarse.npix
+    change = (opd.detach() - small).repeat_interleave(factor, 0).repeat_interleave(factor, 1)
+    error = setting.judge(rendered(setting.model, setting.measured + change)).sigma
+    note = f"one step timed, times {ADAM_STEPS}"
+    label = f"{ADAM_STEPS} Adam steps"
+    return Point("fit", "the paper's recipe", label, ADAM_STEPS * seconds, error, note=note)
+
+
+def klip_points(path: Path) -> list[Point]:
+    """Subtraction of reference images, from a table of `examples/paper/klip_table.py`."""
+    table = Table.read(path)
+    points = []
+    for method in ("KLIP", "KLIP, library"):
+        rows = table[table["method"] == method]
+        seconds, error = (float(np.median(rows[name])) for name in ("seconds", "star_error"))
+        label = "9 dithered frames" if method == "KLIP" else "50 frames"
+        note = f"from {path.name}, {table.meta['date']}; error in the planet's annulus"
+        points.append(Point("fit", "KLIP", label, seconds, error, note=note))
+    return points
+
+
+def reduction_points(frames: Sequence[Path], opd: Path, *, quick: bool) -> list[Point]:
+    """Reductions of real frames with fewer wavelengths and modes; limits against finer ones."""
+    sequence = dr.Sequence.from_files(list(frames))
+    first = sequence.science[0]
+    size = 32 if quick else 80
+    # As `reduce` has it where its pattern is known.
+    default = nircam_settings(first, min_model_error=0.002)
+    (highest, *_) = np.atleast_1d(default.cycles)
+    finest = (5, 5.0) if quick else (9, float(highest))
+    others = [(5, 4.0)] if quick else [(7, highest), (5, highest), (3, highest)]
+    others += [] if quick else [(7, 0.75 * highest), (7, 0.5 * highest)]
+
+    def limits(nlambda: int, cycles: float) -> tuple[NDArray[np.float64], float, str]:
+        options = ReduceOptions(size=size, settings=replace(default, cycles=cycles))
+        preparation = prepare(sequence, opd, options)
+        model = dr.model_for(first, size, nlambda=nlambda)
+        began = time.perf_counter()
+        result = replace(preparation, model=model).run()
+        seconds = time.perf_counter() - began
+        curve = np.asarray(result.detection.contrast_curve["contrast"])
+        return curve, seconds, result.fit.status.name
+
+    truth, *_ = limits(*finest)
+    points = []
+    for nlambda, cycles in others:
+        curve, seconds, status = limits(nlambda, cycles)
+        error = float(np.median(np.abs(curve / truth - 1)))
+        way = "fewer wavelengths" if cycles == finest[1] else "fewer modes of the wavefront"
+        label = f"{nlambda} wavelengths" if cycles == finest[1] else f"{cycles:g} cycles"
+        note = f"{len(sequence.science)} of {sequence.target}, {first.filter}"
+        points.append(Point("reduction", way, label, seconds, error, status, note))
+    return points
+
+
+def committed_points(folder: Path) -> list[Point]:
+    """Points of the tables of `benchmarks.speed` and `klip_table.py`, as far as they have them."""
+    table = Table.read(folder / "performance.ecsv")
+    kinds = {"forward": "image", "forward + backward": "step", "refinement": "fit"}
+    points = []
+    for row in table[table["precision"] == "float64"]:
+        what, column = kinds.get(str(row["row"])), str(row["column"])
+        sigma, remark = float(row["sigma"]), ""
+        if column.startswith("stpsf"):
+            # Its row has the largest error over the peak alone; of poppy's, which is alike, both.
+            (alike,) = table[(table["row"] == "forward") & (table["column"] == _ALIKE)]
+            sigma = float(row["error"] * alike["sigma"] / alike["error"])
+            remark = "; sigma by the ratio of poppy's errors"
+        if what is None or not np.isfinite(sigma):
+            continue
+        way, _, label = column.partition(", ")
+        if way in ("multi-fidelity", "coarse alone"):
+            way = {"multi-fidelity": "change of a fine image, on fewer samples"}.get(
+                way, "fewer samples across the pupil"
+            )
+            label = f"{label} samples"
+        elif what != "fit" and way == "this package":
+            way, label = "fewer samples across the pupil", f"{label} samples"
+        note = f"{table.meta['command']}, {table.meta['date']}{remark}"
+        points.append(Point(what, way, label, row["seconds"], sigma, note=note))
+    return [*points, *klip_points(folder / "klip_table_measured.ecsv")]
+
+
+def stpsf_points(setting: Setting, budget: float) -> list[Point]:
+    """stpsf's own calc_psf for several samplings, and the same arrays in this package."""
+    if setting.data is None:
+        return []
+    from benchmarks.speed.plain import plain_stpsf
+    from pyklip_diffrender.bridges import from_webbpsf
+
+    instrument = plain_stpsf(setting.data, 1024)
+    photons, read_noise = setting.scene.star.photons, setting.scene.read_noise
+    call: dict[str, Any] = {
+        "monochromatic": WAVELENGTH, "fov_pixels": setting.fov, "detector_oversample": 1,
+        "add_distortion": False,
+    }  # fmt: skip
+
+    def converted(cells: float) -> Callable[[], Any]:
+        model = from_webbpsf(instrument, fft_oversample=4, occulter_sampling=cells, **call)
+        opd = model.opd(None)
+        return lambda: rendered(model, opd).numpy()
+
+    truth = converted(16.0)()
+    noise = np.sqrt(photons * truth + read_noise**2)
+
+    def sigma(image: Any) -> float:
+        return float(np.sqrt(((photons * (np.asarray(image) - truth) / noise) ** 2).mean()))
+
+    points = []
+    for pad in (1,) if setting.quick else (1, 2, 4):
+        began = time.perf_counter()
+        image = instrument.calc_psf(**call, fft_oversample=pad)["DET_SAMP"].data
+        seconds = time.perf_counter() - began
+        label = f"fft_oversample {pad}"
+        points.append(Point("image", "stpsf calc_psf", label, seconds, sigma(image)))
+    ways = (2.0, 3.0, 6.0)
+    works = [converted(cells) for cells in ways]
+    errors = [sigma(work()) for work in works]
+    for cells, seconds, error in zip(ways, interleaved(works, budget), errors, strict=True):
+        label = f"{cells:g} cells per lambda/D"
+        way = "this package, of stpsf's arrays"
+        points.append(Point("image", way, label, seconds, error))
+    return points
+
+
+def measure(setting: Setting, *, klip: Path | None = None, budget: float = 2.0) -> list[Point]:
+    """All points.
+
+    Parameters
+    ----------
+    setting : Setting
+    klip : Path, optional
+        Table of `examples/paper/klip_table.py`.
+    budget : float
+        Seconds for each timed function.
+    """
+    return [
+        *image_points(setting, budget),
+        *stpsf_points(setting, budget),
+        *broad_points(setting, budget),
+        *gradient_points(setting, budget),
+        *fit_points(setting),
+        *([] if klip is None else klip_points(klip)),
+    ]
+
+
+def as_table(points: Sequence[Point], command: str) -> Table:
+    """The points as a table with its provenance."""
+    table = Table(rows=list(points), names=Point._fields)
+    for name in ("seconds", "error"):
+        table[name].info.format = ".3g"
+    table["seconds"].unit = "s"
+    table["error"].description = "; ".join(f"{key}: {value}" for key, value in UNITS.items())
+    lines = provenance(command.removeprefix("python "), ("stpsf",))
+    table.meta["provenance"] = [line.removeprefix("- ") for line in lines]
+    return table
+
+
+def draw(table: Table) -> Figure:
+    """Error against time, a panel for images, gradients and fits, a line for each way."""
+    shown = [what for what in TITLES if what in set(table["what"])]
+    colors = {way: f"C{k}" for k, way in enumerate(dict.fromkeys(map(str, table["way"])))}
+    columns = 3 if len(shown) in (3, 5, 6) else 2
+    count = -(-len(shown) // columns)
+    figure = Figure(figsize=(5 * columns, 4.8 * count), layout="constrained")
+    panels = figure.subplots(count, columns, squeeze=False).flat
+    for ax in list(panels)[len(shown) :]:
+        ax.set_axis_off()
+    for ax, what in zip(figure.axes, shown, strict=False):
+        rows = table[table["what"] == what]
+        for way in dict.fromkeys(map(str, rows["way"])):
+            line = rows[rows["way"] == way]
+            ours = way.startswith(("this package", "fewer", "change", "single"))
+            # The setting of a single point is part of the name of its way.
+            alone = str(line["setting"][0]) if len(line) == 1 else ""
+            ax.loglog(
+                line["seconds"], np.maximum(line["error"], 1e-16), "o-" if ours else "s--",
+                color=colors[way], label=", ".join(filter(None, [way, alone])), ms=6,
+                mfc=None if ours else "none",
+            )  # fmt: skip
+            for row in line[[0, -1]] if len(line) > 1 else ():
+                ax.annotate(
+                    str(row["setting"]), (row["seconds"], max(row["error"], 1e-16)),
+                    xytext=(6, -10), textcoords="offset points", fontsize=7,
+                )  # fmt: skip
+        ax.set(title=TITLES[what], xlabel="time (s)", ylabel=UNITS[what])
+        if "sigma" in UNITS[what]:
+            # The noise of a pixel.
+            ax.axhline(1.0, color="0.7", lw=1, zorder=0)
+        ax.margins(0.2)
+        ax.legend(
+            fontsize=7, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.08), ncols=2
+        )
+    return figure
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("speed_error"))
+    parser.add_argument(
+        "--quick", action="store_true", help="small arrays, to see whether all runs"
+    )
+    parser.add_argument("--device", default="cpu", help="torch device of this package")
+    parser.add_argument("--frames", nargs="+", type=Path, metavar="FILE", help="real frames")
+    parser.add_argument("--opd", type=Path, metavar="FILE", help="wavefront map of the frames")
+    parser.add_argument(
+        "--committed", action="store_true", help="take the points from tables of docs/results"
+    )
+    parser.add_argument("--figure", type=Path, metavar="TABLE", help="only draw a table again")
+    options = parser.parse_args(arguments)
+    options.output.mkdir(parents=True, exist_ok=True)
+    command = "python -m benchmarks.speed_error"
+    if options.figure:
+        table = Table.read(options.figure)
+    elif options.committed:
+        table = as_table(committed_points(RESULTS), f"{command} --committed")
+        table.meta["provenance"] = ["of the tables and dates in the column note"]
+        write_table(table, options.output / "speed_error.ecsv")
+    else:
+        setting = Setting(options.quick, options.device)
+        points = measure(
+            setting,
+            klip=RESULTS / "klip_table_measured.ecsv",
+            budget=0.05 if options.quick else 2.0,
+        )
+        if options.frames:
+            points += reduction_points(options.frames, options.opd, quick=options.quick)
+        command += " --quick" * options.quick + " --frames FILES --opd MAP" * bool(options.frames)
+        table = as_table(points, command)
+        write_table(table, options.output / "speed_error.ecsv")
+        table["what", "way", "setting", "seconds", "error", "status"].pprint_all()
+    save(draw(table), options.output / "speed_error.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

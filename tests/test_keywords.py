@@ -1,0 +1,63 @@
+"""The package's own FITS keywords have one declaration, and products one form of each."""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from pathlib import Path
+
+import pytest
+from astropy import units as u
+from astropy.io import fits
+
+from pyklip_diffrender.io.keywords import KEYWORDS, fits_unit, set_keyword
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def written_keywords() -> set[str]:
+    """Texts of the package's modules that look like keywords of its own."""
+    names: set[str] = set()
+    for path in (ROOT / "pyklip_diffrender").rglob("*.py"):
+        if path.name == "keywords.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                names |= {node.value} if re.fullmatch(r"DR[A-Z0-9]{2,6}", node.value) else set()
+    # The beginning of the names of a position and its error.
+    return names - {"DRFM"}
+
+
+def test_every_keyword_that_is_written_is_declared() -> None:
+    formed = {f"DRFM{axis}{end}" for axis in ("RA", "DE") for end in ("", "ER")}
+    assert written_keywords() | formed == set(KEYWORDS)
+
+
+def test_keywords_fit_on_cards() -> None:
+    assert all(len(name) <= 8 for name in KEYWORDS)
+    header = fits.Header()
+    for name, each in KEYWORDS.items():
+        set_keyword(header, name, 1.5)
+        assert header.comments[name] == each.comment
+        assert each.comment or each.meaning
+        assert set(each.files.split(", ")) <= {"reduce", "pyKLIP", "psf"}
+    assert len(header.tostring()) % 2880 == 0
+
+
+def test_values_are_such_as_headers_can_hold() -> None:
+    header = fits.Header()
+    set_keyword(header, "DRCHI2", math.nan)
+    set_keyword(header, "DRSYST", "Übersicht β")
+    assert (header["DRCHI2"], header["DRSYST"]) == ("nan", "Ubersicht ?")
+    with pytest.raises(KeyError, match="DROPDNAM"):
+        set_keyword(header, "DROPDNAM", "map.fits")
+
+
+@pytest.mark.parametrize(
+    ("unit", "text"),
+    [("MJy/sr", "MJy/sr"), ("MJy sr-1", "MJy/sr"), ("electron / s", "electron / s"), ("", "")],
+)
+def test_units_are_spelled_as_the_pipeline_does(unit: str, text: str) -> None:
+    assert fits_unit(u.Unit(unit)) == text
+    assert u.Unit(text) == u.Unit(unit)
