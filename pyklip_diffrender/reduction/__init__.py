@@ -11,7 +11,9 @@ from pyklip_diffrender.reduction.products import (
 from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.several import (
     COMPARISON,
+    combined_rows,
     compare_reductions,
+    in_words,
     write_comparison,
 )
 from pyklip_diffrender.reduction.summary import summarise
@@ -22,8 +24,10 @@ __all__ = [
     "Preparation",
     "ReduceOptions",
     "Reduction",
+    "combined_rows",
     "compare_reductions",
     "existing_products",
+    "in_words",
     "prepare",
     "reduce",
     "summarise",

@@ -20,11 +20,19 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from pyklip_diffrender.detection import Combination
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.reduction import html
 from pyklip_diffrender.reduction.words import plus_minus, scientific
 
-__all__ = ["COMPARISON", "compare_reductions", "sources_of", "write_comparison"]
+__all__ = [
+    "COMPARISON",
+    "combined_rows",
+    "compare_reductions",
+    "in_words",
+    "sources_of",
+    "write_comparison",
+]
 
 COMPARISON = ("comparison.html", "comparison.json")
 """Files that `write_comparison` writes."""
@@ -228,6 +236,7 @@ def write_comparison(
     folders: Mapping[str, Mapping[str, Any]],
     motion: tuple[float, float] | None,
     folder: str | os.PathLike[str],
+    combination: Combination | str | None = None,
 ) -> list[Path]:
     """Write ``comparison.html`` and ``comparison.json``, above the products of every reduction.
 
@@ -239,6 +248,9 @@ def write_comparison(
         Proper motion of the star, see `compare_reductions`.
     folder : path
         That the folders are in.
+    combination : Combination or str, optional
+        The search of all reductions together, or why there is none. ``comparison.json`` has it as
+        `combined`.
 
     Returns
     -------
@@ -257,10 +269,14 @@ def write_comparison(
         ],
         "pairs": pairs,
         "sources": sources,
+        "combined": (
+            combination.to_dict() if isinstance(combination, Combination)
+            else None if combination is None else {"reason": combination}
+        ),
     }  # fmt: skip
     page, data = (Path(folder) / name for name in COMPARISON)
     texts = {
-        page: _page(folders, pairs, sources, motion),
+        page: _page(folders, pairs, sources, motion, content["combined"]),
         data: json.dumps(content, indent=2, allow_nan=False) + "\n",
     }
     for path, text in texts.items():
@@ -274,6 +290,7 @@ def _page(
     pairs: Sequence[Mapping[str, Any]],
     sources: Sequence[Mapping[str, Any]],
     motion: tuple[float, float] | None,
+    combined: Mapping[str, Any] | None,
 ) -> str:
     target = next(iter(folders.values()))["target"]
     reductions = [
@@ -327,6 +344,7 @@ def _page(
             if positions
             else html.note("There are no candidates."),
         ),
+        *([] if combined is None else [_combined_section(combined)]),
         *([_over_filters(list(folders.values()), sources)] if sources else []),
         html.section(
             "Pairs of candidates",
@@ -348,6 +366,91 @@ def _page(
     ]  # fmt: skip
     header = f"<header><h1>{escape(str(target))}: {len(folders)} reductions</h1></header>\n"
     return html.document(f"{target}: comparison", header, sections)
+
+
+def combined_rows(combined: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Title and cells of a table with the candidates of a search over filters and epochs.
+
+    Parameters
+    ----------
+    combined : dict
+        What `Combination.to_dict` returned, also after it was read from ``comparison.json``.
+
+    Returns
+    -------
+    title : list of str
+    rows : list of list of str
+        One for each candidate.
+    """
+    candidates = combined["candidates"]
+    dated = any("verdict" in each for each in candidates)
+    title = ["", "Separation (arcsec)", "Position angle (deg)", "S/N", "Spectrum", "False alarm"]
+    title += [f"Contrast in {name}" for name in combined["filters"]]
+    title += ["Bound / background / neither (%)", "Verdict"] if dated else []
+    rows = []
+    for k, row in enumerate(candidates, 1):
+        cells = [
+            str(k),
+            plus_minus(row["separation_arcsec"], row["separation_error_arcsec"]),
+            plus_minus(row["position_angle_deg"], row["position_angle_error_deg"]),
+            f"{row['snr']:.1f}",
+            row["spectrum"],
+            scientific(row["false_alarm_probability"]),
+        ]
+        for name in combined["filters"]:
+            value, error = row[f"contrast_{name}"], row[f"contrast_error_{name}"]
+            snr = row[f"snr_{name}"]
+            known = None not in (value, error, snr)
+            cells.append(f"{scientific(value, error)}, S/N {snr:.1f}" if known else "not observed")
+        if dated:
+            names = ("bound", "background", "neither")
+            shares = (f"{100 * row[f'probability_{name}']:.0f}" for name in names)
+            cells += [" / ".join(shares), row["verdict"]]
+        rows.append(cells)
+    return title, rows
+
+
+def in_words(combination: Combination | str) -> str:
+    """What a search over filters and epochs says, or why there is none, in a few lines."""
+    if isinstance(combination, str):
+        return f"no combined search: {combination}"
+    count = len(combination.candidates)
+    lines = [
+        f"combined search of {len(combination.maps)} reductions: {count} "
+        f"candidate{'' if count == 1 else 's'}"
+    ]
+    for row in combination.candidates:
+        verdict = f", {row['verdict']}" if "verdict" in combination.candidates.colnames else ""
+        lines.append(
+            f"  {row['separation'].value:.3f} arcsec at {row['position_angle'].value:.1f} deg, "
+            f"S/N {row['snr']:.1f} ({row['spectrum']}), false-alarm probability "
+            f"{row['false_alarm_probability']:.1e}{verdict}"
+        )
+    lines += [f"  left out: {name}: {reason}" for name, reason in combination.left_out]
+    return "\n".join([*lines, *(f"  {each}" for each in combination.remarks)])
+
+
+def _combined_section(combined: Mapping[str, Any]) -> str:
+    """The section of the page about the combined search."""
+    if "reason" in combined:
+        reason = html.note(f"There is no combined search. {combined['reason']}")
+        return html.section("Combined search", reason)
+    title, rows = combined_rows(combined)
+    thresholds = ", ".join(
+        f"{name}: {value:.2f}" for name, value in combined["thresholds_sigmas"].items()
+    )
+    notes = [
+        "All reductions were searched together. The false-alarm probability is that of a peak "
+        "anywhere, with all positions, spectra and motions that were tried. Thresholds in "
+        f"Gaussian standard deviations: {thresholds}.",
+        *(f"Left out: {each['name']}: {each['reason']}." for each in combined["left_out"]),
+        *(f"{each}." for each in combined["remarks"]),
+    ]
+    return html.section(
+        "Combined search",
+        html.table(title, rows, wrap=len(title) - 1) if rows else html.note("No candidate."),
+        *(html.note(each) for each in notes),
+    )
 
 
 def _over_filters(
