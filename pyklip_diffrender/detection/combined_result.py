@@ -115,6 +115,9 @@ class Combination:
     thresholds : dict of str to float
         By search and family of spectra: the S/N that noise exceeds as rarely, in Gaussian standard
         deviations.
+    expected_false_candidates : float
+        Number of candidates that noise makes in all the searches: as many as in the search of a
+        single filter with `threshold`.
     candidates : QTable
         One row for each source, the least probable false alarm first; every column has a
         description.
@@ -128,6 +131,14 @@ class Combination:
         If there are several epochs.
     remarks : tuple of str
         What has to be known to read the result.
+
+    Examples
+    --------
+    Of folders with the products of reductions, which the package does not contain:
+
+    >>> import pyklip_diffrender as dr
+    >>> both = dr.combine(["products/F356W", "products/F444W"])  # doctest: +SKIP
+    >>> both.measure([[0.41, -0.35]])["contrast_F356W", "snr_F356W"]  # doctest: +SKIP
     """
 
     target: str
@@ -138,6 +149,7 @@ class Combination:
     unit: str
     threshold: float
     thresholds: dict[str, float]
+    expected_false_candidates: float
     candidates: QTable
     limits: QTable
     grid: Image
@@ -206,6 +218,7 @@ class Combination:
             "flux_unit": self.unit,
             "threshold_snr": self.threshold,
             "thresholds_sigmas": self.thresholds,
+            "expected_false_candidates": self.expected_false_candidates,
             "proper_motion_arcsec_per_year": (
                 None if self.motion is None else list(self.motion.proper)
             ),

@@ -71,6 +71,9 @@ Spectra = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 _SHIFTS = 300
 """Largest number of orbital motions for which the epochs are added."""
 
+_UNLISTED = 9.0
+"""Chi-squared by which free fluxes have to be better than all listed spectra to be preferred."""
+
 _BELOW = 0.7
 """Standard deviations by which the highest pixel of a peak may be lower than the peak."""
 
@@ -184,6 +187,7 @@ def combine(
         unit=unit,
         threshold=level,
         thresholds=searcher.thresholds,
+        expected_false_candidates=searcher.alarms_of_single_search(),
         candidates=candidates_table(
             sources,
             filters,
@@ -233,6 +237,14 @@ class _Peak:
     sigmas: float
     false_alarm: float
 
+    @property
+    def preference(self) -> float:
+        """Chi-squared of the source, by which one of its peaks is chosen; less for free fluxes.
+
+        They always fit better, and stand for a spectrum that is not listed.
+        """
+        return self.sigmas**2 - (_UNLISTED if self.family == FREE else 0.0)
+
     def seen_at(self) -> dict[str, Image]:
         """East and north by the name of the map."""
         moves = self.search.moves[self.move]
@@ -274,12 +286,13 @@ class _Searcher:
 
     def sources(self) -> list[CombinedSource]:
         """Candidates, the least probable false alarm first."""
-        alarms = self._alarms_of_single_search() / len(self.searches)
+        alarms = self.alarms_of_single_search() / len(self.searches)
         peaks = [peak for each in self.searches for peak in self._peaks(each, alarms)]
         kept: list[_Peak] = []
-        for peak in sorted(peaks, key=lambda each: (each.false_alarm, -each.sigmas)):
+        for peak in sorted(peaks, key=lambda each: -each.preference):
             if not any(self._is_same(peak, other) for other in kept):
                 kept.append(peak)
+        kept.sort(key=lambda each: (each.false_alarm, -each.sigmas))
         return [self._measured(peak) for peak in kept]
 
     @property
@@ -334,7 +347,7 @@ class _Searcher:
         inside = [np.array([x, y]) for x in axis for y in axis if math.hypot(x, y) <= fastest]
         return sorted(inside or [np.zeros(2)], key=lambda v: float(np.hypot(*v)))
 
-    def _alarms_of_single_search(self) -> float:
+    def alarms_of_single_search(self) -> float:
         """Expected number of false candidates of a search of one filter, mean over the maps."""
         counts = []
         for each in self.maps:
