@@ -16,9 +16,11 @@ if TYPE_CHECKING:
     from pyklip_diffrender.archive import fetch_calints, list_calints
     from pyklip_diffrender.bridges import from_poppy, from_webbpsf
     from pyklip_diffrender.detection import (
+        Combination,
         Detection,
         Disk,
         WideField,
+        combine,
         completeness,
         contrast_curve,
         detect,
@@ -63,6 +65,7 @@ if TYPE_CHECKING:
     from pyklip_diffrender.wavefront.priors import WavefrontPrior, learn_prior
 
 __all__ = [
+    "Combination",
     "Detection",
     "DiffrenderSettings",
     "Disk",
@@ -84,6 +87,7 @@ __all__ = [
     "__version__",
     "backend",
     "choose_map",
+    "combine",
     "combine_libraries",
     "completeness",
     "contrast_curve",
@@ -116,8 +120,8 @@ __all__ = [
 _NAMES = {
     "archive": "fetch_calints list_calints",
     "bridges": "from_poppy from_webbpsf",
-    "detection": "Detection Disk WideField completeness contrast_curve detect fit_disk measure "
-    "wide_field",
+    "detection": "Combination Detection Disk WideField combine completeness contrast_curve detect "
+    "fit_disk measure wide_field",
     "instrument.nircam": "nircam_coronagraph",
     "instrument.star_flux": "star_flux_density",
     "linear.model": "LinearModel",

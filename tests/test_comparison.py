@@ -9,11 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
+from synthetic_searches import searched
 
 import pyklip_diffrender as dr
 from benchmarks.calints_files import calints
 from pyklip_diffrender.cli import main
-from pyklip_diffrender.reduction import compare_reductions, write_comparison
+from pyklip_diffrender.reduction import (
+    combined_rows,
+    compare_reductions,
+    in_words,
+    write_comparison,
+)
 from pyklip_diffrender.reduction.several import _thumbnails, _tracks, sources_of
 from pyklip_diffrender.scene.product_headers import world_coordinates
 
@@ -183,6 +189,30 @@ def test_the_page_has_a_table_of_candidates_over_filters(tmp_path: Path) -> None
     assert len(json.loads(data.read_text(encoding="utf-8"))["sources"]) == 2
 
 
+def test_the_page_shows_the_combined_search(tmp_path: Path) -> None:
+    folders = {"2022": summary(59855.0, []), "2023": summary(60280.0, [])}
+    place = (0.5, 0.45, 9.0)
+    found = [searched("F444W", 1, [place], mjd=59855.0), searched("F444W", 2, [place], mjd=60280.0)]
+    found.append(searched("F356W", 3, status="MODEL_MISMATCH"))
+    combination = dr.combine(found, proper_motion=MOTION)
+    html, data = write_comparison(folders, MOTION, tmp_path, combination)
+    text = html.read_text(encoding="utf-8")
+    assert "moves with the star" in text
+    assert "MODEL_MISMATCH" in text
+    content = json.loads(data.read_text(encoding="utf-8"))["combined"]
+    assert content == json.loads(json.dumps(combination.to_dict()))
+    title, (row,) = combined_rows(content)
+    assert len(title) == len(row)
+    # At 0.673 arcsec; the place is known to 9 mas.
+    assert row[1].startswith(("0.65", "0.66", "0.67", "0.68", "0.69"))
+    assert "S/N" in row[title.index("Contrast in F444W")]
+    assert "1 candidate\n" in in_words(combination)
+    html, data = write_comparison(folders, MOTION, tmp_path, "the star's proper motion <b>")
+    assert "no combined search. the star&#39;s" in html.read_text(encoding="utf-8")
+    content = json.loads(data.read_text(encoding="utf-8"))
+    assert content["combined"] == {"reason": "the star's proper motion <b>"}
+
+
 def dry_run(folder: Path) -> list[str]:
     """Arguments of a dry run on frames in a folder, with a wavefront map that is made here."""
     opd = folder / "opd.fits"
@@ -235,3 +265,6 @@ def test_the_command_takes_every_filter_of_the_target(
     shown = capsys.readouterr().out
     assert "Jy in F444W" in shown
     assert "Jy in F356W" in shown
+    # Spectra are read before the first fit.
+    assert main([*options, "--spectra", str(tmp_path / "none.ecsv")]) == 1
+    assert "none.ecsv: no such file" in capsys.readouterr().err

@@ -17,6 +17,7 @@ from pyklip_diffrender.cli.shared_options import (
     outputs,
     require_frames,
     search,
+    together,
     wavefront,
 )
 from pyklip_diffrender.errors import IncompatibleSetupError
@@ -142,6 +143,7 @@ Examples:
 @archive
 @wavefront
 @search
+@together
 @outputs()
 @click.pass_obj
 def reduce_frames(
@@ -158,8 +160,8 @@ def reduce_frames(
     """Subtract the star from all rolls of a target and search for planets.
 
     FRAMES are calints files, or one folder of them. With --program they come from MAST. Filters,
-    and epochs more than 5 days apart, are reduced one by one, into a folder for each, and compared
-    on one page.
+    and epochs more than 5 days apart, are reduced one by one, into a folder for each, then searched
+    together, and compared on one page.
     """
     require_frames(frames, program)
 

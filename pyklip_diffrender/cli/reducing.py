@@ -16,7 +16,9 @@ import click
 from pyklip_diffrender.cli.estimate import describe_plan, size_of_products, steps_of
 from pyklip_diffrender.cli.session import Run, with_options
 from pyklip_diffrender.cli.shared_options import config_remark
+from pyklip_diffrender.detection import COMBINED, Combination, combine
 from pyklip_diffrender.errors import DiffrenderError, IncompatibleSetupError
+from pyklip_diffrender.instrument import planet_spectra
 from pyklip_diffrender.instrument.star_flux import star_flux_density
 from pyklip_diffrender.io.files import read_text
 from pyklip_diffrender.io.opd_map import OPDMap
@@ -28,17 +30,18 @@ from pyklip_diffrender.reduction import (
     ProductFolder,
     ReduceOptions,
     existing_products,
+    in_words,
     prepare,
     write_comparison,
 )
 from pyklip_diffrender.scene.admission_table import SHORT
-from pyklip_diffrender.scene.catalogue_star import proper_motion
+from pyklip_diffrender.scene.catalogue_star import proper_motion as motion_of
 from pyklip_diffrender.scene.sequence import Sequence
 from pyklip_diffrender.wavefront.map_choice import Rule, choose_map
 from pyklip_diffrender.wavefront.opd import as_opd_map
 from pyklip_diffrender.wavefront.wss import load_wss_opd_by_date
 
-__all__ = ["map_for", "run_reduction"]
+__all__ = ["combined", "map_for", "run_reduction"]
 
 _MAST = "mast"
 """Value of --opd for maps that come from MAST."""
@@ -59,6 +62,9 @@ def run_reduction(
     opd: str,
     opd_date: Rule | None,
     star_sed: str | None,
+    spectra: tuple[str, ...] = (),
+    proper_motion: tuple[float, float] | None = None,
+    parallax: float | None = None,
     **options: Any,
 ) -> None:
     """Reduce the epochs and filters of a target, write all products and say what they show.
@@ -76,7 +82,7 @@ def run_reduction(
         checked = ReduceOptions(device=run.device, accuracy=accuracy, **options)
     except DiffrenderError as error:
         raise click.UsageError(with_options(str(error)) + config_remark()) from error
-    run.claim_folder(output, (*PRODUCTS, *COMPARISON), overwrite or resume)
+    run.claim_folder(output, (*PRODUCTS, *COMPARISON, *COMBINED), overwrite or resume)
     # Libraries may print, too.
     with redirect_stdout(sys.stderr) if json else nullcontext():
         sequences = read()
@@ -101,6 +107,8 @@ def run_reduction(
             prepared.append(prepare(sequence, map_, _with_flux(checked, star_sed, sequence.filter)))
             if dry_run:
                 click.echo(describe_plan(prepared[-1].sequence, prepared[-1].options))
+        if several:
+            _require_spectra(spectra, filters)
         sizes = (size_of_products(each.sequence, derivatives=derivatives) for each in prepared)
         run.require_room(output, sum(sizes))
         if dry_run:
@@ -136,10 +144,15 @@ def run_reduction(
             _remove_others(output, folders)
         if several:
             first = sequences[0].science[0]
-            motion = proper_motion(first.header, first.name)
-            page, data = write_comparison(summaries, motion, output)
+            motion = proper_motion or motion_of(first.header, first.name)
+            combination = combined(
+                folders, spectra, star_sed=star_sed, motion=motion, parallax=parallax
+            )
+            page, data = write_comparison(summaries, motion, output, combination)
             summary = loads(read_text(data))
-            click.echo(f"\nwrote {page}, which compares them")
+            if isinstance(combination, Combination):
+                combination.write(output, overwrite=overwrite or resume)
+            click.echo(f"\nwrote {page}, which compares them\n{in_words(combination)}")
     if json:
         click.echo(dumps(summary, indent=2))
 
@@ -147,6 +160,35 @@ def run_reduction(
 def _is_finished(folder: Path) -> bool:
     """Whether a folder has the products of a reduction that was not interrupted."""
     return (folder / "summary.json").exists() and not (folder / UNFINISHED).exists()
+
+
+def _require_spectra(spectra: tuple[str, ...], filters: list[str]) -> None:
+    """Raise an exception, before any fit, for spectra that cannot be combined in the filters."""
+    listed = [each for each in spectra if each != "free"]
+    if listed and len(filters) > 1 and "unknown" not in filters:
+        planet_spectra(listed, filters)
+
+
+def combined(
+    folders: list[Path],
+    spectra: tuple[str, ...],
+    *,
+    star_sed: str | None,
+    motion: tuple[float, float] | None,
+    parallax: float | None,
+) -> Combination | str:
+    """Search the products in folders together; a sentence if that is not possible."""
+    try:
+        return combine(
+            folders,
+            spectra=spectra or ("blackbody", "flat", "free"),
+            star=star_sed,
+            proper_motion=motion,
+            parallax=parallax,
+        )
+    except IncompatibleSetupError as error:
+        # The reductions are finished, and worth more than a search that cannot be made of them.
+        return with_options(str(error))
 
 
 def _with_flux(options: ReduceOptions, star_sed: str | None, name: str | None) -> ReduceOptions:
@@ -183,7 +225,7 @@ def _remove_others(output: Path, folders: list[Path]) -> None:
             path.unlink()
         if folder != output and folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
-    for path in (page, data):
+    for path in (page, data, *(output / name for name in COMBINED)):
         path.unlink(missing_ok=True)
 
 

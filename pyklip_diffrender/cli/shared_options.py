@@ -24,6 +24,7 @@ __all__ = [
     "read_config",
     "require_frames",
     "search",
+    "together",
     "wavefront",
 ]
 
@@ -323,4 +324,21 @@ search = _all(
            "figures."),
     option("--json", is_flag=True, section="Output",
            help="Print the content of summary.json and nothing else on standard output."),
+)  # fmt: skip
+
+together = _all(
+    option("--spectra", metavar="blackbody|flat|free|FILE", multiple=True,
+           section="Filters and epochs",
+           help="Spectra of planets for the combined search of several filters or epochs; may be "
+                "repeated: black bodies of 150 to 1,500 K, the same flux density in all filters, "
+                "any fluxes, or a table of spectra with the wavelength (micron) in the first "
+                "column. Default: blackbody, flat and free."),
+    option("--proper-motion", type=float, nargs=2, metavar="EAST NORTH",
+           section="Filters and epochs",
+           help="Proper motion of the star, arcsec per year, to tell companions from background "
+                "sources; default: that of the headers."),
+    option("--parallax", type=click.FloatRange(min=0), metavar="ARCSEC",
+           section="Filters and epochs",
+           help="Parallax of the star, for the motion of background sources and of orbits between "
+                "epochs; default: neglected."),
 )  # fmt: skip

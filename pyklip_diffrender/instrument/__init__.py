@@ -24,6 +24,7 @@ from pyklip_diffrender.instrument.nircam import (
     NIRCAM_LW_PIXELSCALE,
     nircam_coronagraph,
 )
+from pyklip_diffrender.instrument.planet_spectra import PlanetSpectra, planet_spectra
 from pyklip_diffrender.instrument.spectrum import blackbody, filter_bandpass, filter_throughput
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "TABULATED_GAP",
     "BarMask",
     "ChromaticAberration",
+    "PlanetSpectra",
     "blackbody",
     "detector_place",
     "filter_bandpass",
@@ -47,4 +49,5 @@ __all__ = [
     "maskbar_openings",
     "maskrnd_openings",
     "nircam_coronagraph",
+    "planet_spectra",
 ]

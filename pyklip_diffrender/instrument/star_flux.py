@@ -20,7 +20,7 @@ from pyklip_diffrender.instrument.spectrum import filter_throughput
 from pyklip_diffrender.io.files import is_fits_name, open_fits, read_text
 from pyklip_diffrender.io.units import native_float64
 
-__all__ = ["read_spectrum", "star_flux_density"]
+__all__ = ["mean_in_filter", "read_spectrum", "star_flux_density"]
 
 _GAP = 1.6
 """Largest step between samples, as a fraction of the wavelength, over which a power law is a fair
@@ -79,13 +79,36 @@ def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
     >>> print(dr.star_flux_density("A2V, K=6.77", "F444W").round(3))
     0.378 Jy
     """
-    wavelength, throughput = filter_throughput(filter)
     grid, flux = dwarf_photometry(str(star)) if is_dwarf(str(star)) else read_spectrum(star)
+    return mean_in_filter(grid, flux, filter, str(star)) * u.Jy
+
+
+def mean_in_filter(
+    grid: NDArray[np.float64], flux: NDArray[np.float64], filter: str, name: str
+) -> float:
+    """Mean of a flux density over the photons that a filter detects; see `star_flux_density`.
+
+    Parameters
+    ----------
+    grid : ndarray, (n,)
+        Wavelengths, m, increasing.
+    flux : ndarray, (n,)
+        Flux density per frequency, positive.
+    filter : str
+    name : str
+        Of the spectrum, for the message.
+
+    Raises
+    ------
+    IncompatibleSetupError
+        For an unknown filter, or a spectrum that does not cover it.
+    """
+    wavelength, throughput = filter_throughput(filter)
     inside = throughput > 0.01 * throughput.max()
     first, last = wavelength[inside][[0, -1]]
     if grid[0] > first or grid[-1] < last:
         raise IncompatibleSetupError(
-            f"{star}: the spectrum covers {grid[0] * 1e6:.3f} to {grid[-1] * 1e6:.3f} micron, the "
+            f"{name}: the spectrum covers {grid[0] * 1e6:.3f} to {grid[-1] * 1e6:.3f} micron, the "
             f"filter {filter} needs {first * 1e6:.3f} to {last * 1e6:.3f} micron"
         )
     fine = np.linspace(first, last, 4001)
@@ -93,7 +116,7 @@ def star_flux_density(star: str | os.PathLike[str], filter: str) -> u.Quantity:
     spectrum = np.exp(np.interp(np.log(fine), np.log(grid), np.log(flux)))
     # In photons per logarithmic interval of frequency, dnu / nu = dlambda / lambda.
     weight = np.interp(fine, wavelength, throughput) / fine
-    return float((spectrum * weight).sum() / weight.sum()) * u.Jy
+    return float((spectrum * weight).sum() / weight.sum())
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> _Spectrum:

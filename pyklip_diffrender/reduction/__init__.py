@@ -13,7 +13,9 @@ from pyklip_diffrender.reduction.products import (
 from pyklip_diffrender.reduction.reduction_result import Reduction
 from pyklip_diffrender.reduction.several import (
     COMPARISON,
+    combined_rows,
     compare_reductions,
+    in_words,
     write_comparison,
 )
 from pyklip_diffrender.reduction.summary import summarise
@@ -29,8 +31,10 @@ __all__ = [
     "ReduceOptions",
     "Reduction",
     "Visit",
+    "combined_rows",
     "compare_reductions",
     "existing_products",
+    "in_words",
     "prepare",
     "reduce",
     "summarise",

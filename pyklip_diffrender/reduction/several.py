@@ -23,11 +23,19 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pyklip_diffrender import drawing
+from pyklip_diffrender.detection import Combination
 from pyklip_diffrender.io.files import replacing
 from pyklip_diffrender.reduction.pages import Picture, render
 from pyklip_diffrender.reduction.words import plus_minus, scientific
 
-__all__ = ["COMPARISON", "compare_reductions", "sources_of", "write_comparison"]
+__all__ = [
+    "COMPARISON",
+    "combined_rows",
+    "compare_reductions",
+    "in_words",
+    "sources_of",
+    "write_comparison",
+]
 
 COMPARISON = ("comparison.html", "comparison.json")
 """Files that `write_comparison` writes."""
@@ -234,6 +242,7 @@ def write_comparison(
     folders: Mapping[str, Mapping[str, Any]],
     motion: tuple[float, float] | None,
     folder: str | os.PathLike[str],
+    combination: Combination | str | None = None,
 ) -> list[Path]:
     """Write ``comparison.html`` and ``comparison.json``, above the products of every reduction.
 
@@ -245,6 +254,9 @@ def write_comparison(
         Proper motion of the star, see `compare_reductions`.
     folder : path
         That the folders are in.
+    combination : Combination or str, optional
+        The search of all reductions together, or why there is none. ``comparison.json`` has it as
+        `combined`.
 
     Returns
     -------
@@ -263,6 +275,10 @@ def write_comparison(
         ],
         "pairs": pairs,
         "sources": sources,
+        "combined": (
+            combination.to_dict() if isinstance(combination, Combination)
+            else None if combination is None else {"reason": combination}
+        ),
     }  # fmt: skip
     page, data = (Path(folder) / name for name in COMPARISON)
     texts = {
@@ -274,6 +290,8 @@ def write_comparison(
             thumbnails=_thumbnails(folders, Path(folder)),
             tracks=_tracks(summaries, motion),
             motion=motion,
+            combined=content["combined"],
+            combined_table=_combined_table(content["combined"]),
             filters=list(dict.fromkeys(str(e["filter"]) for s in sources for e in s["filters"])),
             sources=[
                 {
@@ -372,6 +390,75 @@ def _tracks(
             )
         )
     return pictures
+
+
+def combined_rows(combined: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Title and cells of a table with the candidates of a search over filters and epochs.
+
+    Parameters
+    ----------
+    combined : dict
+        What `Combination.to_dict` returned, also after it was read from ``comparison.json``.
+
+    Returns
+    -------
+    title : list of str
+    rows : list of list of str
+        One for each candidate.
+    """
+    candidates = combined["candidates"]
+    dated = any("verdict" in each for each in candidates)
+    title = ["", "Separation (arcsec)", "Position angle (deg)", "S/N", "Spectrum", "False alarm"]
+    title += [f"Contrast in {name}" for name in combined["filters"]]
+    title += ["Bound / background / neither (%)", "Verdict"] if dated else []
+    rows = []
+    for k, row in enumerate(candidates, 1):
+        cells = [
+            str(k),
+            plus_minus(row["separation_arcsec"], row["separation_error_arcsec"]),
+            plus_minus(row["position_angle_deg"], row["position_angle_error_deg"]),
+            f"{row['snr']:.1f}",
+            row["spectrum"],
+            scientific(row["false_alarm_probability"]),
+        ]
+        for name in combined["filters"]:
+            value, error = row[f"contrast_{name}"], row[f"contrast_error_{name}"]
+            snr = row[f"snr_{name}"]
+            known = None not in (value, error, snr)
+            cells.append(f"{scientific(value, error)}, S/N {snr:.1f}" if known else "not observed")
+        if dated:
+            names = ("bound", "background", "neither")
+            shares = (f"{100 * row[f'probability_{name}']:.0f}" for name in names)
+            cells += [" / ".join(shares), row["verdict"]]
+        rows.append(cells)
+    return title, rows
+
+
+def in_words(combination: Combination | str) -> str:
+    """What a search over filters and epochs says, or why there is none, in a few lines."""
+    if isinstance(combination, str):
+        return f"no combined search: {combination}"
+    count = len(combination.candidates)
+    lines = [
+        f"combined search of {len(combination.maps)} reductions: {count} "
+        f"candidate{'' if count == 1 else 's'}"
+    ]
+    for row in combination.candidates:
+        verdict = f", {row['verdict']}" if "verdict" in combination.candidates.colnames else ""
+        lines.append(
+            f"  {row['separation'].value:.3f} arcsec at {row['position_angle'].value:.1f} deg, "
+            f"S/N {row['snr']:.1f} ({row['spectrum']}), false-alarm probability "
+            f"{row['false_alarm_probability']:.1e}{verdict}"
+        )
+    lines += [f"  left out: {name}: {reason}" for name, reason in combination.left_out]
+    return "\n".join([*lines, *(f"  {each}" for each in combination.remarks)])
+
+
+def _combined_table(
+    combined: Mapping[str, Any] | None,
+) -> tuple[list[str], list[list[str]]] | None:
+    """`combined_rows`, where there is a combined search."""
+    return None if combined is None or "reason" in combined else combined_rows(combined)
 
 
 def _brightness(summary: Mapping[str, Any], in_filter: Mapping[str, Any]) -> str:

@@ -1,0 +1,229 @@
+"""How many false candidates a combined search has, and how much deeper it is than one filter.
+
+Run from the root of the project::
+
+    python -m benchmarks.combined --output docs/results/combined_search.ecsv [--sequences 12]
+
+Frames of a star are simulated in two and in three filters and at two epochs, each with a wavefront
+that has drifted since the map, and fitted and searched by `refine` and `detect`. The searches are
+combined by `combine`. The table has, for each set:
+
+- the standard deviation of the S/N of noise, without planets, of single and combined searches;
+- how many searches of noise have a peak above a lowered threshold, of a single filter and of all
+  together, beside the number that is stated;
+- the ratio of the limit of the best single filter to that of the combination, for a planet of 1,500
+  K, each at the threshold of equal false-alarm probability, beside the root of the summed squares.
+
+Last, background sources at two epochs, in smooth noise, and the share that is told apart from
+companions, by how far the star moves in units of the error of a place.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from astropy.table import QTable
+from astropy.time import Time
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.detection import Detection, Motion, SkyMap, hypotheses
+from pyklip_diffrender.detection.field import separation_of
+
+WAVELENGTHS = {"F444W": 4.4e-6, "F356W": 3.56e-6, "F300M": 3.0e-6}
+SETS = {
+    "two filters": (("F444W", 0), ("F356W", 0)),
+    "three filters": (("F444W", 0), ("F356W", 0), ("F300M", 0)),
+    "two epochs": (("F444W", 0), ("F444W", 1)),
+}
+"""Filter and epoch of the searches that are combined."""
+
+STAR = "A2V, K=6.77"
+NPIX, SIDE, CYCLES = 128, 40, 6.0
+DATES = ("2022-08-01T00:00:00", "2023-09-01T00:00:00")
+MOTION = (0.3, -0.2)
+INNER = 0.35
+LEVEL = 3.8
+"""Threshold at which false candidates are counted: high enough for the theory of maxima, and low
+enough for a few in some dozens of searches."""
+
+
+def searched(name: str, epoch: int, seed: int) -> Detection:
+    """Simulate, fit and search a frame without a planet."""
+    model = dr.nircam_coronagraph(name, monochromatic=WAVELENGTHS[name], npix=NPIX, fov_pixels=SIDE)
+    sensed = dr.random_opd(1, npix=NPIX).data
+    # Every epoch has its own drift, which the filters share.
+    drift = dr.random_opd(1000 + 10 * seed + epoch, npix=NPIX, rms=5e-9).data
+    number = 100 * seed + 10 * epoch + list(WAVELENGTHS).index(name)
+    frame = replace(
+        dr.simulate(model, dr.Scene(), sensed + drift, seed=number),
+        position_angles=np.array([15.0 + 60.0 * epoch]),
+        date=Time(DATES[epoch]),
+    )
+    fit = dr.refine(model, frame, sensed, settings=dr.GaussNewton(cycles=CYCLES))
+    return dr.detect(fit, inner=INNER)
+
+
+def combined(detections: Sequence[Detection], threshold: float) -> dr.Combination:
+    return dr.combine(
+        detections, star=STAR, threshold=threshold, inner=INNER, proper_motion=MOTION,
+        parallax=0.01,
+    )  # fmt: skip
+
+
+def highest(detection: Detection) -> float:
+    """Highest peak between the pixels of a single search, in Gaussian standard deviations."""
+    each = SkyMap.of(detection, "one")
+    x, y = np.moveaxis(detection.grid, -1, 0)
+    fine = np.linspace(0, 1, 4 * SIDE)
+    places = np.stack(np.meshgrid(x.min() + fine * np.ptp(x), y.min() + fine * np.ptp(y)), axis=-1)
+    values = each.at(each.on_sky(places))[1]
+    return float(values[separation_of(places) >= INNER].max())
+
+
+def deviation(detection: Detection) -> float:
+    used = separation_of(detection.grid) >= INNER
+    return float(np.nanstd(detection.snr[used]))
+
+
+def told_apart(ratio: float, count: int, snr: float = 8.0) -> float:
+    """Share of background sources that are told apart, for a motion in errors of a place."""
+    side, pixel, smooth, error = 41, 0.063, 1.2, 1e-6
+    half = (side - 1) / 2 * pixel
+    axis = np.linspace(-half, half, side)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1)
+    width = 2**0.5 * smooth * pixel
+    motion = ratio * width / snr
+    told = 0
+    for seed in range(count):
+        rng = np.random.default_rng([seed, round(100 * ratio)])
+        start = rng.uniform(0.3, 0.8, 2) * rng.choice([-1, 1], 2)
+        angle = rng.uniform(0, 2 * np.pi)
+        moved = motion * np.array([np.cos(angle), np.sin(angle)])
+        maps = []
+        for k, place in enumerate((start, start + moved)):
+            noise = _smooth(rng, side, smooth)
+            # East is to the left.
+            away = ((grid - place * [-1, 1]) ** 2).sum(axis=-1)
+            maps.append(
+                SkyMap(
+                    name=str(k), filter="F444W", mjd=59900.0 + 365.25 * k, north=0.0, grid=grid,
+                    snr=noise + snr * np.exp(-away / (2 * width**2)),
+                    error=np.full(noise.shape, error), noise=noise,
+                    freedom=np.full(noise.shape, np.inf), resolution=0.14,
+                )
+            )  # fmt: skip
+        motion_of_star = Motion((float(-moved[0]), float(-moved[1])))
+        flux = dict.fromkeys(("0", "1"), 1.0)
+        result = hypotheses(maps, flux, start, 59900.0, motion_of_star)
+        told += result.verdict.startswith("stays")
+    return told / count
+
+
+def _smooth(rng: np.random.Generator, side: int, smooth: float) -> np.ndarray:
+    from scipy.ndimage import gaussian_filter
+
+    field = gaussian_filter(rng.normal(size=(side + 40, side + 40)), smooth, mode="wrap")
+    return field[20:-20, 20:-20] / field.std()
+
+
+def main() -> None:
+    """Simulate, combine, and write the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--sequences", type=int, default=12)
+    parser.add_argument("--sources", type=int, default=100)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    names: list[str] = []
+    rows: list[dict[str, float]] = []
+    members = sorted({each for parts in SETS.values() for each in parts})
+    results: dict[str, list[tuple[list[Detection], dr.Combination]]] = {name: [] for name in SETS}
+    for seed in range(options.sequences):
+        singles = {each: searched(*each, seed) for each in members}
+        for name, parts in SETS.items():
+            chosen = [singles[each] for each in parts]
+            results[name].append((chosen, combined(chosen, LEVEL)))
+        print(f"sequence {seed + 1} of {options.sequences}", flush=True)
+    for name, runs in results.items():
+        count = len(runs)
+        spread = [np.nanstd(both.snr[:, separation_of(both.grid) >= INNER]) for _, both in runs]
+        limits = []
+        squares = []
+        for chosen, _ in runs:
+            best, sum_of_squares, all_ = gain(chosen)
+            limits.append(best / all_)
+            squares.append(best * sum_of_squares**0.5)
+        singles_above = [highest(each) > LEVEL for chosen, _ in runs for each in chosen]
+        alarms = [len(both.candidates) > 0 for _, both in runs]
+        names.append(name)
+        rows.append(
+            {
+                "searches": count,
+                "snr_single": np.mean([deviation(each) for chosen, _ in runs for each in chosen]),
+                "snr_combined": float(np.mean(spread)),
+                "false_single": float(np.mean(singles_above)),
+                "false_combined": float(np.mean(alarms)),
+                "false_stated": stated(runs[0][1]),
+                "gain": float(np.mean(limits)),
+                "gain_without_trials": float(np.mean(squares)),
+            }
+        )
+    for ratio in (1.0, 2.0, 3.0, 4.0, 6.0, 8.0):
+        names.append(f"background, motion of {ratio:g} errors")
+        rows.append({"told_apart": told_apart(ratio, options.sources)})
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    table = QTable({"set": names})
+    for column in columns:
+        table[column] = [row.get(column, np.nan) for row in rows]
+        table[column].info.format = ".3f"
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+    ).stdout.strip()
+    table.meta = {
+        "command": f"python -m benchmarks.combined --sequences {options.sequences} "
+        f"--sources {options.sources}",
+        "commit": commit, "date": Time.now().isot[:10], "threshold": LEVEL,
+        "threads": os.environ.get("OMP_NUM_THREADS", "default"),
+    }  # fmt: skip
+    table.write(options.output, format="ascii.ecsv", overwrite=True)
+    table.pprint_all()
+
+
+def gain(chosen: Sequence[Detection]) -> tuple[float, float, float]:
+    """Limit of the best search, sum of the squares of the inverse errors, and combined limit.
+
+    For a planet of 1,500 K, as the amplitude of its spectrum, median beyond 0.35 arcsec.
+    """
+    both = combined(chosen, 5.0)
+    spectrum = (
+        both.spectra.names.index("black body of 1500 K") if len(both.spectra.names) > 1 else 0
+    )
+    places = both.grid[separation_of(both.grid) >= INNER][::7]
+    errors = []
+    for each in both.maps:
+        flux = both.spectra.flux[spectrum, both.spectra.filters.index(each.filter)]
+        star = 1.0 if both.unit != "Jy" else float(each.star or 1.0)
+        errors.append(each.at(places)[2] * star / flux)
+    errors = np.array(errors)
+    inside = np.isfinite(errors).all(axis=0)
+    all_ = (errors[:, inside] ** -2.0).sum(axis=0) ** -0.5
+    level = next(v for k, v in both.thresholds.items() if k.endswith("spectra") and
+                 (k.startswith("all")))  # fmt: skip
+    best = 5.0 * float(np.median(errors[:, inside], axis=1).min())
+    return best, float(np.median(all_)) ** -2.0 / 25.0, level * float(np.median(all_))
+
+
+def stated(both: dr.Combination) -> float:
+    """Probability of a false candidate that the thresholds of a combined search are made for."""
+    return float(-np.expm1(-both.expected_false_candidates))
+
+
+if __name__ == "__main__":
+    main()

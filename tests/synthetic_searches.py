@@ -1,0 +1,102 @@
+"""Searches of frames that were never fitted: maps of smooth noise with sources in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from astropy.io import fits
+from astropy.table import QTable
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from pyklip_diffrender.detection import Candidates, Detection
+from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.sky import Sky
+from pyklip_diffrender.scene.observation import Observation
+
+PIXEL = 0.063
+SMOOTH = 1.2
+"""Standard deviation, pixels, of the Gaussian with which white noise is smoothed. That of the
+autocorrelation, and so of the image of a source in the map, is the root of two times that."""
+
+RESOLUTION = 0.14
+CURVATURE = 1 / (2 * (SMOOTH * PIXEL) ** 2)
+"""Of the autocorrelation, per arcsec^2."""
+
+Image = NDArray[np.float64]
+
+
+def noise(seed: int, side: int) -> Image:
+    """Smooth noise of standard deviation 1, (side, side)."""
+    white = np.random.default_rng(seed).normal(size=(side + 20, side + 20))
+    smooth = gaussian_filter(white, SMOOTH, mode="wrap")
+    # The sum of the squares of the kernel, far from the edge of an impulse's image.
+    impulse = np.zeros((41, 41))
+    impulse[20, 20] = 1.0
+    kernel = gaussian_filter(impulse, SMOOTH)
+    return np.asarray(smooth[10:-10, 10:-10] / np.sqrt((kernel**2).sum()))
+
+
+def searched(
+    filter: str = "F444W",
+    seed: int = 0,
+    sources: Sequence[tuple[float, float, float]] = (),
+    *,
+    mjd: float = 60000.0,
+    north: float | None = 0.0,
+    error: float = 1e-6,
+    side: int = 41,
+    star: float | None = 1.0,
+    status: str = "CONVERGED",
+    header: dict[str, object] | None = None,
+    known: bool = False,
+    freedom: float = np.inf,
+    factor: float = 1.0,
+) -> Detection:
+    """A detection whose map has noise, and sources of an S/N at offsets to the east and north.
+
+    With `known`, the sources are candidates of the search itself.
+    """
+    half = (side - 1) / 2
+    y, x = (np.indices((side, side)) - half) * PIXEL
+    grid = np.stack([x, y], axis=-1)
+    angle = np.deg2rad(north or 0.0)
+    turn = np.array([[-np.cos(angle), np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    quiet = noise(seed, side)
+    snr = quiet.copy()
+    offsets = np.array([turn.T @ source[:2] for source in sources]).reshape(-1, 2)
+    for offset, source in zip(offsets, sources, strict=True):
+        square = ((grid - offset) ** 2).sum(axis=-1) / (SMOOTH * PIXEL) ** 2
+        snr += source[2] * np.exp(-square / 4)
+    heights = np.array([source[2] for source in sources])
+    own = Candidates.at(offsets, error * heights)
+    if known and len(sources):
+        own = Candidates(
+            own.offsets, own.contrasts, own.covariance, torch.full((len(own),), error / factor)
+        )
+    none = Candidates.at(np.zeros((0, 2)), np.zeros(0))
+    errors = np.full((side, side), error)
+    constant = ErrorFactor.constant(factor)
+    measured = ErrorFactor(factor * np.ones(errors.shape), np.full(errors.shape, freedom), grid)
+    curve = QTable(
+        {"separation": [0.5], "contrast": [5 * error]},
+        meta={"sigmas": 5.0, "resolution_arcsec": RESOLUTION},
+    )
+    detection = Detection(
+        fits=(), groups=(), contrast=snr * errors, error=errors, photon_error=errors, snr=snr,
+        residual_snr=quiet if known else snr,
+        error_factor=measured if np.isfinite(freedom) else constant,
+        sources=own if known else none, false_alarm=np.zeros(len(own) if known else 0),
+        rings=QTable(), threshold=5.0, contrast_curve=curve,
+        has_limits=np.ones(errors.shape, dtype=bool), grid=grid,
+    )  # fmt: skip
+    observation = Observation.from_arrays(
+        snr, errors, pixelscale=PIXEL, filter=filter,
+        position_angles=None if north is None else np.array([north]),
+        header=fits.Header(header or {}),
+    )  # fmt: skip
+    sky = Sky(north, mjd, None if star is None else (star, 0.1 * star))
+    vars(detection).update(observation=observation, sky=sky, provenance={"status": status})
+    return detection

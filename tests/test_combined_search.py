@@ -1,0 +1,421 @@
+"""One search over filters and epochs: exact, calibrated, and honest about what it leaves out."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from astropy import units as u
+from astropy.coordinates import GCRS, SkyCoord
+from astropy.table import QTable
+from astropy.time import Time
+from scipy import stats
+from synthetic_searches import CURVATURE, PIXEL, noise, searched
+
+import pyklip_diffrender as dr
+from pyklip_diffrender.cli.reducing import combined
+from pyklip_diffrender.detection import Detection, Motion, SkyMap, hypotheses
+from pyklip_diffrender.detection.error_factor import ErrorFactor
+from pyklip_diffrender.detection.groups import weigh
+from pyklip_diffrender.detection.sky_map import SkyStack
+from pyklip_diffrender.detection.trials import Family
+from pyklip_diffrender.errors import IncompatibleSetupError
+from pyklip_diffrender.instrument import planet_spectra
+from pyklip_diffrender.linear.frames import Unknown
+from pyklip_diffrender.linear.model import LinearModel
+
+MOTION = (0.3, -0.2)
+YEAR = 365.25
+
+
+def fitted(filter: str, wavelength: float, seed: int) -> Detection:
+    """A small frame of a star, searched, with maps in double precision at its pixels."""
+    model = dr.nircam_coronagraph(filter, monochromatic=wavelength, npix=64, fov_pixels=16)
+    opd = dr.random_opd(1, npix=64)
+    frame = replace(
+        dr.simulate(model, dr.Scene(), opd, seed=seed), position_angles=np.array([40.0])
+    )
+    fit = dr.refine(model, frame, opd, settings=dr.GaussNewton(cycles=3))
+    return dr.detect(fit)
+
+
+@pytest.fixture(scope="module")
+def pair() -> list[Detection]:
+    return [fitted("F444W", 4.4e-6, 1), fitted("F356W", 3.6e-6, 2)]
+
+
+def stacked(models: list[LinearModel]) -> LinearModel:
+    """One model of the data of several, whose unknowns are independent."""
+    unknowns, frames, count = [], [], 0
+    for model in models:
+        unknowns += [Unknown(f"{count} {each.name}"[:20], each.component, each.frame)
+                     for each in model.unknowns]  # fmt: skip
+        frames += [
+            replace(each, rows=each.rows + count, drift=each.drift + count) for each in model.frames
+        ]
+        count += len(model.unknowns)
+    columns = (
+        torch.cat([getattr(each, name) for each in models])
+        for name in ("vector", "mean", "deviation")
+    )
+    return LinearModel(
+        tuple(unknowns), tuple(frames), *columns,
+        torch.block_diag(*(each.curvature for each in models)),
+    )  # fmt: skip
+
+
+def test_it_is_the_joint_likelihood_of_all_frames(pair: list[Detection]) -> None:
+    """Amplitudes of spectra equal those of one linear model of both data sets."""
+    grid = pair[0].grid
+    offsets = torch.from_numpy(grid.reshape(-1, 2))
+    exact = []
+    for each in pair:
+        products = weigh(each.groups, lambda templates: templates.at(offsets))
+        information = products.information.numpy().reshape(grid.shape[:2])
+        contrast = products.numerator.numpy().reshape(grid.shape[:2]) / information
+        snr = contrast * np.sqrt(information)
+        exact.append(
+            replace(
+                each, contrast=contrast, error=information**-0.5, snr=snr, residual_snr=snr,
+                error_factor=ErrorFactor.constant(1.0), grid=grid,
+            )
+        )  # fmt: skip
+    both = dr.combine(exact, star="A2V, K=6.77", spectra=["blackbody", "flat", "free"])
+    assert both.unit == "Jy"
+    pixels = [(3, 4), (12, 2), (7, 13)]
+    places = np.array([both.maps[0].on_sky(grid[pixel]) for pixel in pixels])
+    table = both.measure(places * u.arcsec)
+    joint = stacked([each.groups[0][0] for each in pair])
+    at = torch.from_numpy(np.array([grid[pixel] for pixel in pixels]))
+    images = [each.groups[0][1].at(at)[0] for each in pair]
+    stars = [dr.star_flux_density("A2V, K=6.77", name).value for name in ("F444W", "F356W")]
+    for k, flux in enumerate(both.spectra.flux):
+        templates = {f: flux[f] / stars[f] * image for f, image in enumerate(images)}
+        matrix, vector = joint.normal_equations(templates)
+        information = matrix.diagonal().numpy()
+        np.testing.assert_allclose(table["amplitude_error"][:, k], information**-0.5, rtol=1e-8)
+        scale = 1e-8 * np.sqrt(information)
+        assert np.all(np.abs(table["amplitude"][:, k] * information - vector.numpy()) < scale)
+    # Free fluxes are those of both templates fitted together, which do not share pixels.
+    zero = torch.zeros_like(images[0])
+    first, second = (
+        {0: torch.cat([images[0], zero]), 1: torch.cat([torch.zeros_like(images[1]), images[1]])},
+        3,
+    )
+    matrix, vector = joint.normal_equations(first)
+    both_fluxes = torch.linalg.solve(matrix[::second, ::second], vector[::second]).numpy()
+    measured = [table["contrast_F444W"][0], table["contrast_F356W"][0]]
+    errors = [table["contrast_error_F444W"][0], table["contrast_error_F356W"][0]]
+    assert np.all(np.abs(measured - both_fluxes) < 1e-8 * np.array(errors))
+
+
+def test_a_combination_of_products_is_that_of_the_detections(
+    pair: list[Detection], tmp_path: Path
+) -> None:
+    for each in pair:
+        each.write(tmp_path / str(each.observation.filter))
+    folders = [tmp_path / "F444W", tmp_path / "F356W"]
+    live, read = dr.combine(pair), dr.combine(folders)
+    np.testing.assert_allclose(read.snr, live.snr, atol=1e-9)
+    assert read.to_dict() == live.to_dict()
+    # The star is not known in photons: its own spectrum, and the result says so.
+    assert read.spectra.names == ("as the star",)
+    assert "--star-sed" in read.remarks[0]
+    paths = read.write(tmp_path / "both")
+    assert [each.name for each in paths] == [
+        "combined.fits", "combined_candidates.ecsv", "combined_limits.ecsv"
+    ]  # fmt: skip
+    limits = QTable.read(paths[2])
+    assert limits.meta["sigmas"] == pytest.approx(read.limits.meta["sigmas"])
+    assert 0 < limits["contrast"].min() < limits["contrast"].max() < 1e-2
+    json.dumps(read.to_dict(), allow_nan=False)
+    with pytest.raises(FileExistsError):
+        read.write(tmp_path / "both")
+    options = {"star_sed": None, "motion": None, "parallax": None}
+    by_command = combined(folders, ("free",), **options)
+    assert list(by_command.thresholds) == ["all filters, spectra", "all filters, free"]
+    # The command has finished the reductions, so that a search that is not possible is no error.
+    assert "expected two or more" in combined(folders[:1], (), **options)
+
+
+def test_a_planet_too_faint_for_each_filter_is_a_candidate_of_both() -> None:
+    place = (0.6, 0.35)
+    one = searched("F444W", 1, [(*place, 4.2)], north=20.0)
+    two = searched("F356W", 2, [(*place, 4.0)], north=-35.0)
+    both = dr.combine([one, two])
+    assert one.snr.max() < 5
+    assert two.snr.max() < 5
+    assert len(both.candidates) == 1
+    row = both.candidates[0]
+    moved = np.hypot(row["delta_ra"].value - place[0], row["delta_dec"].value - place[1])
+    error = math.hypot(row["delta_ra_error"].value, row["delta_dec_error"].value)
+    assert moved < 3 * error < 0.1
+    # Combined noise has the standard deviation 1, so that 4.1 sqrt(2) is met within three.
+    assert row["snr"] == pytest.approx(4.1 * math.sqrt(2), abs=3)
+    assert row["false_alarm_probability"] < 0.01
+    for name in ("F444W", "F356W"):
+        pull = (row[f"contrast_{name}"] - 4.1e-6) / row[f"contrast_error_{name}"]
+        assert abs(pull) < 3
+        assert row[f"flux_density_{name}"].value == pytest.approx(row[f"contrast_{name}"])
+    assert both.thresholds["all filters, spectra"] > 5
+
+
+def test_the_colour_says_which_spectrum() -> None:
+    """A planet of 250 K has a tenth of its flux in F356W."""
+    cold = searched("F444W", 1, [(0.6, 0.3, 30.0)], known=True)
+    none = searched("F356W", 2, [(0.6, 0.3, 2.9)])
+    both = dr.combine([cold, none], spectra="blackbody")
+    temperature = int(both.candidates["spectrum"][0].split()[3])
+    assert 150 <= temperature <= 300
+    assert both.candidates["spectrum_chi2"][0] < 9
+    warm = dr.combine([cold, searched("F356W", 2, [(0.6, 0.3, 30.0)], known=True)])
+    assert warm.candidates["spectrum"][0] in (
+        "black body of 1200 K",
+        "black body of 1500 K",
+        "flat",
+    )
+    assert len(warm.candidates) == 1
+
+
+def test_a_source_of_one_filter_alone_is_found_with_free_fluxes_and_keeps_its_flux() -> None:
+    """A methane planet, bright at 4.4 micron only, among spectra that have light in both."""
+    one = searched("F444W", 1, [(0.6, 0.3, 12.0)], known=True)
+    two = searched("F356W", 3, [(0.6, 0.3, -6.0)])
+    both = dr.combine([one, two], spectra=["flat", "free"])
+    assert both.candidates["spectrum"][0] == "free"
+    assert both.candidates["snr_F444W"][0] == pytest.approx(12, abs=0.05)
+
+
+def test_errors_that_are_hardly_known_need_a_higher_peak() -> None:
+    sources = [(0.6, 0.35, 5.0)]
+    known = dr.combine([searched("F444W", 1, sources), searched("F356W", 2, sources)])
+    unsure = dr.combine(
+        [searched("F444W", 1, sources, freedom=8.0), searched("F356W", 2, sources, freedom=8.0)]
+    )
+    assert len(known.candidates) == 1
+    assert len(unsure.candidates) == 0
+    np.testing.assert_allclose(known.snr, unsure.snr)
+
+
+def test_side_lobes_of_a_bright_candidate_are_no_candidates() -> None:
+    """What a search explains by its own candidates is not searched again."""
+    bright = searched("F444W", 1, [(0.6, 0.3, 300.0)], known=True)
+    lobe = searched("F444W", 1, [(0.6, 0.3, 300.0), (-0.5, -0.4, 8.0)], known=True)
+    snr = np.where(np.hypot(*np.moveaxis(lobe.grid, -1, 0)) < 9, lobe.snr, 0)
+    both = dr.combine([replace_maps(bright, snr), searched("F356W", 2)])
+    assert len(both.candidates) == 1
+    assert both.candidates["snr_F444W"][0] == pytest.approx(300, rel=1e-3)
+
+
+def replace_maps(detection: Detection, snr: np.ndarray) -> Detection:
+    """The detection with another map, whose residual stays as it is."""
+    changed = replace(detection, snr=snr)
+    for name in ("observation", "sky", "provenance"):
+        vars(changed)[name] = getattr(detection, name)
+    return changed
+
+
+def test_a_bad_fit_is_left_out_and_its_candidates_with_it() -> None:
+    bad = searched("F444W", 1, [(0.6, 0.3, 40.0)], status="MODEL_MISMATCH", known=True)
+    good = [searched("F356W", 2), searched("F300M", 3)]
+    both = dr.combine([bad, *good])
+    assert len(both.candidates) == 0
+    assert [each.filter for each in both.maps] == ["F356W", "F300M"]
+    ((name, reason),) = both.left_out
+    assert name.startswith("F444W")
+    assert "MODEL_MISMATCH" in reason
+    with pytest.raises(IncompatibleSetupError, match=r"expected two or more .*MODEL_MISMATCH"):
+        dr.combine([bad, good[0]])
+
+
+def test_what_cannot_be_combined_is_refused_with_the_reason(tmp_path: Path) -> None:
+    one = searched("F444W", 1, header={"TARGPROP": "HD 1", "TARG_RA": 10.0, "TARG_DEC": 5.0})
+    other = searched("F356W", 2, header={"TARGPROP": "HD 2", "TARG_RA": 90.0, "TARG_DEC": 5.0})
+    with pytest.raises(IncompatibleSetupError, match="HD 1 and HD 2"):
+        dr.combine([one, other])
+    with pytest.raises(IncompatibleSetupError, match="no position angle"):
+        dr.combine([searched("F444W"), searched("F356W", north=None)])
+    later = searched("F444W", 2, mjd=60400.0)
+    with pytest.raises(IncompatibleSetupError, match="proper_motion="):
+        dr.combine([searched("F444W", 1), later])
+    with pytest.raises(IncompatibleSetupError, match="expected a Reduction"):
+        dr.combine([3, 4])
+    with pytest.raises(IncompatibleSetupError, match="spectra: got none"):
+        dr.combine([searched("F444W"), searched("F356W")], spectra=[])
+    short = tmp_path / "short.txt"
+    short.write_text("# micron Y T\n3.0 1 1\n3.5 2 nan\n4.2 3 2\n", encoding="utf-8")
+    with pytest.raises(IncompatibleSetupError, match=r"Y: .* F444W needs"):
+        dr.combine([searched("F444W"), searched("F356W")], spectra=str(short))
+
+
+def test_spectra_come_from_a_table_of_model_atmospheres(tmp_path: Path) -> None:
+    wave = np.linspace(2.5, 5.6, 200)
+    table = QTable({
+        "wavelength": wave * u.micron,
+        "blue": wave**-4 * u.Unit("W / (m2 um)"),  # Per frequency wave^-2.
+        "cut": np.where(wave < 4, wave, np.nan) * u.Unit("W / (m2 um)"),
+    })  # fmt: skip
+    path = tmp_path / "atmospheres.ecsv"
+    table.write(path)
+    spectra = planet_spectra(path, ["F356W", "F444W"])
+    assert spectra.names == ("blue",)
+    assert spectra.left_out[0][0] == "cut"
+    # The mean of wave^-2 over a filter is near that at its mean wavelength.
+    assert spectra.flux[0] == pytest.approx([1, (3.56 / 4.40) ** 2], rel=0.02)
+    cold = planet_spectra("blackbody", ["F356W", "F444W"]).flux[0]
+    x = {w: 14387.77 / (w * 150) for w in (3.56, 4.40)}
+    ratio = (4.40 / 3.56) ** 3 * np.expm1(x[4.40]) / np.expm1(x[3.56])
+    # Steep over a filter, so that its mean is that of a longer wavelength.
+    assert ratio < cold[0] < 3 * ratio
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_free_fluxes_at_one_place_follow_chi_bar_squared(count: int) -> None:
+    stack = SkyStack(
+        np.zeros((count, 1)), np.zeros((count, 1)), np.ones((count, 1)), np.zeros((count, 2, 2))
+    )
+    for level in (1.0, 2.5, 5.0):
+        rare = sum(
+            math.comb(count, k) / 2**count * stats.chi.sf(level, k) for k in range(1, count + 1)
+        )
+        assert Family(None, stack, 1.0).expected(level) == pytest.approx(rare, rel=1e-9)
+
+
+@pytest.mark.parametrize("names", [("F444W", "F356W"), ("F444W", "F356W", "F210M")])
+def test_noise_has_as_many_peaks_as_expected(names: tuple[str, ...]) -> None:
+    """Fine maps of noise: the share with a peak above a level, for black bodies and free fluxes."""
+    count, side = 1000, 40
+    errors = np.array([1.0, 0.6, 0.8])[: len(names), None]
+    spectra = planet_spectra(["blackbody", "flat"], names).flux
+    stack = SkyStack(
+        np.zeros((len(names), side**2)), np.zeros((len(names), side**2)),
+        errors * np.ones((1, side**2)), CURVATURE * np.tile(np.eye(2), (len(names), 1, 1)),
+    )  # fmt: skip
+    highest = {"listed": [], "free": []}
+    families = {"listed": Family(spectra, stack, PIXEL**2), "free": Family(None, stack, PIXEL**2)}
+    for k in range(count):
+        maps = np.stack([noise(5 * k + f, side).ravel() for f in range(len(names))])
+        for name, family in families.items():
+            highest[name].append(family.statistic(replace(stack, sigmas=maps)).max())
+    for name, family in families.items():
+        for level in (4.0, 4.5):
+            share = np.mean(np.array(highest[name]) > level)
+            expected = -math.expm1(-family.expected(level))
+            # Pixels miss the tops of peaks, and the bound is one of expectations: it may be high.
+            spread = math.sqrt(expected / count)
+            assert share - 3 * spread < expected < 1.5 * share + 4 * spread, (name, level, share)
+
+
+def test_the_curvature_of_a_map_is_measured() -> None:
+    turned = SkyMap.of(searched(side=121, seed=4, north=30.0), "map")
+    # Of 121 x 121 pixels, of which about 800 are independent.
+    np.testing.assert_allclose(turned.curvature, CURVATURE * np.eye(2), atol=0.1 * CURVATURE)
+
+
+def test_parallax_and_proper_motion_are_those_of_astropy() -> None:
+    star = SkyCoord(80.0 * u.deg, -30.0 * u.deg, distance=10 * u.pc)
+    motion = Motion(MOTION, 0.1, (80.0, -30.0))
+    before, after = 59900.0, 59990.0
+    seen = []
+    for mjd in (before, after):
+        frame = GCRS(obstime=Time(mjd, format="mjd"))
+        far = SkyCoord(80.0 * u.deg, -30.0 * u.deg, distance=1e9 * u.pc).transform_to(frame)
+        east, north = far.spherical_offsets_to(star.transform_to(frame))
+        # At the telescope, 1 % farther from the Sun than the Earth.
+        seen.append(1.01 * np.array([east.to_value("arcsec"), north.to_value("arcsec")]))
+    expected = -(seen[1] - seen[0]) - np.array(MOTION) * 90 / YEAR
+    np.testing.assert_allclose(motion.background(before, after), expected, atol=5e-4)
+
+
+def epochs(first: tuple[float, float, float], second: tuple[float, float, float], seed: int = 0,
+           days: float = 400.0) -> list[Detection]:  # fmt: skip
+    """A source at two epochs."""
+    return [
+        searched("F444W", 2 * seed + 1, [first], mjd=59900.0),
+        searched("F444W", 2 * seed + 2, [second], mjd=59900.0 + days, north=25.0),
+    ]
+
+
+def test_epochs_tell_companions_from_the_background() -> None:
+    moved = -np.array(MOTION) * 400 / YEAR
+    start = np.array([0.5, 0.45])
+    bound = dr.combine(epochs((*start, 9.0), (*start, 9.0)), proper_motion=MOTION)
+    assert list(bound.candidates["verdict"]) == ["moves with the star"]
+    assert bound.candidates["ln_evidence_ratio"][0] > 5
+    sky = dr.combine(epochs((*start, 9.0), (*(start + moved), 9.0)), proper_motion=MOTION)
+    assert list(sky.candidates["verdict"]) == ["stays on the sky: a source in the background"]
+    assert sky.candidates["search"][0] == "all epochs, on the sky"
+    assert sky.candidates["ln_evidence_ratio"][0] < -5
+    elsewhere = epochs((*start, 9.0), (-0.6, -0.5, 9.0))
+    neither = dr.combine(elsewhere, proper_motion=MOTION)
+    assert set(neither.candidates["verdict"]) == {
+        "neither moves with the star nor stays on the sky"
+    }
+    assert any("parallax" in each for each in neither.remarks)
+    still = dr.combine(epochs((*start, 9.0), (*start, 9.0)), proper_motion=(0.004, 0.0))
+    assert list(still.candidates["verdict"]) == ["not decided"]
+    assert still.candidates["probability_neither"][0] < 0.01
+
+
+def test_a_faint_companion_is_found_in_the_sum_of_epochs() -> None:
+    start = (0.5, 0.45, 4.4)
+    both = dr.combine(epochs(start, start, seed=3), proper_motion=MOTION)
+    assert len(both.candidates) == 1
+    assert both.candidates["search"][0] == "all epochs, with the star"
+    # Free fluxes of a single filter are no family of their own.
+    assert all(name.endswith("spectra") for name in both.thresholds)
+
+
+def test_orbits_allow_a_bound_source_to_move() -> None:
+    """At 0.7 arcsec and 10 pc a circular orbit moves by 0.24 arcsec a year."""
+    start = np.array([0.5, 0.45])
+    moved = start + np.array([0.12, -0.13])
+    found = epochs((*start, 12.0), (*moved, 12.0))
+    fixed = dr.combine(found, proper_motion=(1.0, 1.0))
+    assert "moves with the star" not in fixed.candidates["verdict"]
+    orbit = dr.combine(found, proper_motion=(1.0, 1.0), parallax=0.1)
+    assert set(orbit.candidates["verdict"]) == {"moves with the star"}
+    assert len(orbit.candidates) == 1
+
+
+def test_more_background_sources_are_told_apart_the_farther_the_star_moves() -> None:
+    """Of seeded sources of S/N 8, whose places are known to 0.011 arcsec."""
+    shares = []
+    for motion in (0.01, 0.05, 0.15):
+        told = 0
+        for seed in range(12):
+            start = np.array([0.5, 0.45])
+            end = start - [motion, 0.0]
+            maps = [SkyMap.of(each, str(k)) for k, each in
+                    enumerate(epochs((*start, 8.0), (*end, 8.0), seed, YEAR))]  # fmt: skip
+            flux = dict.fromkeys(("0", "1"), 1.0)
+            result = hypotheses(maps, flux, start, 59900.0, Motion((motion, 0.0)))
+            total = result.bound + result.background + result.neither
+            assert total == pytest.approx(1)
+            told += result.verdict.startswith("stays")
+            assert not result.verdict.startswith("moves")
+        shares.append(told / 12)
+    assert shares[0] <= shares[1] <= shares[2]
+    assert shares[0] < 0.2
+    assert shares[2] > 0.9
+
+
+@pytest.mark.slow
+def test_false_candidates_are_as_rare_as_those_of_a_single_search() -> None:
+    """Thresholds lowered to 3.6, so that many searches of noise have a candidate."""
+    count, level = 150, 3.6
+    false = single = 0
+    for seed in range(count):
+        maps = [searched("F444W", 3 * seed, north=10.0), searched("F356W", 3 * seed + 1)]
+        both = dr.combine(maps, threshold=level)
+        false += len(both.candidates) > 0
+        single += maps[0].snr.max() > level
+    # Peaks between the pixels are searched, which a single map's pixels miss; and the bound on the
+    # trials is generous.
+    assert abs(false - single) < 4 * math.sqrt(single) + 0.3 * single
+    assert false > 0.5 * single
