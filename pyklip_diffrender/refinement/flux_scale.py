@@ -42,7 +42,7 @@ error of a good catalogue."""
 _ROUNDS = 3
 """Most fits with the flux held, of which each starts from the one before."""
 
-_TIGHTER = 10.0
+_TIGHTER = 100.0
 """Factor by which the next of these fits holds the flux more tightly."""
 
 _BRIGHTNESS = u.MJy / u.sr
