@@ -102,7 +102,7 @@ def test_reference_frames_in_the_dataset_stay_out_of_the_products(
         frames = gathered(dataset)
     assert [each.target for each in frames.references] == ["REF"]
     assert frames.references[0].reference
-    assert [len(each) for each in frames.references] == [2]
+    assert [each.count for each in frames.references] == [2]
     np.testing.assert_array_equal(frames.usable, [False, False, True, True, True, True])
     with pytest.warns(DiffrenderWarning, match="reference star"):
         reduce(dataset, tmp_path / "out", mode="ADI")

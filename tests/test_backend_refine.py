@@ -436,7 +436,7 @@ def test_frames_at_one_place_are_averaged_and_all_share_a_fit(
         rendered = subtract_by_refinement(observation, OLD, settings, tell=told.append)
     (fit,) = rendered.fits
     assert fit.frames == (0, 1, 2, 3, 4)
-    assert [len(frame.observation) for frame in fit.result.frames] == [2, 1, 1, 1]
+    assert [frame.observation.count for frame in fit.result.frames] == [2, 1, 1, 1]
     assert "5 frames of 4 pointings together" in told[0]
     assert rendered.star.shape == cube.shape
     np.testing.assert_array_equal(rendered.star[0], rendered.star[3])

@@ -75,7 +75,7 @@ class Broken(io.StringIO):
 
 @pytest.mark.parametrize("stream", [lambda: None, closed, Broken])
 @pytest.mark.parametrize(
-    "arguments", [["--help"], ["psf", "no/such/folder/star.fits"], ["nothing"]]
+    "arguments", [["--help"], ["psf", "-o", "no/such/folder/star.fits"], ["nothing"]]
 )
 def test_a_program_without_standard_streams_ends_as_with_them(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], stream: Any,

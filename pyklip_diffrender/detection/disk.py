@@ -20,7 +20,7 @@ from pyklip_diffrender.detection.sky import Sky
 from pyklip_diffrender.errors import CorruptFileError
 from pyklip_diffrender.io.files import open_fits, require_new, write_fits
 from pyklip_diffrender.io.html_repr import html_summary
-from pyklip_diffrender.io.keywords import fits_unit
+from pyklip_diffrender.io.keywords import fits_unit, set_keyword
 from pyklip_diffrender.io.units import native_float64
 from pyklip_diffrender.refinement import Refinement
 from pyklip_diffrender.scene.product_headers import primary_hdu, world_coordinates
@@ -171,7 +171,7 @@ class Disk:
         shown = [each for each in self.fit.frames if not each.observation.reference]
         frames = [each.wcs for each in shown]
         sources = fits.BinTableHDU(self.table, name="SOURCES")
-        sources.header["DRGAIN"] = (self.gain, "decrease of chi-squared by the sources")
+        set_keyword(sources.header, "DRGAIN", self.gain)
         hdus = fits.HDUList(
             [
                 primary_hdu(first, self.fit.summary(), Sky.of([self.fit]).mjd),

@@ -58,6 +58,7 @@ _DECLARED = (
     Keyword("DRNFRAME", "number of fitted frames", "reduce"),
     Keyword("DRNFIT", "number of refinements", "pyKLIP"),
     Keyword("DRPIXELS", "pixels that were fitted", "pyKLIP"),
+    Keyword("DRGAIN", "decrease of chi-squared by a disk", "reduce"),
     Keyword("DRFILLED", "flagged pixels replaced by neighbours", "pyKLIP"),
     Keyword("DRNOISE", "where the errors came from", "pyKLIP"),
     Keyword("DRKEPT", "companions in the model of the star", "pyKLIP",

@@ -19,7 +19,7 @@ from pyklip_diffrender import drawing
 from pyklip_diffrender._version import __version__
 from pyklip_diffrender.detection import Detection, Disk
 from pyklip_diffrender.errors import CorruptFileError, IncompatibleSetupError
-from pyklip_diffrender.io.files import replacing, require_new, write_table
+from pyklip_diffrender.io.files import read_text, replacing, require_new, write_table
 from pyklip_diffrender.pattern import PatternChoice
 from pyklip_diffrender.reduction.overview import Klip, Overview
 from pyklip_diffrender.reduction.pages import FIGURE_FORMATS, write_figures
@@ -258,7 +258,7 @@ class ProductFolder:
             return None
         path = self.folder / UNFINISHED
         try:
-            facts = json.loads(path.read_text(encoding="utf-8"))
+            facts = json.loads(read_text(path))
             same = (facts["version"], facts["fingerprint"]) == (__version__, fingerprint)
             done, choice = frozenset(facts["done"]), facts["choice"]
             failed = tuple((str(name), str(why)) for name, why in choice["failed"])
